@@ -1,0 +1,1 @@
+"""Finite elements: lattices, specimens, materials, equilibrium, stability, the path through buckling."""

@@ -1,0 +1,246 @@
+"""A mesh, nodal displacements on it, and how they came about: plain numpy, no dolfinx.
+
+This is what the finite-element side hands to everything else. The file is HDF5 and can be
+read with h5py alone::
+
+    nodes (n, 2) [mm]    cells (m, k)    @element @geometry @material @versions @seed
+    snapshots/0000/displacement (n, 2) [mm]    @nominal_strain @branch ...
+
+Nodes of a cell: corners counter-clockwise, then mid-sides starting between the first two
+corners, then (Q9) the centre; this is the order of VTK, gmsh and meshio.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.files import atomic
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FORMAT = "modeharvest-solution-1"
+NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
+_MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A plane isoparametric mesh of one element type.
+
+    Parameters
+    ----------
+    nodes
+        (n, 2) positions [mm].
+    cells
+        (m, k) node numbers; order of the nodes: see the module's docstring.
+    element
+        One of T3, T6, Q4, Q8, Q9.
+    """
+
+    nodes: FloatArray
+    cells: IntArray
+    element: str
+
+    def __post_init__(self) -> None:
+        if self.element not in NODES_PER_CELL:
+            raise InputError(f"expected an element among {list(NODES_PER_CELL)}, got {self.element}")
+        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
+        object.__setattr__(self, "cells", np.ascontiguousarray(self.cells, dtype=np.int64))
+        k = NODES_PER_CELL[self.element]
+        if self.nodes.ndim != 2 or self.nodes.shape[1] != 2:
+            raise InputError(f"expected nodes of shape (n, 2), got {self.nodes.shape}")
+        if self.cells.ndim != 2 or self.cells.shape[1] != k:
+            raise InputError(
+                f"expected {self.element} cells of shape (m, {k}), got {self.cells.shape}"
+            )
+        if not np.isfinite(self.nodes).all():
+            raise InputError("expected finite node positions, got NaN or infinity")
+        if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.nodes):
+            raise InputError(f"a cell names a node outside 0 ... {len(self.nodes) - 1}")
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """One equilibrium state.
+
+    Parameters
+    ----------
+    nominal_strain
+        Applied shortening over L, the length of the cellular part [-]; compression positive.
+    displacement
+        (n, 2) at the mesh's nodes [mm].
+    reaction
+        Compressive force on the loaded edge per unit thickness [N/mm].
+    energy
+        Stored energy per unit thickness [N].
+    negative_pivots
+        Number of negative eigenvalues of the tangent stiffness; 0 means stable, None unknown.
+    eigenvalues
+        Lowest eigenvalues of K x = lambda M x, ascending [N/mm^4]; M is the mass matrix of
+        unit density. Empty where none were computed.
+    branch
+        "primary", "buckled+" or "buckled-".
+    """
+
+    nominal_strain: float
+    displacement: FloatArray
+    reaction: float = float("nan")
+    energy: float = float("nan")
+    negative_pivots: int | None = None
+    eigenvalues: tuple[float, ...] = ()
+    branch: str = "primary"
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A mesh and its snapshots, with everything needed to make them again.
+
+    ``info`` holds plain JSON values: geometry, material, loading, versions, seed, the
+    critical strain and what the path cost.
+    """
+
+    mesh: Mesh
+    snapshots: tuple[Snapshot, ...]
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for s in self.snapshots:
+            if s.displacement.shape != self.mesh.nodes.shape:
+                raise InputError(
+                    f"snapshot at strain {s.nominal_strain}: expected displacements of shape "
+                    f"{self.mesh.nodes.shape}, got {s.displacement.shape}"
+                )
+
+    def at(self, nominal_strain: float) -> Snapshot:
+        """The stable snapshot at a nominal strain (the first one listed, if several)."""
+        found = [s for s in self.snapshots if abs(s.nominal_strain - nominal_strain) < 1e-9]
+        if not found:
+            have = ", ".join(f"{s.nominal_strain:.4f}" for s in self.snapshots) or "none"
+            raise InputError(f"expected a snapshot at strain {nominal_strain}, have: {have}")
+        return min(found, key=lambda s: s.negative_pivots or 0)
+
+    def write(self, path: Path | str) -> None:
+        """Write HDF5, atomically; displacements and nodes are stored losslessly."""
+        with atomic(path) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["element"] = self.mesh.element
+            file.attrs["info"] = json.dumps(dict(self.info))
+            file.create_dataset("nodes", data=self.mesh.nodes, compression=6, shuffle=True)
+            cells = self.mesh.cells.astype(np.int32)
+            file.create_dataset("cells", data=cells, compression=6, shuffle=True)
+            for k, s in enumerate(self.snapshots):
+                group = file.create_group(f"snapshots/{k:04d}")
+                group.create_dataset(
+                    "displacement", data=s.displacement, compression=6, shuffle=True
+                )
+                group.attrs["nominal_strain"] = s.nominal_strain
+                group.attrs["reaction"] = s.reaction
+                group.attrs["energy"] = s.energy
+                group.attrs["negative_pivots"] = (
+                    -1 if s.negative_pivots is None else s.negative_pivots
+                )
+                group.attrs["eigenvalues"] = np.asarray(s.eigenvalues, dtype=np.float64)
+                group.attrs["branch"] = s.branch
+
+    @classmethod
+    def read(cls, path: Path | str) -> Solution:
+        """Read what :meth:`write` wrote.
+
+        Raises
+        ------
+        InputError
+            If the file is missing, cut short or of another format.
+        """
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != FORMAT:
+                    raise InputError(
+                        f"expected a {FORMAT} file at {path}, got format "
+                        f"{file.attrs.get('format')!r}; make it again with 'modeharvest fem'"
+                    )
+                mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
+                groups = file.get("snapshots", {})
+                snapshots = tuple(_read_snapshot(groups[name]) for name in sorted(groups))
+                return cls(mesh, snapshots, json.loads(file.attrs["info"]))
+        except (OSError, KeyError) as error:
+            raise InputError(
+                f"expected a solution (HDF5) at {path}, got: {error}; "
+                "make it again with 'modeharvest fem'"
+            ) from error
+
+    def write_vtu(self, path: Path | str) -> None:
+        """Write mesh and all displacements as VTU for ParaView, atomically."""
+        flat = np.zeros((len(self.mesh.nodes), 1))
+        points = np.hstack([self.mesh.nodes, flat])
+        data = {
+            f"u_mm_{k:04d}_{s.branch}_{100 * s.nominal_strain:.3f}pct": np.hstack(
+                [s.displacement, flat]
+            )
+            for k, s in enumerate(self.snapshots)
+        }
+        cells = [(_MESHIO_NAME[self.mesh.element], self.mesh.cells)]
+        with atomic(path) as temporary:
+            meshio.Mesh(points, cells, point_data=data).write(temporary, file_format="vtu")
+
+
+def _read_snapshot(group: h5py.Group) -> Snapshot:
+    pivots = int(group.attrs["negative_pivots"])
+    return Snapshot(
+        nominal_strain=float(group.attrs["nominal_strain"]),
+        displacement=group["displacement"][:],
+        reaction=float(group.attrs["reaction"]),
+        energy=float(group.attrs["energy"]),
+        negative_pivots=None if pivots < 0 else pivots,
+        eigenvalues=tuple(float(v) for v in group.attrs["eigenvalues"]),
+        branch=str(group.attrs["branch"]),
+    )
+
+
+def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:
+    """Take the mesh and displacement of any solver whose file meshio reads.
+
+    Parameters
+    ----------
+    path
+        File with T3, T6, Q4, Q8 or Q9 cells in the x-y plane [mm].
+    displacement
+        Name of the nodal vector field to read [mm].
+    nominal_strain
+        The strain to label the snapshot with [-].
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, has no such cells or no such field.
+    """
+    try:
+        source = meshio.read(path)
+    except Exception as error:  # meshio raises a different type for every format
+        raise InputError(f"expected a mesh that meshio reads at {path}, got: {error}") from error
+    blocks = {block.type: block.data for block in source.cells}
+    for element, name in _MESHIO_NAME.items():
+        if name in blocks:
+            break
+    else:
+        raise InputError(
+            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {list(blocks)}"
+        )
+    if displacement not in source.point_data:
+        raise InputError(
+            f"expected a nodal field {displacement!r} in {path}, got {list(source.point_data)}"
+        )
+    cells = np.vstack([b.data for b in source.cells if b.type == name])
+    mesh = Mesh(source.points[:, :2], cells, element)
+    u = np.ascontiguousarray(source.point_data[displacement][:, :2], dtype=np.float64)
+    return Solution(mesh, (Snapshot(nominal_strain, u),), {"source": str(path)})

@@ -1,0 +1,1 @@
+"""Micromorphic integrated digital image correlation."""

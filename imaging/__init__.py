@@ -1,0 +1,1 @@
+"""Speckle images whose truth is known at every pixel."""
