@@ -1,0 +1,35 @@
+# The commands of the project. Each sets up what it needs through scripts/env, which says
+# beforehand what it installs, where, and how long that takes.
+
+ENV := scripts/env
+OUT := out/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint test-next bench clean
+
+help: ## Show this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | \
+	  while IFS='|' read -r name what; do printf '  make %-10s %s\n' "$$name" "$$what"; done
+
+demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
+	$(ENV) python -m modeharvest run paper-virtual --out $(OUT)
+
+test: lint ## Lint, type-check and run the tests: all that must pass before a commit
+	$(ENV) python -m pytest
+
+lint: ## Check style, types and the direction of imports
+	$(ENV) ruff check .
+	$(ENV) ruff format --check .
+	$(ENV) mypy -p modeharvest
+	$(ENV) lint-imports
+
+test-next: ## Run the tests on the next dolfinx (Debian unstable, in a root of its own)
+	$(ENV) --next python -m pytest
+
+bench: ## Measure what benchmarks/ measures (ratios within one run)
+	$(ENV) python -m pytest benchmarks --benchmark-only
+
+clean: ## Remove what the other commands leave in this folder (not the cache, not out/)
+	rm -rf build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis \
+	  .import_linter_cache .benchmarks
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
