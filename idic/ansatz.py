@@ -1,0 +1,217 @@
+"""The kinematics that IDIC looks for: u(x) = v0(x) + sum_i v_i(x) phi_i(x).
+
+Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x right, y up).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.chebyshev import Box, ChebyshevField
+from modeharvest.idic.fourier import FourierMode, square_family
+from modeharvest.idic.support import Taper
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ansatz:
+    """Slow field v0, amplitudes v_i and modes phi_i, and the order of their unknowns.
+
+    The unknowns are, in this order: v0 along x, v0 along y [mm], v_1 ... v_n [mm], then the
+    parameters of phi_1 ... phi_n.
+
+    Parameters
+    ----------
+    domain
+        The box that the Chebyshev polynomials span; the whole specimen [mm].
+    modes
+        phi_1 ... phi_n; none gives a plain global DIC with v0 alone.
+    v0_degree, v_degree
+        Total degrees of v0 (5 in the paper) and of every v_i (6).
+    """
+
+    domain: Box
+    modes: tuple[FourierMode, ...] = ()
+    v0_degree: int = 5
+    v_degree: int = 6
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "modes", tuple(self.modes))
+        if self.v0_degree < 1 or self.v_degree < 0:
+            raise InputError(
+                "expected degrees of at least 1 for v0 and 0 for v_i, got "
+                f"{self.v0_degree} and {self.v_degree}"
+            )
+
+    @classmethod
+    def square(
+        cls, domain: Box, cellular: Box, unit_cell: float, origin: str = "junction"
+    ) -> Ansatz:
+        """The paper's ansatz for a square stacking of holes: 77 unknowns.
+
+        Parameters
+        ----------
+        domain
+            The specimen [mm].
+        cellular
+            The part of it that has holes [mm]; the mode fades to zero outside it over half a
+            unit cell.
+        unit_cell
+            l [mm].
+        origin
+            "junction" or "hole": what lies at x = y = 0.
+        """
+        taper = Taper(cellular, 0.5 * unit_cell)
+        return cls(domain, (FourierMode.scaled(square_family(origin), unit_cell, taper),))
+
+    @property
+    def v0_space(self) -> ChebyshevField:
+        """The space of either component of v0."""
+        return ChebyshevField(self.domain, self.v0_degree)
+
+    @property
+    def v_space(self) -> ChebyshevField:
+        """The space of every v_i."""
+        return ChebyshevField(self.domain, self.v_degree)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.phi_offset(len(self.modes))
+
+    def v0_slice(self, component: int) -> slice:
+        """Where v0 along x (0) or y (1) is among the unknowns."""
+        n = self.v0_space.size
+        return slice(component * n, (component + 1) * n)
+
+    def v_slice(self, i: int) -> slice:
+        """Where v of the mode number i (from 0) is among the unknowns."""
+        first = 2 * self.v0_space.size + i * self.v_space.size
+        return slice(first, first + self.v_space.size)
+
+    def phi_offset(self, i: int) -> int:
+        """Number of unknowns before the parameters of the mode number i (from 0)."""
+        slow = 2 * self.v0_space.size + len(self.modes) * self.v_space.size
+        return slow + sum(mode.family.size for mode in self.modes[:i])
+
+    def phi_slice(self, i: int) -> slice:
+        """Where the parameters of the mode number i (from 0) are among the unknowns."""
+        return slice(self.phi_offset(i), self.phi_offset(i + 1))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each unknown: ``v0x[2,1]``, ``v1[0,3]``, ``phi1.a4``."""
+        v0 = [f"v0{c}[{i},{j}]" for c in "xy" for i, j in self.v0_space.orders]
+        v = [f"v{k + 1}[{i},{j}]" for k in range(len(self.modes)) for i, j in self.v_space.orders]
+        phi = [f"phi{k + 1}.{name}" for k, m in enumerate(self.modes) for name in m.family.names]
+        return tuple(v0 + v + phi)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each unknown."""
+        slow = ("mm",) * self.phi_offset(0)
+        return slow + tuple(unit for mode in self.modes for unit in mode.family.units)
+
+    def checked(self, a: ArrayLike) -> FloatArray:
+        """The unknowns as (size,) floats; raises InputError if the size is wrong."""
+        a = np.asarray(a, dtype=np.float64)
+        if a.shape != (self.size,):
+            raise InputError(
+                f"expected {self.size} unknowns for this ansatz, got an array of shape {a.shape}"
+            )
+        if not np.isfinite(a).all():
+            bad = int(np.argmin(np.isfinite(a)))
+            raise InputError(f"expected finite unknowns, got {a[bad]} for {self.names[bad]}")
+        return a
+
+    def start(self, strain: float = 0.0, amplitude: float = 1.0) -> FloatArray:
+        """Where a correlation begins, as in the paper.
+
+        Parameters
+        ----------
+        strain
+            Nominal compression along x [-], the shortening over the length of the cellular
+            part; v0x = -strain (x - centre), so that the ends of the cellular part move by half
+            the shortening. Positive in compression.
+        amplitude
+            The constant that every v_i starts with [mm]; not zero, because the modes could
+            not be seen then. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
+        """
+        a = np.zeros(self.size)
+        a[self.v0_slice(0)][1] = -strain * self.domain.half[0]
+        for i, mode in enumerate(self.modes):
+            a[self.v_slice(i)][0] = amplitude
+            a[self.phi_slice(i)] = mode.family.start
+        return a
+
+    def v0(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """(..., 2): the slow field [mm]; positions as in :meth:`displacement`."""
+        a, (x, y) = self.checked(a), _positions(x, y)
+        space = self.v0_space
+        return np.stack([space.evaluate(a[self.v0_slice(c)], x, y) for c in (0, 1)], axis=-1)
+
+    def v(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """(...): the amplitude of the mode number i (from 0) [mm]."""
+        a, (x, y) = self.checked(a), _positions(x, y)
+        return self.v_space.evaluate(a[self.v_slice(i)], x, y)
+
+    def phi(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """(..., 2): the mode number i (from 0) [-]."""
+        a, (x, y) = self.checked(a), _positions(x, y)
+        return self.modes[i].evaluate(a[self.phi_slice(i)], x, y)
+
+    def fluctuation(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """(..., 2): v_i phi_i of the mode number i (from 0) [mm]."""
+        return self.v(i, a, x, y)[..., None] * self.phi(i, a, x, y)
+
+    def displacement(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """The whole displacement [mm].
+
+        Parameters
+        ----------
+        a
+            (size,) unknowns.
+        x, y
+            Two axes, one-dimensional both (``grid.x`` and ``grid.y``), which give an array
+            (len(y), len(x), 2) fast; or arrays of any other shapes that broadcast together.
+        """
+        total = self.v0(a, x, y)
+        for i in range(len(self.modes)):
+            total += self.fluctuation(i, a, x, y)
+        return total
+
+    def displacement_at(self, a: ArrayLike, points: ArrayLike) -> FloatArray:
+        """(..., 2): the whole displacement [mm] at points (..., 2) [mm]."""
+        points = np.asarray(points, dtype=np.float64)
+        at = self.displacement(a, points[..., None, 0], points[..., None, 1])
+        return np.asarray(at[..., 0, :])
+
+    def sensitivities(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """(..., 2, size): derivatives of the displacement with respect to the unknowns.
+
+        Meant for tests and for few points; the correlation itself never forms it.
+        """
+        a, (x, y) = self.checked(a), _positions(x, y)
+        x, y = np.broadcast_arrays(x, y)
+        result = np.zeros((*x.shape, 2, self.size))
+        for c in (0, 1):
+            result[..., c, self.v0_slice(c)] = self.v0_space.basis(x, y)
+        for i, mode in enumerate(self.modes):
+            part = self.phi_slice(i)
+            phi, v = mode.evaluate(a[part], x, y), self.v_space.evaluate(a[self.v_slice(i)], x, y)
+            result[..., self.v_slice(i)] = phi[..., None] * self.v_space.basis(x, y)[..., None, :]
+            result[..., part] = v[..., None, None] * mode.sensitivities(a[part], x, y)
+        return result
+
+
+def _positions(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two one-dimensional axes as an open grid; anything else as it is."""
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if x.ndim == 1 and y.ndim == 1:
+        return x[None, :], y[:, None]
+    return x, y

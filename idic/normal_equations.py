@@ -1,0 +1,245 @@
+"""Gauss-Newton's normal equations of an ansatz, assembled from moments.
+
+The unknowns of the ansatz are a linear combination of *primitives*: a base field times a
+product of Chebyshev polynomials (see :mod:`modeharvest.idic.moments`). From
+T_a T_b = (T_(a+b) + T_|a-b|)/2 the matrix of the primitives follows from the moments, and the
+mode families then make from it the matrix of the unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import orders
+from modeharvest.idic.fourier import PER_WAVE
+from modeharvest.idic.moments import IMAGE, accumulate
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.interpolation import SplineImage
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+BANDS = 64
+"""Bands of rows; fixed, so that sums don't depend on the number of threads."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The quadratic model of the cost 1/2 sum r^2 around some unknowns.
+
+    Parameters
+    ----------
+    matrix
+        (n, n): J'J, where J is minus the derivative of the residual.
+    gradient
+        (n,): -J'r, the derivative of the cost.
+    cost
+        1/2 sum r^2 over the pixels used.
+    pixels
+        Number of pixels used; a displacement fit counts its two components as two.
+    left_image
+        Number of pixels whose deformed position is outside the image.
+    """
+
+    matrix: FloatArray
+    gradient: FloatArray
+    cost: float
+    pixels: int
+    left_image: int
+
+    @property
+    def mean_square(self) -> float:
+        """Mean of r^2 over the pixels used; infinite if there is none."""
+        return 2.0 * self.cost / self.pixels if self.pixels else float("inf")
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(
+            self.matrix + other.matrix,
+            self.gradient + other.gradient,
+            self.cost + other.cost,
+            self.pixels + other.pixels,
+            self.left_image + other.left_image,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """What stays the same from one iteration to the next: ansatz, pixels and tables.
+
+    Parameters
+    ----------
+    ansatz
+        The kinematics.
+    grid
+        Where the pixels are.
+    mask
+        (rows, cols) True where there is material.
+    """
+
+    ansatz: Ansatz
+    grid: PixelGrid
+    mask: BoolArray
+
+    def __post_init__(self) -> None:
+        if self.mask.shape != self.grid.shape:
+            raise InputError(
+                f"expected a mask of {self.grid.shape} px like the grid, got {self.mask.shape}"
+            )
+
+    @cached_property
+    def _columns(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        row_start = np.concatenate([[0], np.cumsum(self.mask.sum(axis=1, dtype=np.int64))])
+        return np.nonzero(self.mask)[1].astype(np.int32), row_start
+
+    @cached_property
+    def _degrees(self) -> list[int]:
+        """Total degree of the products that multiply each base field."""
+        d = [self.ansatz.v0_degree] * 2
+        d += [self.ansatz.v_degree] * len(self.ansatz.modes)
+        for mode in self.ansatz.modes:
+            d += [0, 0, 1] * mode.family.wave_count
+        return [*d, 0]
+
+    @cached_property
+    def _pairs(self) -> NDArray[np.int64]:
+        d = self._degrees
+        return np.array([(e, k, d[e] + d[k]) for e in range(len(d)) for k in range(e, len(d))])
+
+    @cached_property
+    def _primitive_slices(self) -> list[slice]:
+        ends = np.cumsum([0] + [(d + 1) * (d + 2) // 2 for d in self._degrees])
+        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    @cached_property
+    def _to_unknowns(self) -> FloatArray:
+        """(primitives, unknowns): how each unknown's sensitivity is made of primitives."""
+        ansatz, parts = self.ansatz, self._primitive_slices
+        result = np.zeros((parts[-1].start, ansatz.size))
+        slow = ansatz.phi_offset(0)
+        result[:slow, :slow] = np.eye(slow)
+        (xc, yc), (hx, hy) = ansatz.domain.centre, ansatz.domain.half
+        k = 2 + len(ansatz.modes)
+        for i, mode in enumerate(ansatz.modes):
+            for w in range(mode.family.wave_count):
+                wave = np.zeros((5, PER_WAVE))  # rows: sin gx, sin gy, then T00, T10, T01 of cos
+                wave[0, 0] = wave[1, 1] = 1.0
+                wave[2:, 2] = xc, hx, 0.0
+                wave[2:, 3] = yc, 0.0, hy
+                wave[2, 4] = 1.0
+                rows = slice(parts[k].start, parts[k + 2].stop)
+                family = mode.family.matrix[PER_WAVE * w : PER_WAVE * (w + 1)]
+                result[rows, ansatz.phi_slice(i)] = wave @ family
+                k += 3
+        return result
+
+    def images(
+        self,
+        a: FloatArray,
+        reference: NDArray[Any],
+        deformed: SplineImage,
+        allowed: BoolArray | None = None,
+    ) -> NormalEquations:
+        """The normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
+
+        Parameters
+        ----------
+        a
+            (size,) unknowns.
+        reference
+            (rows, cols): f.
+        deformed
+            g.
+        allowed
+            (rows, cols) where g may be sampled; None for everywhere.
+        """
+        if allowed is None:
+            allowed = np.zeros((0, 0), dtype=np.bool_)
+        return self._assemble(a, IMAGE, reference, deformed.coefficients, deformed.order, allowed)
+
+    def displacement(self, a: FloatArray, target: NDArray[Any]) -> NormalEquations:
+        """The normal equations of r = target - u(a), both components.
+
+        Parameters
+        ----------
+        a
+            (size,) unknowns.
+        target
+            (rows, cols, 2) displacement [mm].
+        """
+        nothing = np.zeros((8, 8), dtype=np.float32)
+        everywhere = np.zeros((0, 0), dtype=np.bool_)
+        x, y = (
+            self._assemble(a, c, np.ascontiguousarray(target[..., c]), nothing, 5, everywhere)
+            for c in (0, 1)
+        )
+        return x + y
+
+    def _assemble(
+        self,
+        a: FloatArray,
+        component: int,
+        f: NDArray[Any],
+        coefficients: NDArray[Any],
+        order: int,
+        allowed: BoolArray,
+    ) -> NormalEquations:
+        ansatz, grid = self.ansatz, self.grid
+        a = ansatz.checked(a)
+        xi, eta = ansatz.domain.normalised(grid.x, grid.y)
+        columns, row_start = self._columns
+        top = int(self._pairs[:, 2].max()) + 1
+        moments = np.zeros((BANDS, len(self._pairs), top, top))
+        counts = np.zeros((BANDS, 2), dtype=np.int64)
+        accumulate(
+            component, f, coefficients, order, grid.pixel_size, allowed, columns, row_start,
+            xi, eta, *_tables(ansatz, grid, a), self._pairs, BANDS, moments, counts,
+        )  # fmt: skip
+        used, off = (int(n) for n in counts.sum(axis=0))
+        return self._from_moments(moments.sum(axis=0), used, off)
+
+    def _from_moments(self, moments: FloatArray, used: int, off: int) -> NormalEquations:
+        parts, degrees = self._primitive_slices, self._degrees
+        matrix = np.zeros((parts[-1].stop, parts[-1].stop))
+        for (e, k, _), moment in zip(self._pairs, moments, strict=True):
+            matrix[parts[e], parts[k]] = _products(moment, degrees[e], degrees[k])
+            matrix[parts[k], parts[e]] = matrix[parts[e], parts[k]].T
+        to = self._to_unknowns
+        return NormalEquations(
+            to.T @ matrix[:-1, :-1] @ to, -to.T @ matrix[:-1, -1], 0.5 * matrix[-1, -1], used, off
+        )
+
+
+def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
+    """Sums of e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
+    i, j = np.array(orders(degree)).T[:, :, None]
+    k, m = np.array(orders(other)).T[:, None, :]
+    a, b, c, d = i + k, abs(i - k), j + m, abs(j - m)
+    return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
+
+
+def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> tuple[NDArray[Any], ...]:
+    """The one-dimensional tables that the kernel combines; see ``accumulate``."""
+    v0 = np.stack([ansatz.v0_space.square(a[ansatz.v0_slice(c)]) for c in (0, 1)])
+    n, d = len(ansatz.modes), ansatz.v_degree + 1
+    v, waves, mode_of_wave = np.zeros((n, d, d)), np.zeros((0, 6)), []
+    taper_x, taper_y = np.zeros((n, grid.cols)), np.zeros((n, grid.rows))
+    for i, mode in enumerate(ansatz.modes):
+        v[i] = ansatz.v_space.square(a[ansatz.v_slice(i)])
+        own = mode.family.waves(a[ansatz.phi_slice(i)])
+        per_mm = np.full((len(own), 1), np.pi / mode.half_wavelength)
+        waves = np.vstack([waves, np.hstack([own, per_mm])])
+        mode_of_wave += [i] * len(own)
+        taper_x[i] = mode.scale * mode.taper.along_x(grid.x)
+        taper_y[i] = mode.taper.along_y(grid.y)
+    tx = waves[:, 5:] * waves[:, 2:3] * grid.x
+    ty = waves[:, 5:] * (waves[:, 3:4] * grid.y + waves[:, 4:5])
+    owner = np.array(mode_of_wave, dtype=np.int64)
+    trig = (np.sin(tx), np.cos(tx), np.sin(ty), np.cos(ty))
+    return (v0, v, waves, owner, *trig, taper_x, taper_y)
