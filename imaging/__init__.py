@@ -1,1 +1,15 @@
-"""Speckle images whose truth is known at every pixel."""
+"""Speckle images whose truth is known at every pixel.
+
+===============  =============================================================================
+grid             pixels and millimetres, the one place for the y flip
+speckle          the pattern: a thresholded Gaussian field, blurred, exact at any point
+elements         reference elements, polynomials over them
+jacobian         proof that an element's map is one to one
+isoparametric    inverse mapping: element and local coordinates of every pixel
+rasterise        its compiled kernels
+render           reference and deformed images, and the truth behind them
+spec, imageset   what to image, and the folder of files that comes of it
+truth, io        truth files; images and masks from and to files
+interpolation    values and gradients of a measured image between its pixels
+===============  =============================================================================
+"""

@@ -46,7 +46,7 @@ class PixelGrid:
 
     @classmethod
     def centred(cls, rows: int, cols: int, pixel_size: float) -> PixelGrid:
-        """The grid whose image centre is the physical origin."""
+        """Make the grid whose image centre is the physical origin."""
         return cls(
             rows, cols, pixel_size, -0.5 * (cols - 1) * pixel_size, 0.5 * (rows - 1) * pixel_size
         )
@@ -59,12 +59,12 @@ class PixelGrid:
     @property
     def x(self) -> FloatArray:
         """(cols,) x of the pixel centres [mm], ascending."""
-        return self.x0 + self.pixel_size * np.arange(self.cols)
+        return np.asarray(self.x0 + self.pixel_size * np.arange(self.cols), dtype=np.float64)
 
     @property
     def y(self) -> FloatArray:
         """(rows,) y of the pixel centres [mm], descending."""
-        return self.y0 - self.pixel_size * np.arange(self.rows)
+        return np.asarray(self.y0 - self.pixel_size * np.arange(self.rows), dtype=np.float64)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -85,7 +85,7 @@ class PixelGrid:
         return row, col
 
     def binned(self, factor: int) -> PixelGrid:
-        """The grid of ``factor`` x ``factor`` blocks of pixels; incomplete blocks are dropped."""
+        """Join blocks of ``factor`` x ``factor`` pixels; incomplete blocks are dropped."""
         shift = 0.5 * (factor - 1) * self.pixel_size
         return PixelGrid(
             self.rows // factor,

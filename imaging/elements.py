@@ -1,0 +1,165 @@
+"""Reference elements T3, T6, Q4, Q8 and Q9, and polynomials over them.
+
+An element is its nodes and the monomials it spans; everything else follows. Over an element
+every field (position, displacement) is one polynomial in the local coordinates (xi, eta), kept
+as nine coefficients in the order
+
+    1, xi, eta, xi^2, xi eta, eta^2, xi^2 eta, xi eta^2, xi^2 eta^2,
+
+so that all element types share the same kernels. Triangles live on xi, eta >= 0,
+xi + eta <= 1; quadrilaterals on -1 <= xi, eta <= 1. Node order: see modeharvest.fem.field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import factorial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+EXPONENTS = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [2, 1], [1, 2], [2, 2]])
+
+_TRIANGLE = [[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]
+_SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0], [0, 0]]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceElement:
+    """One element type.
+
+    Parameters
+    ----------
+    name
+        T3, T6, Q4, Q8 or Q9.
+    triangular
+        Whether the reference domain is the triangle (else the square).
+    nodes
+        (k, 2) local coordinates (xi, eta) of the nodes [-].
+    monomials
+        Which k of the nine monomials the element spans.
+
+    Attributes
+    ----------
+    coefficients : (9, k); column a holds the coefficients of node a's shape function.
+    """
+
+    name: str
+    triangular: bool
+    nodes: FloatArray
+    monomials: tuple[int, ...]
+    coefficients: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        full = np.zeros((9, len(self.nodes)))
+        full[list(self.monomials)] = np.linalg.inv(monomials(self.nodes)[:, self.monomials])
+        # The exact values are multiples of 1/4; the inversion may leave rounding behind.
+        object.__setattr__(self, "coefficients", np.round(full * 4.0) / 4.0)
+
+
+def monomials(xi: ArrayLike) -> FloatArray:
+    """(..., 9) values of the nine monomials at local coordinates (..., 2)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    return np.asarray(xi[..., :1] ** EXPONENTS[:, 0] * xi[..., 1:] ** EXPONENTS[:, 1])
+
+
+def monomial_gradients(xi: ArrayLike) -> FloatArray:
+    """(..., 9, 2) derivatives of the nine monomials along xi and eta at (..., 2)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    i, j = EXPONENTS.T
+    along_xi = i * xi[..., :1] ** np.maximum(i - 1, 0) * xi[..., 1:] ** j
+    along_eta = j * xi[..., :1] ** i * xi[..., 1:] ** np.maximum(j - 1, 0)
+    return np.stack([along_xi, along_eta], axis=-1)
+
+
+def _make(name: str, triangular: bool, count: int, spanned: tuple[int, ...]) -> ReferenceElement:
+    nodes = np.array(_TRIANGLE if triangular else _SQUARE, dtype=np.float64)[:count]
+    return ReferenceElement(name, triangular, nodes, spanned)
+
+
+_ELEMENTS = {
+    "T3": _make("T3", True, 3, (0, 1, 2)),
+    "T6": _make("T6", True, 6, (0, 1, 2, 3, 4, 5)),
+    "Q4": _make("Q4", False, 4, (0, 1, 2, 4)),
+    "Q8": _make("Q8", False, 8, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "Q9": _make("Q9", False, 9, (0, 1, 2, 3, 4, 5, 6, 7, 8)),
+}
+
+
+def reference_element(name: str) -> ReferenceElement:
+    """Look up a reference element by its name; InputError if there is none."""
+    try:
+        return _ELEMENTS[name]
+    except KeyError:
+        raise InputError(f"expected an element among {list(_ELEMENTS)}, got {name!r}") from None
+
+
+def shape_functions(name: str, xi: ArrayLike) -> FloatArray:
+    """(..., k) shape functions of element ``name`` at local coordinates (..., 2)."""
+    return np.asarray(monomials(xi) @ reference_element(name).coefficients)
+
+
+def shape_gradients(name: str, xi: ArrayLike) -> FloatArray:
+    """(..., k, 2) derivatives of the shape functions along xi and eta at (..., 2)."""
+    coefficients = reference_element(name).coefficients
+    return np.asarray(np.einsum("...mi,mk->...ki", monomial_gradients(xi), coefficients))
+
+
+def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
+    """(m, c, 9) coefficients, over each cell (m, k), of a nodal field (n, c)."""
+    per_cell = nodal[cells].transpose(0, 2, 1)
+    return np.ascontiguousarray(per_cell @ reference_element(name).coefficients.T)
+
+
+def lattice(triangular: bool, degree: int) -> FloatArray:
+    """(p, 2) equidistant points that determine a polynomial of ``degree`` on the domain.
+
+    Total degree on the triangle, degree in each coordinate on the square.
+    """
+    steps = [(i, j) for i in range(degree + 1) for j in range(degree + 1)]
+    if triangular:
+        return np.array([s for s in steps if sum(s) <= degree], dtype=np.float64) / degree
+    return 2.0 * np.array(steps, dtype=np.float64) / degree - 1.0
+
+
+def bernstein(triangular: bool, degree: int, xi: FloatArray) -> FloatArray:
+    """(..., p) Bernstein polynomials at local coordinates (..., 2), ordered like the lattice.
+
+    A polynomial lies between the least and the greatest of its Bernstein coefficients; those
+    of a mapping are its Bézier control points, whose convex hull holds the element.
+    """
+    x, y = xi[..., 0], xi[..., 1]
+    columns = []
+    for u, v in lattice(triangular, degree):
+        if triangular:
+            i, j = round(u * degree), round(v * degree)
+            k = degree - i - j
+            count = factorial(degree) // (factorial(i) * factorial(j) * factorial(k))
+            columns.append(count * x**i * y**j * (1.0 - x - y) ** k)
+        else:
+            i, j = round((u + 1) * degree / 2), round((v + 1) * degree / 2)
+            count = factorial(degree) ** 2 // (
+                factorial(i) * factorial(degree - i) * factorial(j) * factorial(degree - j)
+            )
+            s, t = 0.5 * (1.0 + x), 0.5 * (1.0 + y)
+            columns.append(
+                count * s**i * (1.0 - s) ** (degree - i) * t**j * (1.0 - t) ** (degree - j)
+            )
+    return np.stack(columns, axis=-1)
+
+
+def to_bernstein(triangular: bool, degree: int) -> FloatArray:
+    """(p, p) matrix from values at the lattice to Bernstein coefficients."""
+    values = bernstein(triangular, degree, lattice(triangular, degree))
+    return np.asarray(np.linalg.inv(values), dtype=np.float64)
+
+
+def bezier_matrix(triangular: bool) -> FloatArray:
+    """(p, 9) matrix from the nine monomial coefficients to quadratic Bézier control points."""
+    points = lattice(triangular, 2)
+    return np.asarray(to_bernstein(triangular, 2) @ monomials(points))

@@ -1,0 +1,293 @@
+"""Benchmark images with certified truth: a folder that any DIC code can be scored on.
+
+::
+
+    reference.tif  reference_8bit.tif  mask.tif
+    deformed_0780.tif  deformed_0780_8bit.tif  deformed_0780_mask.tif  truth_0780.h5
+    images.json
+
+The number in a file's name is the nominal strain in hundredths of a percent (0780 is 7.80 %).
+``images.json`` says how the set was made and is written last: without it, the set isn't
+finished. For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import modeharvest
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.files import read_json, write_json
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.io import quantise, read_image, read_mask, write_image
+from modeharvest.imaging.isoparametric import locate
+from modeharvest.imaging.render import Rendering, Truth, render_deformed, render_reference
+from modeharvest.imaging.spec import ImagingSpec, choose_grid
+from modeharvest.imaging.speckle import Speckle
+from modeharvest.imaging.truth import read_truth, write_truth
+from modeharvest.progress import Progress, silent
+
+BoolArray = NDArray[np.bool_]
+
+__all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
+
+FORMAT = "modeharvest-images-1"
+SIDECAR = "images.json"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSet:
+    """A finished set on disk; images and truth are read when asked for.
+
+    Parameters
+    ----------
+    folder
+        Where the files are.
+    info
+        The content of ``images.json``.
+    """
+
+    folder: Path
+    info: dict[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path | str) -> ImageSet:
+        """Open a set; InputError if it isn't there or isn't finished."""
+        folder = Path(folder)
+        if not (folder / SIDECAR).is_file():
+            raise InputError(
+                f"expected a finished image set in {folder}, found no {SIDECAR}; "
+                "make it with 'modeharvest image'"
+            )
+        info = read_json(folder / SIDECAR)
+        if not isinstance(info, dict) or info.get("format") != FORMAT:
+            raise InputError(f"expected {FORMAT} in {folder / SIDECAR}, make the set again")
+        return cls(folder, info)
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The pixels of all images of the set."""
+        return PixelGrid(**self.info["grid"])
+
+    @property
+    def strains(self) -> tuple[float, ...]:
+        """Nominal strains of the deformed images [-]."""
+        return tuple(s["nominal_strain"] for s in self.info["snapshots"])
+
+    @property
+    def max_residual_px(self) -> float:
+        """The largest residual of the inverse mapping in the whole set [px]."""
+        return float(self.info["inverse_map_max_residual_px"])
+
+    def reference(self, *, camera: bool = False) -> NDArray[np.float32]:
+        """(rows, cols) reference image [fraction of full scale]; ``camera``: the quantised one."""
+        return self._image(self.info["reference"], camera)
+
+    def mask(self) -> BoolArray:
+        """(rows, cols) True where the reference image shows material."""
+        return read_mask(self.folder / self.info["reference"]["mask"])
+
+    def deformed(self, strain: float, *, camera: bool = False) -> NDArray[np.float32]:
+        """(rows, cols) deformed image [fraction of full scale] at a nominal strain [-]."""
+        return self._image(self._snapshot(strain), camera)
+
+    def deformed_mask(self, strain: float) -> BoolArray:
+        """(rows, cols) True where the deformed image shows material."""
+        return read_mask(self.folder / self._snapshot(strain)["mask"])
+
+    def truth(self, strain: float) -> Truth:
+        """Read the truth behind the deformed image at a nominal strain [-]."""
+        return read_truth(self.folder / self._snapshot(strain)["truth"])
+
+    def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
+        path = self.folder / entry["camera_image" if camera else "image"]
+        image = read_image(path)
+        if camera and self.info["spec"]["bits"] not in (8, 16):
+            full = 255.0 if self.info["spec"]["bits"] < 8 else 65535.0
+            image *= np.float32(full / (2 ** self.info["spec"]["bits"] - 1))
+        return image
+
+    def _snapshot(self, strain: float) -> dict[str, Any]:
+        for entry in self.info["snapshots"]:
+            if abs(entry["nominal_strain"] - strain) < 1e-9:
+                found: dict[str, Any] = entry
+                return found
+        raise InputError(
+            f"expected an image at strain {strain} in {self.folder}, have: "
+            f"{', '.join(f'{s:.4f}' for s in self.strains)}"
+        )
+
+
+def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
+    """Digest everything that the images depend on, hexadecimal."""
+    digest = hashlib.sha256()
+    wanted = {"format": FORMAT, "spec": asdict(spec), "element": solution.mesh.element,
+              "strains": [float(s) for s in strains]}  # fmt: skip
+    digest.update(json.dumps(wanted, sort_keys=True).encode())
+    for array in (solution.mesh.nodes, solution.mesh.cells):
+        digest.update(array.tobytes())
+    for strain in strains:
+        digest.update(np.ascontiguousarray(solution.at(strain).displacement).tobytes())
+    return digest.hexdigest()
+
+
+def is_complete(folder: Path | str, key: str, *, verify: bool = False) -> bool:
+    """Whether ``folder`` holds a finished set of that key, with all files of the listed sizes.
+
+    ``verify`` also compares the files' SHA-256 digests.
+    """
+    folder = Path(folder)
+    try:
+        info = read_json(folder / SIDECAR)
+        if info["format"] != FORMAT or info["key"] != key:
+            return False
+        for name, entry in info["files"].items():
+            if (folder / name).stat().st_size != entry["bytes"]:
+                return False
+            if verify and _sha256(folder / name) != entry["sha256"]:
+                return False
+    except (InputError, OSError, KeyError, TypeError):
+        return False
+    return True
+
+
+def make_images(
+    solution: Solution,
+    strains: Sequence[float],
+    spec: ImagingSpec,
+    folder: Path | str,
+    progress: Progress = silent,
+) -> ImageSet:
+    """Make (or find finished) the images and the truth of some snapshots.
+
+    Parameters
+    ----------
+    solution
+        Mesh and displacements.
+    strains
+        Nominal strains of the snapshots to image [-].
+    spec
+        How.
+    folder
+        Where to write; made if it doesn't exist. A finished set of the same solution, strains
+        and spec is left as it is; any other set there is replaced.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If a snapshot is missing, an element is turned inside out, two strains would share a
+        file name, or the disk refuses.
+    """
+    folder = Path(folder)
+    labels = [_label(s) for s in strains]
+    if not labels or len(set(labels)) < len(labels):
+        raise InputError(f"expected strains that differ by 0.01 % or more, got {list(strains)}")
+    key = image_key(solution, strains, spec)
+    if is_complete(folder, key):
+        return ImageSet.read(folder)
+    _discard(folder)
+    info = _write_set(solution, list(zip(strains, labels, strict=True)), spec, folder, progress)
+    names = [n for e in (info["reference"], *info["snapshots"]) for n in _file_names(e)]
+    files = {n: {"bytes": (folder / n).stat().st_size, "sha256": _sha256(folder / n)}
+             for n in names}  # fmt: skip
+    write_json(folder / SIDECAR, {"format": FORMAT, "key": key, **info, "files": files})
+    progress(1, 1, "images")
+    return ImageSet.read(folder)
+
+
+def _write_set(
+    solution: Solution,
+    wanted: list[tuple[float, str]],
+    spec: ImagingSpec,
+    folder: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    steps = 1 + 2 * len(wanted) + 1
+    progress(0, steps, "images: reference")
+    mesh = solution.mesh
+    grid = choose_grid(solution, [strain for strain, _ in wanted], spec)
+    located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
+    speckle = Speckle(spec.speckle, grid.shape)
+    rendering = render_reference(located, speckle, spec.background)
+    reference = _write_rendering(folder, "reference", "mask.tif", rendering, spec)
+    residual = located.max_residual_px
+    snapshots = []
+    for k, (strain, label) in enumerate(wanted):
+        name = f"deformed_{label}"
+        progress(1 + 2 * k, steps, f"images: strain {100 * strain:.2f} %")
+        rendering, truth = render_deformed(
+            mesh, solution.at(strain).displacement, located, grid, speckle, spec.background,
+            f"snapshot at strain {strain:.4f}",
+        )  # fmt: skip
+        progress(2 + 2 * k, steps, f"images: writing strain {100 * strain:.2f} %")
+        entry = _write_rendering(folder, name, f"{name}_mask.tif", rendering, spec)
+        write_truth(folder / f"truth_{label}.h5", truth, strain, grid)
+        worst = float(np.nanmax(truth.residual_px))
+        residual = max(residual, worst)
+        snapshots.append(
+            {"nominal_strain": float(strain), **entry, "truth": f"truth_{label}.h5",
+             "branch": solution.at(strain).branch, "inverse_map_max_residual_px": worst}
+        )  # fmt: skip
+    return {
+        "grid": asdict(grid),
+        "spec": asdict(spec),
+        "speckle_period_px": list(speckle.period),
+        "inverse_map_max_residual_px": residual,
+        "reference": reference,
+        "snapshots": snapshots,
+        "solution": dict(solution.info),
+        "versions": _versions(),
+    }
+
+
+def _write_rendering(
+    folder: Path, name: str, mask_name: str, rendering: Rendering, spec: ImagingSpec
+) -> dict[str, str]:
+    camera_name = f"{name}_{spec.bits}bit.tif"
+    write_image(folder / f"{name}.tif", rendering.image)
+    write_image(folder / camera_name, quantise(rendering.image, spec.bits))
+    write_image(folder / mask_name, rendering.mask)
+    return {"image": f"{name}.tif", "camera_image": camera_name, "mask": mask_name}
+
+
+def _file_names(entry: dict[str, Any]) -> list[str]:
+    return [entry[k] for k in ("image", "camera_image", "mask", "truth") if k in entry]
+
+
+def _discard(folder: Path) -> None:
+    """Take away an older set, the mark of completeness first."""
+    try:
+        info = read_json(folder / SIDECAR)
+        names = [Path(name).name for name in info["files"]]
+    except (InputError, KeyError, TypeError):
+        names = []
+    for name in (SIDECAR, *names):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _label(strain: float) -> str:
+    return f"{round(1e4 * strain):04d}"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _versions() -> dict[str, str]:
+    libraries = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
+    own = {"modeharvest": modeharvest.__version__, "python": platform.python_version()}
+    return own | {name: version(name) for name in libraries}

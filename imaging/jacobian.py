@@ -1,0 +1,99 @@
+"""Is the Jacobian of every element positive everywhere? A proof, not a sample.
+
+The determinant is a polynomial; if its Bernstein coefficients are positive, so is it. Where
+they aren't, the element is cut into four and each part is asked again, until a corner value
+shows a violation or every part is proved. Only then is the element's map one to one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.imaging.elements import (
+    bernstein,
+    lattice,
+    monomial_gradients,
+    polynomials,
+    reference_element,
+    to_bernstein,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_DEEPEST = 12
+_ROUNDING = 1e-12  # of the largest Bernstein coefficient
+
+
+def sub_elements(triangular: bool) -> FloatArray:
+    """(4, 3) the quarters of a reference domain: xi = (origin xi, origin eta) + scale xi'."""
+    if triangular:
+        return np.array([[0, 0, 0.5], [0.5, 0, 0.5], [0, 0.5, 0.5], [0.5, 0.5, -0.5]])
+    return np.array([[s, t, 0.5] for s in (-0.5, 0.5) for t in (-0.5, 0.5)])
+
+
+def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str) -> IntArray:
+    """Numbers of the cells whose Jacobian isn't positive everywhere, ascending.
+
+    Parameters
+    ----------
+    positions
+        (n, 2) node positions in a right-handed frame (x right, y up).
+    cells, element
+        As in :class:`modeharvest.fem.field.Mesh`.
+    """
+    triangular = reference_element(element).triangular
+    degree = 2 if triangular else 3
+    points = lattice(triangular, degree)
+    gradients = polynomials(element, cells, positions) @ monomial_gradients(points)[:, None]
+    jacobians = gradients.transpose(1, 0, 2, 3)  # (cells, points, component, direction)
+    convert = to_bernstein(triangular, degree)
+    coefficients = np.linalg.det(jacobians) @ convert.T
+    corners = _corners(triangular, degree)
+    split = np.stack(
+        [convert @ bernstein(triangular, degree, s[:2] + s[2] * points)
+         for s in sub_elements(triangular)]
+    )  # fmt: skip
+    owner = np.arange(len(cells))
+    threshold = _ROUNDING * np.abs(coefficients).max(axis=1)
+    bad = np.zeros(len(cells), dtype=np.bool_)
+    for _ in range(_DEEPEST):
+        limit = threshold[owner, None]
+        bad[owner[(coefficients[:, corners] <= limit).any(axis=1)]] = True
+        open_ = (coefficients <= limit).any(axis=1) & ~bad[owner]
+        if not open_.any():
+            break
+        coefficients = np.einsum("spq,eq->esp", split, coefficients[open_])
+        coefficients = coefficients.reshape(-1, len(points))
+        owner = np.repeat(owner[open_], 4)
+    else:
+        bad[owner] = True  # zero to within what can be told
+    return np.flatnonzero(bad)
+
+
+def require_positive_jacobian(
+    positions: FloatArray, cells: IntArray, element: str, where: str = "mesh"
+) -> None:
+    """Raise InputError, naming the first cell, unless all Jacobians are positive."""
+    bad = non_positive_jacobians(positions, cells, element)
+    if bad.size:
+        centre = positions[cells[bad[0]]].mean(axis=0)
+        raise InputError(
+            f"{where}: expected {element} elements with positive Jacobians (nodes "
+            f"counter-clockwise, not folded), got {bad.size} without, the first is element "
+            f"{bad[0]} near ({centre[0]:.4g}, {centre[1]:.4g}); repair the mesh or take a "
+            "smaller displacement"
+        )
+
+
+def _corners(triangular: bool, degree: int) -> IntArray:
+    """Lattice points where a Bernstein coefficient is the polynomial's value."""
+    points = lattice(triangular, degree)
+    if triangular:
+        at_corner = np.isclose(np.column_stack([points, 1 - points.sum(axis=1)]).max(axis=1), 1.0)
+    else:
+        at_corner = np.isclose(np.abs(points), 1.0).all(axis=1)
+    return np.flatnonzero(at_corner)

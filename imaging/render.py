@@ -1,0 +1,119 @@
+"""Images of a deforming specimen and the truth behind them.
+
+The reference image shows the speckle itself. A pixel x of a deformed image shows the speckle at
+its reference point X, with X + u(X) = x solved by the inverse isoparametric mapping, so neither
+image is interpolated from the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.isoparametric import Located, interpolate, locate
+from modeharvest.imaging.speckle import Speckle
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """An image with material and background told apart.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) float32 intensity [fraction of full scale].
+    mask
+        (rows, cols) True where there is material.
+    """
+
+    image: NDArray[np.float32]
+    mask: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a measurement of one deformed image should find.
+
+    The leading axis of length 2 holds the components (x, y) along the physical axes; NaN
+    where there is no material.
+
+    Parameters
+    ----------
+    displacement
+        (2, rows, cols) u at the *reference* image's pixels [mm].
+    reference_point
+        (2, rows, cols) X of the material that the *deformed* image's pixels show [mm].
+    deformed_displacement
+        (2, rows, cols) float32 u at the *deformed* image's pixels [mm].
+    element
+        (rows, cols) int32 element shown by the deformed image's pixels, -1 for background.
+    residual_px
+        (rows, cols) float32 residual of the inverse mapping in the deformed image [px].
+    """
+
+    displacement: FloatArray
+    reference_point: FloatArray
+    deformed_displacement: NDArray[np.float32]
+    element: NDArray[np.int32]
+    residual_px: NDArray[np.float32]
+
+
+def render_reference(located: Located, speckle: Speckle, background: float) -> Rendering:
+    """Show the undeformed specimen: speckle at whole pixels, ``background`` around it.
+
+    ``located`` is the undeformed mesh on the image's grid.
+    """
+    mask = located.mask
+    return Rendering(np.where(mask, speckle.image(), background).astype(np.float32), mask)
+
+
+def render_deformed(
+    mesh: Mesh,
+    displacement: FloatArray,
+    located_reference: Located,
+    grid: PixelGrid,
+    speckle: Speckle,
+    background: float,
+    where: str = "deformed mesh",
+) -> tuple[Rendering, Truth]:
+    """Show the deformed specimen, and tell the truth about it.
+
+    Parameters
+    ----------
+    mesh, displacement
+        The undeformed mesh and its nodal displacements (n, 2) [mm].
+    located_reference
+        The undeformed mesh on the same grid.
+    grid
+        The pixels of both images; the speckle's whole pixels are the grid's.
+    speckle, background
+        Intensity of the material and around it [fraction of full scale].
+    where
+        What to call the state in an error.
+
+    Raises
+    ------
+    InputError
+        If the displacement turns an element inside out.
+    """
+    located = locate(mesh.nodes + displacement, mesh.cells, mesh.element, grid, where)
+    point = interpolate(located, mesh.cells, mesh.element, mesh.nodes)
+    moved = interpolate(located, mesh.cells, mesh.element, displacement)
+    truth = Truth(
+        displacement=interpolate(located_reference, mesh.cells, mesh.element, displacement),
+        reference_point=point,
+        deformed_displacement=moved.astype(np.float32),
+        element=located.element,
+        residual_px=located.residual_px,
+    )
+    mask = located.mask
+    image = np.full(grid.shape, background, dtype=np.float32)
+    image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
+    return Rendering(image, mask), truth

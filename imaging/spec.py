@@ -1,0 +1,90 @@
+"""How a specimen is imaged: resolution, framing, grey levels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import SpeckleSpec
+
+
+@dataclass(frozen=True)
+class ImagingSpec:
+    """How a specimen is imaged.
+
+    Parameters
+    ----------
+    pixel_size
+        Edge of a pixel [mm/px].
+    margin_px
+        Background kept around the specimen in all its states [px]; the image size follows.
+    shape
+        (rows, cols) instead of the size that follows from the margin [px].
+    background
+        Intensity where there is no material [fraction of full scale].
+    bits
+        Bits of the camera-like copies, 1 to 16.
+    speckle
+        The pattern.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range.
+    """
+
+    pixel_size: float = 0.01
+    margin_px: int = 40
+    shape: tuple[int, int] | None = None
+    background: float = 0.0
+    bits: int = 8
+    speckle: SpeckleSpec = field(default_factory=SpeckleSpec)
+
+    def __post_init__(self) -> None:
+        if not (self.pixel_size > 0.0 and math.isfinite(self.pixel_size)):
+            raise InputError(f"imaging: expected a pixel size above 0 mm, got {self.pixel_size}")
+        if self.margin_px < 0:
+            raise InputError(f"imaging: expected a margin of 0 px or more, got {self.margin_px}")
+        if not 0.0 <= self.background <= 1.0:
+            raise InputError(f"imaging: expected a background in 0 ... 1, got {self.background}")
+        if not 1 <= self.bits <= 16:
+            raise InputError(f"imaging: expected 1 to 16 bits, got {self.bits}")
+        if self.shape is not None:
+            object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+
+
+def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> PixelGrid:
+    """Choose the grid, centred on the undeformed specimen, that holds it in all its states.
+
+    Raises
+    ------
+    InputError
+        If the specimen doesn't fit an image size that the spec prescribes.
+    """
+    nodes = solution.mesh.nodes
+    centre = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
+    states = [nodes, *(nodes + solution.at(s).displacement for s in strains)]
+    reach = np.max([np.abs(state - centre).max(axis=0) for state in states], axis=0)
+    half = np.ceil(reach / spec.pixel_size - 1e-9).astype(int) + spec.margin_px
+    cols, rows = (int(n) for n in 2 * half + 1)
+    if spec.shape is not None:
+        if spec.shape[0] < rows - 2 * spec.margin_px or spec.shape[1] < cols - 2 * spec.margin_px:
+            raise InputError(
+                f"imaging: expected an image of at least {rows - 2 * spec.margin_px} x "
+                f"{cols - 2 * spec.margin_px} px to hold the specimen in all its states, got "
+                f"{spec.shape[0]} x {spec.shape[1]}; enlarge shape or pixel_size"
+            )
+        rows, cols = spec.shape
+    return PixelGrid(
+        rows,
+        cols,
+        spec.pixel_size,
+        float(centre[0]) - 0.5 * (cols - 1) * spec.pixel_size,
+        float(centre[1]) + 0.5 * (rows - 1) * spec.pixel_size,
+    )

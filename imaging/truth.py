@@ -1,0 +1,71 @@
+"""The truth file: one HDF5 per deformed image, readable with h5py alone.
+
+::
+
+    displacement           (2, rows, cols) float64 [mm]  at the reference image's pixels
+    reference_point        (2, rows, cols) float64 [mm]  shown by the deformed image's pixels
+    deformed_displacement  (2, rows, cols) float32 [mm]  at the deformed image's pixels
+    element                (rows, cols)    int32   [-]   at the deformed image's pixels
+    residual_px            (rows, cols)    float32 [px]  of the inverse mapping there
+
+The leading axis holds the components (x, y), x right, y up; rows run down the image. NaN (in
+``element``: -1) marks background. Attributes: nominal_strain and the pixel grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from modeharvest.errors import InputError
+from modeharvest.files import atomic
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.render import Truth
+
+FORMAT = "modeharvest-truth-1"
+
+_CONTENT = {
+    "displacement": ("mm", "displacement (x, y) at the reference image's pixels"),
+    "reference_point": ("mm", "reference point (x, y) shown by the deformed image's pixels"),
+    "deformed_displacement": ("mm", "displacement (x, y) at the deformed image's pixels"),
+    "element": ("-", "element shown by the deformed image's pixels, -1: background"),
+    "residual_px": ("px", "residual of the inverse mapping at the deformed image's pixels"),
+}
+_CHUNK_ROWS = 64
+
+
+def write_truth(path: Path | str, truth: Truth, nominal_strain: float, grid: PixelGrid) -> None:
+    """Write a truth file, whole or not at all."""
+    with atomic(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["nominal_strain"] = nominal_strain
+        for name, value in asdict(grid).items():
+            file.attrs[name] = value
+        for name, (unit, meaning) in _CONTENT.items():
+            data = getattr(truth, name)
+            chunk = (1,) * (data.ndim - 2) + (min(_CHUNK_ROWS, grid.rows), grid.cols)
+            dataset = file.create_dataset(
+                name, data=data, chunks=chunk, compression="lzf", shuffle=True
+            )
+            dataset.attrs["unit"] = unit
+            dataset.attrs["meaning"] = meaning
+
+
+def read_truth(path: Path | str) -> Truth:
+    """Read what :func:`write_truth` wrote; InputError if missing, cut short or another format."""
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise InputError(
+                    f"expected a {FORMAT} file at {path}, got format "
+                    f"{file.attrs.get('format')!r}; make it again with 'modeharvest image'"
+                )
+            return Truth(**{name: np.asarray(file[name]) for name in _CONTENT})
+    except (OSError, KeyError) as error:
+        raise InputError(
+            f"expected a truth file (HDF5) at {path}, got: {error}; "
+            "make it again with 'modeharvest image'"
+        ) from error
