@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.separable import sum_of_products
 
 FloatArray = NDArray[np.float64]
 
@@ -106,16 +107,11 @@ class ChebyshevField:
     def evaluate(self, coefficients: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """The field at positions [mm] that broadcast together.
 
-        On an open grid, x of shape (1, cols) and y of shape (rows, 1), the sum over i is done
-        once per column and not once per pixel.
+        Fast on an open grid, x of shape (1, cols) and y of shape (rows, 1).
         """
         xi, eta = self.box.normalised(x, y)
         along_x = np.tensordot(self.square(coefficients).T, chebyshev(xi, self.degree), axes=1)
-        along_y = chebyshev(eta, self.degree)
-        total = along_x[0] * along_y[0]
-        for j in range(1, self.degree + 1):
-            total += along_x[j] * along_y[j]
-        return total
+        return sum_of_products(along_x, chebyshev(eta, self.degree))
 
     def basis(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., size): every product T_i T_j at positions [mm] that broadcast together."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.separable import sum_of_products
 from modeharvest.idic.support import Taper
 
 FloatArray = NDArray[np.float64]
@@ -204,7 +205,9 @@ class FourierMode:
         for a, b, kx, ky, c in self.family.waves(parameters):
             # Products of one-dimensional tables: on an open grid no sine per pixel is needed.
             tx, ty = per_mm * kx * x, per_mm * (ky * y + c)
-            sine = np.sin(tx) * np.cos(ty) + np.cos(tx) * np.sin(ty)
+            sine = sum_of_products(
+                np.stack([np.sin(tx), np.cos(tx)]), np.stack([np.cos(ty), np.sin(ty)])
+            )
             total[..., 0] += a * sine
             total[..., 1] += b * sine
         return total

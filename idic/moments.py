@@ -105,14 +105,12 @@ def _model_block(
     coefficients: Any,
     order: int,
     pixel_size: float,
-    allowed: Any,
     work: Any,
     E: Any,
-) -> tuple[int, int]:
-    """Gradient into E[0], E[1] and residual into E[-1]; pixels used, and those off the image.
+) -> int:
+    """Gradient into E[0], E[1] and residual into E[-1]; returns how many left the image.
 
-    A pixel that leaves the image, or that the deformed mask forbids, gets zeros: it takes no
-    part in any sum.
+    A pixel that leaves the image gets zeros: it takes no part in any sum.
     """
     last = E.shape[0] - 1
     if component >= 0:
@@ -120,26 +118,23 @@ def _model_block(
             E[0, m] = 1.0 - component
             E[1, m] = component
             E[last, m] = f[row, columns[m]] - (uy[m] if component else ux[m])
-        return n, 0
+        return 0
     per_px = 1.0 / pixel_size
     r, c, value, d_row, d_col = work[0], work[1], work[2], work[3], work[4]
     for m in range(n):
         r[m] = row - uy[m] * per_px
         c[m] = columns[m] + ux[m] * per_px
     sample_points(coefficients, order, r, c, n, value, d_row, d_col)
-    used, off = 0, 0
+    off = 0
     for m in range(n):
         if np.isnan(value[m]):
             off += 1
             E[0, m] = E[1, m] = E[last, m] = 0.0
-        elif allowed.size > 0 and not allowed[int(r[m] + 0.5), int(c[m] + 0.5)]:
-            E[0, m] = E[1, m] = E[last, m] = 0.0
         else:
-            used += 1
             E[0, m] = d_col[m] * per_px
             E[1, m] = -d_row[m] * per_px
             E[last, m] = f[row, columns[m]] - value[m]
-    return used, off
+    return off
 
 
 @compiled()
@@ -210,7 +205,6 @@ def accumulate(
     coefficients: Any,
     order: int,
     pixel_size: float,
-    allowed: Any,
     columns: Any,
     row_start: Any,
     xi: Any,
@@ -228,7 +222,7 @@ def accumulate(
     pairs: Any,
     bands: int,
     moments: Any,
-    counts: Any,
+    left: Any,
 ) -> None:
     """Sum the moments of all pairs of base fields over the pixels.
 
@@ -243,8 +237,6 @@ def accumulate(
         Spline of the deformed image.
     pixel_size
         [mm/px].
-    allowed
-        (rows, cols) bool, where g may be sampled; of size 0 for everywhere.
     columns, row_start
         Columns of the pixels that count, row after row, and (rows + 1,) where each row starts.
     xi, eta
@@ -263,8 +255,8 @@ def accumulate(
         Number of bands that the rows are dealt to.
     moments
         (bands, pairs, K + 1, K + 1), zero on entry: the sums of each band.
-    counts
-        (bands, 2): pixels used; pixels that left the image.
+    left
+        (bands,), zero on entry: how many pixels are mapped outside the image.
     """
     rows = row_start.size - 1
     n_modes, n_waves = v_series.shape[0], waves.shape[0]
@@ -301,14 +293,10 @@ def accumulate(
                     for m in range(n):
                         u[0, m] += v[i, m] * phi[i, 0, m]
                         u[1, m] += v[i, m] * phi[i, 1, m]
-                used, off = _model_block(
+                left[band] += _model_block(
                     component, f, row, block, n, u[0], u[1], coefficients, order, pixel_size,
-                    allowed, work, E,
+                    work, E,
                 )  # fmt: skip
-                counts[band, 0] += used
-                counts[band, 1] += off
                 _base_fields_block(n, waves, phi, sines, cosines, E)
                 _moments_block(n, pairs, T, E, product, row_moments)
             _add_row(pairs, row_moments, eta_T, moments[band])
-
-

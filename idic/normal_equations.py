@@ -144,7 +144,6 @@ class Assembly:
         a: FloatArray,
         reference: NDArray[Any],
         deformed: SplineImage,
-        allowed: BoolArray | None = None,
     ) -> NormalEquations:
         """The normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
@@ -156,12 +155,8 @@ class Assembly:
             (rows, cols): f.
         deformed
             g.
-        allowed
-            (rows, cols) where g may be sampled; None for everywhere.
         """
-        if allowed is None:
-            allowed = np.zeros((0, 0), dtype=np.bool_)
-        return self._assemble(a, IMAGE, reference, deformed.coefficients, deformed.order, allowed)
+        return self._assemble(a, IMAGE, reference, deformed.coefficients, deformed.order)
 
     def displacement(self, a: FloatArray, target: NDArray[Any]) -> NormalEquations:
         """The normal equations of r = target - u(a), both components.
@@ -174,11 +169,7 @@ class Assembly:
             (rows, cols, 2) displacement [mm].
         """
         nothing = np.zeros((8, 8), dtype=np.float32)
-        everywhere = np.zeros((0, 0), dtype=np.bool_)
-        x, y = (
-            self._assemble(a, c, np.ascontiguousarray(target[..., c]), nothing, 5, everywhere)
-            for c in (0, 1)
-        )
+        x, y = (self._assemble(a, c, target[..., c], nothing, 5) for c in (0, 1))
         return x + y
 
     def _assemble(
@@ -188,7 +179,6 @@ class Assembly:
         f: NDArray[Any],
         coefficients: NDArray[Any],
         order: int,
-        allowed: BoolArray,
     ) -> NormalEquations:
         ansatz, grid = self.ansatz, self.grid
         a = ansatz.checked(a)
@@ -196,13 +186,15 @@ class Assembly:
         columns, row_start = self._columns
         top = int(self._pairs[:, 2].max()) + 1
         moments = np.zeros((BANDS, len(self._pairs), top, top))
-        counts = np.zeros((BANDS, 2), dtype=np.int64)
+        left = np.zeros(BANDS, dtype=np.int64)
+        # One type of f for images and displacements means one compilation.
+        f = np.ascontiguousarray(f, dtype=np.float64)
         accumulate(
-            component, f, coefficients, order, grid.pixel_size, allowed, columns, row_start,
-            xi, eta, *_tables(ansatz, grid, a), self._pairs, BANDS, moments, counts,
+            component, f, coefficients, order, grid.pixel_size, columns, row_start,
+            xi, eta, *_tables(ansatz, grid, a), self._pairs, BANDS, moments, left,
         )  # fmt: skip
-        used, off = (int(n) for n in counts.sum(axis=0))
-        return self._from_moments(moments.sum(axis=0), used, off)
+        off = int(left.sum())
+        return self._from_moments(moments.sum(axis=0), columns.size - off, off)
 
     def _from_moments(self, moments: FloatArray, used: int, off: int) -> NormalEquations:
         parts, degrees = self._primitive_slices, self._degrees

@@ -1,0 +1,360 @@
+"""Integrated digital image correlation: two images in, the unknowns of an ansatz out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.gauss_newton import (
+    GaussNewtonOptions,
+    Iteration,
+    Minimum,
+    Outcome,
+    ScaledEigen,
+    StepLength,
+    minimise,
+)
+from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, Pair, prepare
+from modeharvest.idic.result import Result
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.progress import Progress, silent
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_ROUNDS, _SETTLED = 5, 1e-2
+"""The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
+
+
+@dataclass(frozen=True)
+class CorrelationOptions:
+    """How to correlate.
+
+    Parameters
+    ----------
+    levels
+        From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l)
+        or leave fewer than 32 px across are skipped; the last one never is.
+    edge_px
+        Pixels of the reference closer than this to the edge of a hole are left out on the
+        finest level [px].
+    order
+        Of the spline that samples the deformed image: 5 or 3.
+    gauss_newton
+        Tolerances and limits.
+    """
+
+    levels: tuple[Level, ...] = COARSE_TO_FINE
+    edge_px: int = 3
+    order: int = 5
+    gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
+
+    def __post_init__(self) -> None:
+        if not self.levels:
+            raise InputError("expected at least one level from coarse to fine, got none")
+        if self.edge_px < 0 or self.order not in (3, 5):
+            raise InputError(
+                f"expected edge_px >= 0 and order 3 or 5, got {self.edge_px} and {self.order}"
+            )
+
+
+def correlate(
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    grid: PixelGrid,
+    ansatz: Ansatz,
+    start: ArrayLike,
+    mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
+    options: CorrelationOptions | None = None,
+    progress: Progress = silent,
+) -> Result:
+    """Find the unknowns that make the deformed image match the reference.
+
+    Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show
+    material: the paper's Eqs. (r), (dof_opt) and (u_dic).
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels f and g.
+    grid
+        Where their pixels are.
+    ansatz
+        The kinematics.
+    start
+        (size,) unknowns to start from; see :meth:`Ansatz.start`.
+    mask, deformed_mask
+        (rows, cols) True on material, in f and in g. Without a mask every pixel counts;
+        without a deformed mask g is taken as it is.
+    options
+        How to correlate.
+    progress
+        Told about every iteration.
+
+    Raises
+    ------
+    InputError
+        If sizes differ, a mask is empty, or an image holds NaN or is constant.
+    """
+    options = options or CorrelationOptions()
+    clock = _Clock()
+    f, g = _image(reference, "reference", grid), _image(deformed, "deformed", grid)
+    f_mask, g_mask = _mask(mask, "mask", grid), _mask(deformed_mask, "deformed mask", grid)
+    _check_grey_levels(f, f_mask, "reference")
+    _check_grey_levels(g, g_mask, "deformed")
+    a = ansatz.checked(start)
+    levels = _useful(options.levels, ansatz, grid)
+    history: tuple[Iteration, ...] = ()
+    for k, level in enumerate(levels):
+        pair = prepare(f, g, grid, f_mask, g_mask, level, options.edge_px, options.order)
+        clock.lap(f"prepare level {level.factor}")
+        finest = k == len(levels) - 1
+        found = _minimise_pair(
+            pair, ansatz, a, level.factor, finest, options.gauss_newton,
+            _reporter(progress, k, len(levels), options.gauss_newton),
+        )  # fmt: skip
+        clock.lap(f"iterate level {level.factor}")
+        history += found.history
+        a = found.unknowns
+        if found.outcome in (Outcome.LEFT_IMAGE, Outcome.SINGULAR):
+            break
+    progress(len(levels), len(levels), "correlate")
+    return _result(ansatz, grid, found, history, clock.laps)
+
+
+def fit_displacement(
+    displacement: ArrayLike,
+    grid: PixelGrid,
+    ansatz: Ansatz,
+    start: ArrayLike,
+    mask: ArrayLike | None = None,
+    options: GaussNewtonOptions | None = None,
+    progress: Progress = silent,
+) -> Result:
+    """The best possible fit of an ansatz to a known displacement: what IDIC could find at best.
+
+    Minimises 1/2 sum ||u(x) - u(x, a)||^2 over the pixels with the same engine.
+
+    Parameters
+    ----------
+    displacement
+        (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
+    grid
+        Where the pixels are.
+    ansatz, start
+        The kinematics, and (size,) unknowns to start from.
+    mask
+        (rows, cols) True where the displacement counts; everywhere by default.
+    options
+        Tolerances and limits.
+    progress
+        Told about every iteration.
+
+    Returns
+    -------
+    Result
+        ``residual_rms`` is in mm *per component*; sqrt(2) times it is the rms of the norm.
+
+    Raises
+    ------
+    InputError
+        If sizes differ, the mask is empty or the displacement is NaN inside it.
+    """
+    options = options or GaussNewtonOptions()
+    clock = _Clock()
+    target = np.asarray(displacement, dtype=np.float64)
+    if target.shape != (*grid.shape, 2):
+        raise InputError(
+            f"expected a displacement of shape {(*grid.shape, 2)} like the grid, got {target.shape}"
+        )
+    inside = _mask(mask, "mask", grid)
+    inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
+    bad = inside & ~np.isfinite(target).all(axis=-1)
+    if bad.any():
+        raise InputError(f"expected a finite displacement inside the mask, got {_first(bad)}")
+    assembly = Assembly(ansatz, grid, inside)
+    found = minimise(
+        lambda a: assembly.displacement(a, target),
+        _step_length(ansatz, grid, inside, 1),
+        ansatz.checked(start),
+        options,
+        options.tolerance_px,
+        on_iteration=_reporter(progress, 0, 1, options),
+    )
+    clock.lap("iterate")
+    return _result(ansatz, grid, found, found.history, clock.laps)
+
+
+def _minimise_pair(
+    pair: Pair,
+    ansatz: Ansatz,
+    start: FloatArray,
+    factor: int,
+    finest: bool,
+    options: GaussNewtonOptions,
+    on_iteration: Callable[[int], None],
+) -> Minimum:
+    tolerance = options.tolerance_px if finest else options.coarse_tolerance_px * factor
+    history: tuple[Iteration, ...] = ()
+    landed = _landed(pair, ansatz, start)
+    for _ in range(_ROUNDS):
+        assembly = Assembly(ansatz, pair.grid, landed)
+        found = minimise(
+            lambda a, on=assembly: on.images(a, pair.reference, pair.deformed),
+            _step_length(ansatz, pair.grid, landed, factor),
+            start, options, tolerance, factor, on_iteration,
+        )  # fmt: skip
+        history += found.history
+        previous, landed = landed, _landed(pair, ansatz, found.unknowns)
+        if (landed != previous).sum() <= _SETTLED * landed.sum():
+            break
+        start = found.unknowns
+    return replace(found, history=history)
+
+
+def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
+    """The pixels of the mask that these unknowns map onto material of the deformed image.
+
+    The set is frozen while the cost is minimised: pixels that came and went with every step
+    would make the cost jump, and the iteration stagnate.
+    """
+    if pair.allowed is None:
+        return pair.mask
+    u = ansatz.displacement(a, pair.grid.x, pair.grid.y) / pair.grid.pixel_size
+    row, col = np.nonzero(pair.mask)
+    u = u[row, col]
+    to_row, to_col = np.rint(row - u[:, 1]).astype(int), np.rint(col + u[:, 0]).astype(int)
+    rows, cols = pair.grid.shape
+    inside = (to_row >= 0) & (to_row < rows) & (to_col >= 0) & (to_col < cols)
+    landed = pair.mask.copy()
+    # A pixel off the image stays in: the iteration counts those and says so.
+    landed[row[inside], col[inside]] = pair.allowed[to_row[inside], to_col[inside]]
+    return landed
+
+
+def _result(
+    ansatz: Ansatz,
+    grid: PixelGrid,
+    found: Minimum,
+    history: tuple[Iteration, ...],
+    timings_s: dict[str, float],
+) -> Result:
+    eigen = ScaledEigen.of(found.equations.matrix)
+    return Result(
+        ansatz=ansatz,
+        grid=grid,
+        unknowns=found.unknowns.copy(),
+        inverse=eigen.inverse(),
+        residual_rms=float(np.sqrt(found.equations.mean_square)),
+        pixels=found.equations.pixels,
+        left_image=found.equations.left_image,
+        outcome=found.outcome,
+        condition_number=eigen.condition_number,
+        history=history,
+        timings_s=timings_s,
+    )
+
+
+def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple[Level, ...]:
+    """The levels that keep the modes visible and enough pixels; always the last one."""
+    shortest = min((mode.half_wavelength for mode in ansatz.modes), default=np.inf)
+    quarter_px = 0.25 * shortest / grid.pixel_size
+
+    def keeps(level: Level) -> bool:
+        blur_px = level.factor * level.blur
+        return blur_px <= quarter_px and min(grid.shape) // level.factor >= 32
+
+    return (*(level for level in levels[:-1] if keeps(level)), levels[-1])
+
+
+def _step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
+    """Rms difference of two displacements over about 10^4 of the pixels [px of the full image]."""
+    stride = max(1, int(np.sqrt(mask.sum() / 1e4)))
+    some = mask[::stride, ::stride]
+    if not some.any():
+        stride, some = 1, mask
+    x, y = grid.x[::stride], grid.y[::stride]
+    per_px = factor / grid.pixel_size  # a binned px is factor px
+
+    def length(a: FloatArray, b: FloatArray) -> float:
+        change = ansatz.displacement(b, x, y) - ansatz.displacement(a, x, y)
+        squares = (change[some] ** 2).sum(axis=-1)
+        return float(np.sqrt(squares.mean()) * per_px) if squares.size else 0.0
+
+    return length
+
+
+def _reporter(
+    progress: Progress, level: int, levels: int, options: GaussNewtonOptions
+) -> Callable[[int], None]:
+    def report(number: int) -> None:
+        progress(level + number / (options.max_iterations + 1), levels, "correlate")
+
+    return report
+
+
+def _image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
+    pixels = np.asarray(image)
+    if pixels.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} image of {grid.rows} x {grid.cols} px like the grid, got shape "
+            f"{pixels.shape}; give two images and a grid of one size"
+        )
+    pixels = pixels.astype(np.float32, copy=False)
+    bad = ~np.isfinite(pixels)
+    if bad.any():
+        raise InputError(
+            f"expected finite grey levels in the {what} image, got NaN or infinity in "
+            f"{_first(bad)}; fill or crop them"
+        )
+    return pixels
+
+
+def _mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
+    if mask is None:
+        return None
+    inside = np.ascontiguousarray(mask, dtype=np.bool_)
+    if inside.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
+            f"{inside.shape}"
+        )
+    if not inside.any():
+        raise InputError(f"expected material in the {what}, got one that is False everywhere")
+    return inside
+
+
+def _check_grey_levels(image: NDArray[Any], mask: BoolArray | None, what: str) -> None:
+    seen = image if mask is None else image[mask]
+    if seen.min() == seen.max():
+        raise InputError(
+            f"expected a speckle in the {what} image, got the constant grey level {seen.flat[0]}"
+        )
+
+
+def _first(bad: BoolArray) -> str:
+    """How many pixels are bad, and where the first one is."""
+    row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return f"{int(bad.sum())} px, the first at row {row}, column {col}"
+
+
+class _Clock:
+    """Wall-clock seconds of one stage after another."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.laps[stage] = now - self._last
+        self._last = now

@@ -1,0 +1,269 @@
+"""Gauss-Newton with a Levenberg safeguard, and an honest account of how it ended.
+
+A full Gauss-Newton step is tried first. One that raises the cost is solved again from the
+stored matrix with more damping, until the cost falls. The matrix is scaled to a unit diagonal
+and decomposed into eigenvectors; directions the images can't tell anything about (the mode's
+parameters where v is zero) get no step instead of an enormous one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.normal_equations import NormalEquations
+
+FloatArray = NDArray[np.float64]
+
+
+class Outcome(Enum):
+    """Why an iteration ended; ``explanation`` says it in a sentence."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "max_iterations"
+    STAGNATED = "stagnated"
+    SINGULAR = "singular"
+    LEFT_IMAGE = "left_image"
+
+    @property
+    def explanation(self) -> str:
+        """One sentence for a reader of the result."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Outcome.CONVERGED: "The displacement changed by less than the tolerance.",
+    Outcome.MAX_ITERATIONS: (
+        "The largest number of iterations was reached before the displacement settled; "
+        "start closer, or allow more iterations."
+    ),
+    Outcome.STAGNATED: (
+        "No step, however short, lowered the cost, yet the last one was above the tolerance."
+    ),
+    Outcome.SINGULAR: (
+        "The images hold no information about the unknowns: no pixel was used, or the deformed "
+        "image has no gradient there."
+    ),
+    Outcome.LEFT_IMAGE: (
+        "Too many pixels are mapped outside the deformed image; check the sign of the start, "
+        "the pixel size and the origin of the grid."
+    ),
+}
+
+
+@dataclass(frozen=True)
+class GaussNewtonOptions:
+    """When to stop, and how patient to be.
+
+    Parameters
+    ----------
+    tolerance_px
+        Converged once a step changes the displacement by less than this, rms [px]. What the
+        ansatz can't describe makes convergence linear, at a factor of 0.2 to 0.6; the error
+        left is then about as large as the last step. 1e-4 px is a thousandth of the best
+        noise floor of DIC.
+    coarse_tolerance_px
+        The same in *binned* px on the coarse levels, which only have to lead to the next.
+    max_iterations
+        On each level.
+    max_left
+        Fraction of the pixels that may be mapped outside the deformed image [-].
+    """
+
+    tolerance_px: float = 1e-4
+    coarse_tolerance_px: float = 1e-2
+    max_iterations: int = 50
+    max_left: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (self.tolerance_px > 0 and self.coarse_tolerance_px > 0):
+            raise InputError(
+                "expected tolerances above 0 px, got "
+                f"{self.tolerance_px} and {self.coarse_tolerance_px} px"
+            )
+        if self.max_iterations < 1 or not 0 <= self.max_left <= 1:
+            raise InputError(
+                "expected at least 1 iteration and max_left in [0, 1], got "
+                f"{self.max_iterations} and {self.max_left}"
+            )
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One accepted (or the last refused) step.
+
+    Parameters
+    ----------
+    factor
+        Binning of the level [px].
+    number
+        From 1 on each level.
+    mean_square
+        Mean of r^2 after the step.
+    step_px
+        Rms change of the displacement [px of the full image].
+    damping
+        Levenberg's damping of the scaled matrix [-]; 0 is a full step.
+    pixels
+        Pixels used.
+    """
+
+    factor: int
+    number: int
+    mean_square: float
+    step_px: float
+    damping: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledEigen:
+    """A positive semi-definite matrix, scaled to a unit diagonal and decomposed.
+
+    Parameters
+    ----------
+    scale
+        (n,): square root of the diagonal, 1 where that is zero.
+    values, vectors
+        Eigenvalues, ascending, and eigenvectors of the scaled matrix.
+    """
+
+    scale: FloatArray
+    values: FloatArray
+    vectors: FloatArray
+
+    @classmethod
+    def of(cls, matrix: FloatArray) -> ScaledEigen:
+        """Decompose a matrix."""
+        diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+        scale = np.where(diagonal > 0, diagonal, 1.0)
+        values, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
+        return cls(scale, values, vectors)
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """(n,) True for eigenvectors whose eigenvalue stands out of the rounding."""
+        floor = 1e-13 * len(self.values) * max(float(self.values[-1]), 0.0)
+        return np.asarray(self.values > floor)
+
+    @property
+    def condition_number(self) -> float:
+        """Largest over smallest eigenvalue of the *column-scaled* matrix; may be infinite."""
+        if not self.determined.all():
+            return float("inf")
+        return float(self.values[-1] / self.values[0])
+
+    def solve(self, right: FloatArray, damping: float = 0.0) -> FloatArray:
+        """Solve (matrix + damping diag) x = right on the determined directions."""
+        keep = self.determined
+        part = self.vectors[:, keep].T @ (right / self.scale) / (self.values[keep] + damping)
+        return np.asarray(self.vectors[:, keep] @ part / self.scale)
+
+    def inverse(self) -> FloatArray:
+        """Inverse of the matrix; infinite on the diagonal of unknowns not determined."""
+        keep = self.determined
+        half = self.vectors[:, keep] / np.sqrt(self.values[keep]) / self.scale[:, None]
+        result = half @ half.T
+        lost = (self.vectors[:, ~keep] ** 2).sum(axis=1) > 1e-6
+        result[lost, lost] = np.inf
+        return np.asarray(result)
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the iteration ended, and how.
+
+    Parameters
+    ----------
+    unknowns
+        (n,): the best ones found.
+    equations
+        The normal equations there.
+    outcome
+        Why it ended.
+    history
+        Every step.
+    """
+
+    unknowns: FloatArray
+    equations: NormalEquations
+    outcome: Outcome
+    history: tuple[Iteration, ...]
+
+
+Evaluate = Callable[[FloatArray], NormalEquations]
+StepLength = Callable[[FloatArray, FloatArray], float]
+
+_FIRST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e4
+
+
+def minimise(
+    evaluate: Evaluate,
+    step_length: StepLength,
+    start: FloatArray,
+    options: GaussNewtonOptions,
+    tolerance_px: float,
+    factor: int = 1,
+    on_iteration: Callable[[int], None] = lambda number: None,
+) -> Minimum:
+    """Minimise 1/2 sum r^2.
+
+    Parameters
+    ----------
+    evaluate
+        The normal equations at some unknowns.
+    step_length
+        Rms difference of the displacement between two sets of unknowns [px].
+    start
+        (n,) unknowns.
+    options, tolerance_px
+        When to stop.
+    factor
+        Binning, for the history.
+    on_iteration
+        Called with the number of each finished iteration.
+    """
+    a, equations = start, evaluate(start)
+    history: list[Iteration] = []
+    damping = 0.0
+
+    def ended(outcome: Outcome) -> Minimum:
+        return Minimum(a, equations, outcome, tuple(history))
+
+    if _left(equations) > options.max_left:
+        return ended(Outcome.LEFT_IMAGE)
+    for number in range(1, options.max_iterations + 1):
+        if not np.any(equations.matrix):
+            return ended(Outcome.SINGULAR)
+        eigen = ScaledEigen.of(equations.matrix)
+        while True:
+            candidate = a - eigen.solve(equations.gradient, damping)
+            step = step_length(a, candidate)
+            trial = evaluate(candidate)
+            descends = trial.mean_square <= equations.mean_square
+            accepted = descends and _left(trial) <= options.max_left
+            if accepted or step <= tolerance_px or damping >= _LARGEST_DAMPING:
+                break
+            damping = max(_FIRST_DAMPING, 10.0 * damping)
+        if accepted:
+            a, equations = candidate, trial
+        history.append(
+            Iteration(factor, number, equations.mean_square, step, damping, equations.pixels)
+        )
+        on_iteration(number)
+        if step <= tolerance_px and damping <= _FIRST_DAMPING:
+            return ended(Outcome.CONVERGED)
+        if not accepted:
+            return ended(Outcome.STAGNATED)
+        damping = 0.0 if damping <= _FIRST_DAMPING else 0.1 * damping
+    return ended(Outcome.MAX_ITERATIONS)
+
+
+def _left(equations: NormalEquations) -> float:
+    """Fraction of the pixels that are mapped outside the image."""
+    return equations.left_image / max(1, equations.left_image + equations.pixels)

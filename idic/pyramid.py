@@ -1,0 +1,164 @@
+"""The same pair of images, coarser: what lets a correlation start ten speckles away.
+
+A level bins the images and blurs them. Where masks are given, binning and blur are normalised
+by them, so that no grey level of a hole or of the surroundings leaks into the material.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.errors import InputError
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.interpolation import SplineImage
+
+BoolArray = NDArray[np.bool_]
+Image = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One step from coarse to fine.
+
+    Parameters
+    ----------
+    factor
+        Edge of the blocks of pixels that are averaged [px].
+    blur
+        Standard deviation of the Gaussian blur after that [binned px]; 0 for none.
+    """
+
+    factor: int
+    blur: float
+
+    def __post_init__(self) -> None:
+        if self.factor < 1 or self.blur < 0:
+            raise InputError(
+                "expected a binning of at least 1 px and a blur of at least 0 px, got "
+                f"{self.factor} and {self.blur}"
+            )
+
+
+COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), Level(1, 0.0))
+"""Blurs of 24, 12, 6 and 0 px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Reference, deformed image and masks on one level.
+
+    Parameters
+    ----------
+    grid
+        The pixels of both images.
+    reference
+        (rows, cols) float64: f.
+    deformed
+        g, ready to be sampled.
+    mask
+        (rows, cols): pixels of f that count.
+    allowed
+        (rows, cols) where g may be sampled; None for everywhere.
+    """
+
+    grid: PixelGrid
+    reference: Image
+    deformed: SplineImage
+    mask: BoolArray
+    allowed: BoolArray | None
+
+
+def prepare(
+    reference: Image,
+    deformed: Image,
+    grid: PixelGrid,
+    mask: BoolArray | None,
+    deformed_mask: BoolArray | None,
+    level: Level,
+    edge_px: int,
+    order: int,
+) -> Pair:
+    """Make one level of a pair of images.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) f and g.
+    grid
+        Their pixels.
+    mask, deformed_mask
+        (rows, cols) True on material, of f and of g; None if not known. Holes are kept out of
+        the blur only if both are known: they have to look alike in the two images.
+    level
+        Binning and blur.
+    edge_px
+        Pixels closer than this to the mask's edge are left out on the finest level [px].
+    order
+        Of the spline, 3 or 5.
+    """
+    f_weight = mask if deformed_mask is not None else None
+    f = _smooth(reference, f_weight, level)
+    g = _smooth(deformed, deformed_mask, level)
+    inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
+    if level.factor > 1 or level.blur > 0:
+        inside = _bin(inside, level.factor) >= 0.5
+        allowed = None
+    else:
+        inside = eroded(inside, edge_px)
+        # The reference's eroded edge lands near edge_px from the edge of g, give or take the
+        # local strain; one pixel less leaves those pixels in.
+        allowed = None if deformed_mask is None else eroded(deformed_mask, max(0, edge_px - 1))
+    return Pair(
+        grid.binned(level.factor), f.astype(np.float64), SplineImage.of(g, order), inside, allowed
+    )
+
+
+def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
+    """The mask without the pixels within ``distance_px`` of its edge; the image border is none."""
+    if distance_px < 1 or mask.all():
+        return mask
+    padded = np.pad(mask, distance_px + 1, mode="edge")
+    inner = ndimage.distance_transform_cdt(padded, "chessboard") > distance_px
+    keep = distance_px + 1
+    return np.asarray(inner[keep:-keep, keep:-keep])
+
+
+def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
+    """Binned and blurred; where there is no material, a smooth continuation of the material."""
+    image = np.asarray(image, dtype=np.float32)
+    if weight is None or weight.all():
+        binned = _bin(image, level.factor)
+        return _blur(binned, level.blur)
+    share = _bin(weight, level.factor)
+    mean = _bin(np.where(weight, image, np.float32(0.0)), level.factor)
+    if level.blur > 0:
+        return _continued(_blur(mean, level.blur), _blur(share, level.blur), level.blur)
+    filled = _continued(_blur(mean, 1.5), _blur(share, 1.5), 1.5)
+    return np.where(weight, image, filled) if level.factor == 1 else filled
+
+
+def _continued(mean: Image, share: Image, blur: float) -> Image:
+    """mean / share; far from any material, the mean grey level of all material."""
+    overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
+    far = np.float32(1e-4)
+    return np.asarray((mean + far * np.float32(overall)) / (share + far))
+
+
+def _bin(image: Image, factor: int) -> Image:
+    """Mean over blocks; incomplete blocks at the right and at the bottom are dropped."""
+    rows, cols = image.shape[0] // factor, image.shape[1] // factor
+    image = image[: rows * factor, : cols * factor].astype(np.float32, copy=False)
+    if factor == 1:
+        return image
+    along = np.add.reduceat(image, np.arange(0, rows * factor, factor), axis=0)
+    total = np.add.reduceat(along, np.arange(0, cols * factor, factor), axis=1)
+    return np.asarray(total / np.float32(factor * factor))
+
+
+def _blur(image: Image, sigma: float) -> Image:
+    return np.asarray(ndimage.gaussian_filter(image, sigma, mode="nearest")) if sigma else image

@@ -1,0 +1,227 @@
+"""What a correlation found, how sure it is, and how it got there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, write_json
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.gauss_newton import Iteration, Outcome
+from modeharvest.idic.serialise import ansatz_from_dict, ansatz_to_dict
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.interpolation import SplineImage
+
+FloatArray = NDArray[np.float64]
+
+FORMAT = "modeharvest-result-1"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The unknowns with their covariance, and an account of the iteration.
+
+    Parameters
+    ----------
+    ansatz
+        The kinematics.
+    grid
+        The pixels of the full images.
+    unknowns
+        (n,): a, in the order of ``ansatz.names``.
+    inverse
+        (n, n): M^-1, the inverse of the Gauss-Newton matrix; times a variance of the residual
+        it is the covariance. Infinite on the diagonal where nothing could be determined.
+    residual_rms
+        Root mean square of the residual over the pixels used: grey levels, or mm per component
+        for a fit to a displacement.
+    pixels, left_image
+        Pixels used, and pixels mapped outside the deformed image. A fit to a displacement
+        counts each pixel twice, once for each component.
+    outcome
+        Why the iteration ended, on the finest level.
+    condition_number
+        Of the column-scaled Gauss-Newton matrix.
+    history
+        Every iteration of every level.
+    timings_s
+        Seconds for each stage.
+    """
+
+    ansatz: Ansatz
+    grid: PixelGrid
+    unknowns: FloatArray
+    inverse: FloatArray
+    residual_rms: float
+    pixels: int
+    left_image: int
+    outcome: Outcome
+    condition_number: float
+    history: tuple[Iteration, ...] = ()
+    timings_s: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
+        inverse, n = np.asarray(self.inverse, dtype=np.float64), self.ansatz.size
+        if inverse.shape != (n, n):
+            raise InputError(f"expected an inverse of shape ({n}, {n}), got {inverse.shape}")
+        object.__setattr__(self, "inverse", inverse)
+        for array in (self.unknowns, self.inverse):
+            array.setflags(write=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each unknown."""
+        return self.ansatz.names
+
+    @property
+    def iterations(self) -> int:
+        """Iterations on the finest level."""
+        finest = min((step.factor for step in self.history), default=1)
+        return sum(step.factor == finest for step in self.history)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the unknowns that the images say nothing about."""
+        lost = np.isinf(np.diag(self.inverse))
+        return tuple(name for name, is_lost in zip(self.names, lost, strict=True) if is_lost)
+
+    @property
+    def noise_sd(self) -> float:
+        """Grey-level noise of each image if the residual were nothing but noise in both.
+
+        An upper bound: what the ansatz can't describe is in the residual too.
+        """
+        freedom = max(1, self.pixels - self.ansatz.size)
+        return float(self.residual_rms * np.sqrt(self.pixels / freedom / 2.0))
+
+    def covariance(self, noise_sd: float | None = None, noisy_images: int = 2) -> FloatArray:
+        """(n, n) covariance of the unknowns under white noise: the Cramer-Rao bound.
+
+        Parameters
+        ----------
+        noise_sd
+            Standard deviation of the noise in an image [grey levels]; by default
+            :attr:`noise_sd`.
+        noisy_images
+            2 if both images are noisy, 2 s^2 M^-1; 1 if only the deformed one is, s^2 M^-1.
+        """
+        if noisy_images not in (1, 2):
+            raise InputError(f"expected 1 or 2 noisy images, got {noisy_images}")
+        sd = self.noise_sd if noise_sd is None else noise_sd
+        return noisy_images * sd**2 * self.inverse
+
+    def standard_errors(self, noise_sd: float | None = None) -> FloatArray:
+        """(n,): square roots of the diagonal of :meth:`covariance`."""
+        return np.sqrt(np.diag(self.covariance(noise_sd)))
+
+    def mode_parameters(self, i: int = 0) -> FloatArray:
+        """(m,): the parameters of the mode number i (from 0)."""
+        return self.unknowns[self.ansatz.phi_slice(i)]
+
+    def displacement(self, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols, 2): u [mm] at the pixels of ``grid``, by default those of the images."""
+        return self.ansatz.displacement(self.unknowns, *_axes(grid or self.grid))
+
+    def v0(self, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols, 2): the slow field [mm]."""
+        return self.ansatz.v0(self.unknowns, *_axes(grid or self.grid))
+
+    def v(self, i: int = 0, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols): the amplitude of the mode number i (from 0) [mm]."""
+        return self.ansatz.v(i, self.unknowns, *_axes(grid or self.grid))
+
+    def phi(self, i: int = 0, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols, 2): the mode number i (from 0) [-]."""
+        return self.ansatz.phi(i, self.unknowns, *_axes(grid or self.grid))
+
+    def fluctuation(self, i: int = 0, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols, 2): v_i phi_i of the mode number i (from 0) [mm]."""
+        return self.ansatz.fluctuation(i, self.unknowns, *_axes(grid or self.grid))
+
+    def residual(
+        self, reference: NDArray[Any], deformed: NDArray[Any], order: int = 5
+    ) -> FloatArray:
+        """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN off the image.
+
+        Parameters
+        ----------
+        reference, deformed
+            (rows, cols) f and g, on :attr:`grid`.
+        order
+            Of the spline.
+        """
+        if reference.shape != self.grid.shape or deformed.shape != self.grid.shape:
+            raise InputError(
+                f"expected two images of {self.grid.shape} px, got {reference.shape} and "
+                f"{deformed.shape}"
+            )
+        u = self.displacement() / self.grid.pixel_size
+        row, col = np.indices(self.grid.shape)
+        value, _, _ = SplineImage.of(deformed, order).sample(row - u[..., 1], col + u[..., 0])
+        return np.asarray(reference - value)
+
+    def write(self, path: Path | str) -> None:
+        """Write JSON, atomically; every number comes back as it was."""
+        inverse = [[None if np.isinf(v) else v for v in row] for row in self.inverse.tolist()]
+        condition = self.condition_number
+        content = {
+            "format": FORMAT,
+            "outcome": self.outcome.value,
+            "explanation": self.outcome.explanation,
+            "unknowns": dict(zip(self.names, self.unknowns.tolist(), strict=True)),
+            "units": list(self.ansatz.units),
+            "residual_rms": self.residual_rms,
+            "pixels": self.pixels,
+            "left_image": self.left_image,
+            "condition_number": None if np.isinf(condition) else condition,
+            "history": [vars(step) for step in self.history],
+            "timings_s": dict(self.timings_s),
+            "grid": vars(self.grid),
+            "ansatz": ansatz_to_dict(self.ansatz),
+            "inverse": inverse,
+        }
+        write_json(path, content)
+
+    @classmethod
+    def read(cls, path: Path | str) -> Result:
+        """Read what :meth:`write` wrote.
+
+        Raises
+        ------
+        InputError
+            If the file is missing, cut short or of another format.
+        """
+        content = read_json(path)
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise InputError(f"expected a {FORMAT} file at {path}; correlate again")
+        try:
+            inverse = [[np.inf if v is None else v for v in row] for row in content["inverse"]]
+            condition = content["condition_number"]
+            return cls(
+                ansatz=ansatz_from_dict(content["ansatz"]),
+                grid=PixelGrid(**content["grid"]),
+                unknowns=np.array(list(content["unknowns"].values())),
+                inverse=np.array(inverse),
+                residual_rms=content["residual_rms"],
+                pixels=content["pixels"],
+                left_image=content["left_image"],
+                outcome=Outcome(content["outcome"]),
+                condition_number=np.inf if condition is None else condition,
+                history=tuple(Iteration(**step) for step in content["history"]),
+                timings_s=content["timings_s"],
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"expected a complete {FORMAT} file at {path}, got: {error!r}; correlate again"
+            ) from error
+
+
+def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
+    return grid.x, grid.y
