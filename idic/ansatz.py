@@ -52,7 +52,7 @@ class Ansatz:
     def square(
         cls, domain: Box, cellular: Box, unit_cell: float, origin: str = "junction"
     ) -> Ansatz:
-        """The paper's ansatz for a square stacking of holes: 77 unknowns.
+        """Make the paper's ansatz for a square stacking of holes: 77 unknowns.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class Ansatz:
         return slice(first, first + self.v_space.size)
 
     def phi_offset(self, i: int) -> int:
-        """Number of unknowns before the parameters of the mode number i (from 0)."""
+        """Count the unknowns before the parameters of the mode number i (from 0)."""
         slow = 2 * self.v0_space.size + len(self.modes) * self.v_space.size
         return slow + sum(mode.family.size for mode in self.modes[:i])
 
@@ -118,7 +118,7 @@ class Ansatz:
         return slow + tuple(unit for mode in self.modes for unit in mode.family.units)
 
     def checked(self, a: ArrayLike) -> FloatArray:
-        """The unknowns as (size,) floats; raises InputError if the size is wrong."""
+        """Return the unknowns as (size,) floats; raises InputError if the size is wrong."""
         a = np.asarray(a, dtype=np.float64)
         if a.shape != (self.size,):
             raise InputError(
@@ -170,7 +170,7 @@ class Ansatz:
         return self.v(i, a, x, y)[..., None] * self.phi(i, a, x, y)
 
     def displacement(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """The whole displacement [mm].
+        """Evaluate the whole displacement [mm].
 
         Parameters
         ----------

@@ -37,7 +37,7 @@ class Box:
 
     @classmethod
     def centred(cls, width: float, height: float) -> Box:
-        """The box of this size [mm] around the origin."""
+        """Make the box of this size [mm] around the origin."""
         return cls(-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
 
     @property
@@ -105,7 +105,7 @@ class ChebyshevField:
         return matrix
 
     def evaluate(self, coefficients: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
-        """The field at positions [mm] that broadcast together.
+        """Evaluate the field at positions [mm] that broadcast together.
 
         Fast on an open grid, x of shape (1, cols) and y of shape (rows, 1).
         """

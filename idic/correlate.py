@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def fit_displacement(
     options: GaussNewtonOptions | None = None,
     progress: Progress = silent,
 ) -> Result:
-    """The best possible fit of an ansatz to a known displacement: what IDIC could find at best.
+    """Fit an ansatz to a known displacement as well as it can: what IDIC could find at best.
 
     Minimises 1/2 sum ||u(x) - u(x, a)||^2 over the pixels with the same engine.
 
@@ -183,7 +184,7 @@ def fit_displacement(
         raise InputError(f"expected a finite displacement inside the mask, got {_first(bad)}")
     assembly = Assembly(ansatz, grid, inside)
     found = minimise(
-        lambda a: assembly.displacement(a, target),
+        partial(assembly.displacement, target=target),
         _step_length(ansatz, grid, inside, 1),
         ansatz.checked(start),
         options,
@@ -209,10 +210,14 @@ def _minimise_pair(
     for _ in range(_ROUNDS):
         assembly = Assembly(ansatz, pair.grid, landed)
         found = minimise(
-            lambda a, on=assembly: on.images(a, pair.reference, pair.deformed),
+            partial(assembly.images, reference=pair.reference, deformed=pair.deformed),
             _step_length(ansatz, pair.grid, landed, factor),
-            start, options, tolerance, factor, on_iteration,
-        )  # fmt: skip
+            start,
+            options,
+            tolerance,
+            factor,
+            on_iteration,
+        )
         history += found.history
         previous, landed = landed, _landed(pair, ansatz, found.unknowns)
         if (landed != previous).sum() <= _SETTLED * landed.sum():
@@ -222,7 +227,7 @@ def _minimise_pair(
 
 
 def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
-    """The pixels of the mask that these unknowns map onto material of the deformed image.
+    """Keep the pixels that these unknowns map onto material of the deformed image.
 
     The set is frozen while the cost is minimised: pixels that came and went with every step
     would make the cost jump, and the iteration stagnate.
@@ -265,7 +270,7 @@ def _result(
 
 
 def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple[Level, ...]:
-    """The levels that keep the modes visible and enough pixels; always the last one."""
+    """Select the levels that keep the modes visible and enough pixels; always the last one."""
     shortest = min((mode.half_wavelength for mode in ansatz.modes), default=np.inf)
     quarter_px = 0.25 * shortest / grid.pixel_size
 

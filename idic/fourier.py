@@ -75,7 +75,7 @@ class ModeFamily:
     @property
     def size(self) -> int:
         """Number of parameters m."""
-        return self.matrix.shape[1]
+        return len(self.start)
 
     @property
     def wave_count(self) -> int:
@@ -89,7 +89,7 @@ class ModeFamily:
 
 
 def square_family(origin: str = "junction") -> ModeFamily:
-    """The paper's Eq. (mode): two waves along the diagonals, seven parameters.
+    """Make the paper's Eq. (mode): two waves along the diagonals, seven parameters.
 
     phi_x = a1 [-sin t1 - sin t2], phi_y = sin t1 - sin t2 with t1 = pi/l (a2 x + a3 y + a6) and
     t2 = pi/l (a4 x + a5 y + a7); a6 and a7 are in mm.
@@ -116,7 +116,7 @@ def square_family(origin: str = "junction") -> ModeFamily:
 
 
 def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
-    """The family in which every wave has its own five parameters.
+    """Make the family in which every wave has its own five parameters.
 
     An amplitude common to all waves is what v_i already describes, so the largest amplitude
     of the start is held fixed.
@@ -181,11 +181,11 @@ class FourierMode:
     def scaled(
         cls, family: ModeFamily, half_wavelength: float, taper: Taper, maximum: float = 0.04
     ) -> FourierMode:
-        """The mode whose scale makes max ||phi|| = ``maximum`` [-] at the family's start."""
+        """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start."""
         unit = cls(family, half_wavelength, 1.0, taper)
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
         # with k near 1 to well under 1 %; the square one is hit exactly.
-        t = half_wavelength * np.arange(-192, 193) / 16.0
+        t: FloatArray = half_wavelength * np.arange(-192, 193, dtype=np.float64) / 16.0
         phi = unit.waves_sum(family.start, t[None, :], t[:, None])
         largest = float(np.sqrt((phi**2).sum(axis=-1).max()))
         if not largest > 0:

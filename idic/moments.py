@@ -45,7 +45,7 @@ def _chebyshev_block(xi: Any, columns: Any, n: int, T: Any) -> None:
 
 @compiled()
 def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
-    """The sum of C[a, b] T_a(xi) T_b(eta) along the block; eta_T holds T_b of the row."""
+    """Sum C[a, b] T_a(xi) T_b(eta) along the block; eta_T holds T_b of the row."""
     degree = C.shape[0] - 1
     for m in range(n):
         out[m] = 0.0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -115,7 +116,7 @@ class Assembly:
     @cached_property
     def _primitive_slices(self) -> list[slice]:
         ends = np.cumsum([0] + [(d + 1) * (d + 2) // 2 for d in self._degrees])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(a, b) for a, b in pairwise(ends.tolist())]
 
     @cached_property
     def _to_unknowns(self) -> FloatArray:
@@ -145,7 +146,7 @@ class Assembly:
         reference: NDArray[Any],
         deformed: SplineImage,
     ) -> NormalEquations:
-        """The normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
+        """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
         Parameters
         ----------
@@ -159,7 +160,7 @@ class Assembly:
         return self._assemble(a, IMAGE, reference, deformed.coefficients, deformed.order)
 
     def displacement(self, a: FloatArray, target: NDArray[Any]) -> NormalEquations:
-        """The normal equations of r = target - u(a), both components.
+        """Assemble the normal equations of r = target - u(a), both components.
 
         Parameters
         ----------
@@ -209,7 +210,7 @@ class Assembly:
 
 
 def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
-    """Sums of e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
+    """Form the sums of e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
     i, j = np.array(orders(degree)).T[:, :, None]
     k, m = np.array(orders(other)).T[:, None, :]
     a, b, c, d = i + k, abs(i - k), j + m, abs(j - m)
@@ -217,7 +218,7 @@ def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
 
 
 def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> tuple[NDArray[Any], ...]:
-    """The one-dimensional tables that the kernel combines; see ``accumulate``."""
+    """Make the one-dimensional tables that the kernel combines; see ``accumulate``."""
     v0 = np.stack([ansatz.v0_space.square(a[ansatz.v0_slice(c)]) for c in (0, 1)])
     n, d = len(ansatz.modes), ansatz.v_degree + 1
     v, waves, mode_of_wave = np.zeros((n, d, d)), np.zeros((0, 6)), []

@@ -119,7 +119,7 @@ def prepare(
 
 
 def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
-    """The mask without the pixels within ``distance_px`` of its edge; the image border is none."""
+    """Take away the pixels within ``distance_px`` of the mask's edge; the image border is none."""
     if distance_px < 1 or mask.all():
         return mask
     padded = np.pad(mask, distance_px + 1, mode="edge")
@@ -143,7 +143,7 @@ def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
 
 
 def _continued(mean: Image, share: Image, blur: float) -> Image:
-    """mean / share; far from any material, the mean grey level of all material."""
+    """Divide mean by share; far from any material, the mean grey level of all material."""
     overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
     far = np.float32(1e-4)
     return np.asarray((mean + far * np.float32(overall)) / (share + far))

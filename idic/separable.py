@@ -9,7 +9,7 @@ FloatArray = NDArray[np.float64]
 
 
 def sum_of_products(along_x: FloatArray, along_y: FloatArray) -> FloatArray:
-    """The sum over k of along_x[k] * along_y[k], which broadcast together.
+    """Sum over k the products along_x[k] * along_y[k], which broadcast together.
 
     On an open grid, along_x of shape (n, 1, cols) and along_y of shape (n, rows, 1), it is a
     matrix product, and some ten times faster than going through all pixels n times.

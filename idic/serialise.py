@@ -25,7 +25,7 @@ def ansatz_to_dict(ansatz: Ansatz) -> dict[str, Any]:
 
 
 def ansatz_from_dict(content: Mapping[str, Any]) -> Ansatz:
-    """The ansatz that :func:`ansatz_to_dict` described."""
+    """Make the ansatz that :func:`ansatz_to_dict` described."""
     return Ansatz(
         domain=Box(**content["domain"]),
         modes=tuple(_mode_from_dict(mode) for mode in content["modes"]),

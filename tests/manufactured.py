@@ -1,0 +1,92 @@
+"""Pairs of images whose displacement is an ansatz, known exactly: shared by the idic tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.fourier import FourierMode, free_family, square_family
+from modeharvest.idic.support import Taper
+from modeharvest.imaging.grid import PixelGrid
+
+FloatArray = NDArray[np.float64]
+
+UNIT_CELL = 1.0
+PIXEL = 0.01
+GRID = PixelGrid.centred(360, 320, PIXEL)
+DOMAIN = Box.centred(2.6, 3.0)
+CELLULAR = Box.centred(2.0, 2.4)
+
+
+def one_mode() -> Ansatz:
+    return Ansatz.square(DOMAIN, CELLULAR, UNIT_CELL)
+
+
+def two_modes() -> Ansatz:
+    """Make a square mode and a free one of a single wave, of different lengths and supports."""
+    square = FourierMode.scaled(square_family("hole"), UNIT_CELL, Taper(CELLULAR, 0.5))
+    single = FourierMode.scaled(
+        free_family([[0.3, 1.0, 1.2, 0.4, 0.1]]), 0.8, Taper(Box(-0.9, 1.0, -1.0, 1.1), 0.3)
+    )
+    return Ansatz(DOMAIN, (square, single), v0_degree=3, v_degree=2)
+
+
+def random_unknowns(ansatz: Ansatz, seed: int, size: float = 0.01) -> FloatArray:
+    """Disturb every unknown of the start by about ``size``."""
+    rng = np.random.default_rng(seed)
+    return ansatz.start(0.03, 0.8) + size * rng.normal(size=ansatz.size)
+
+
+def inner_mask(margin_mm: float = 0.0) -> NDArray[np.bool_]:
+    """Select the pixels inside the domain, less a margin."""
+    inside_x = abs(GRID.x) < DOMAIN.x_max - margin_mm
+    inside_y = abs(GRID.y) < DOMAIN.y_max - margin_mm
+    return inside_y[:, None] & inside_x[None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class CosinePattern:
+    """A band-limited grey-level field: a sum of plane waves with periods of 14 to 60 px."""
+
+    wave_vectors: FloatArray
+    phases: FloatArray
+
+    @classmethod
+    def random(cls, seed: int = 0, count: int = 40) -> CosinePattern:
+        rng = np.random.default_rng(seed)
+        period, angle = rng.uniform(14, 60, count) * PIXEL, rng.uniform(0, np.pi, count)
+        k = 2 * np.pi / period[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return cls(k, rng.uniform(0, 2 * np.pi, count))
+
+    def __call__(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Grey levels, of standard deviation 1/sqrt(2), at positions [mm]."""
+        total = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for (kx, ky), phase in zip(self.wave_vectors, self.phases, strict=True):
+            total += np.cos(kx * x + ky * y + phase)
+        return total / np.sqrt(len(self.phases))
+
+
+def image_pair(
+    pattern: CosinePattern, ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID
+) -> tuple[FloatArray, FloatArray]:
+    """Make f on the grid, and g(y) = f(x) with x + u(x) = y solved to rounding by iteration."""
+    x, y = np.meshgrid(grid.x, grid.y)
+    at = np.stack([x, y], axis=-1)
+    reference = at.copy()
+    for _ in range(80):
+        # Far outside the domain the polynomials run away; nothing is sampled there.
+        inside = np.stack(
+            [np.clip(reference[..., 0], -1.5, 1.5), np.clip(reference[..., 1], -1.7, 1.7)], -1
+        )
+        moved = at - ansatz.displacement_at(a, inside)
+        change = abs(moved - reference).max()
+        reference = moved
+        if change < 1e-13:
+            break
+    else:
+        raise AssertionError(f"the inverse mapping has not converged: {change} mm")
+    return pattern(x, y), pattern(reference[..., 0], reference[..., 1])
