@@ -22,7 +22,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 BAND = 16  # rows
-ON_EDGE = 1e-10  # pixels this far outside in xi, eta still belong to the element
+ON_EDGE = 1e-9  # pixels this far outside in xi, eta still belong to the element
 _NEWTON_STEPS = 25
 _DEEPEST = 9  # quarters of quarters in the exhaustive search
 _ROUNDING_PX = 1e-13
