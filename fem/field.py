@@ -54,7 +54,9 @@ class Mesh:
 
     def __post_init__(self) -> None:
         if self.element not in NODES_PER_CELL:
-            raise InputError(f"expected an element among {list(NODES_PER_CELL)}, got {self.element}")
+            raise InputError(
+                f"expected an element among {list(NODES_PER_CELL)}, got {self.element}"
+            )
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(self.cells, dtype=np.int64))
         k = NODES_PER_CELL[self.element]
@@ -228,19 +230,17 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
         source = meshio.read(path)
     except Exception as error:  # meshio raises a different type for every format
         raise InputError(f"expected a mesh that meshio reads at {path}, got: {error}") from error
-    blocks = {block.type: block.data for block in source.cells}
-    for element, name in _MESHIO_NAME.items():
-        if name in blocks:
-            break
-    else:
+    types = {block.type for block in source.cells}
+    element = next((e for e, name in _MESHIO_NAME.items() if name in types), None)
+    if element is None:
         raise InputError(
-            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {list(blocks)}"
+            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {sorted(types)}"
         )
     if displacement not in source.point_data:
         raise InputError(
             f"expected a nodal field {displacement!r} in {path}, got {list(source.point_data)}"
         )
-    cells = np.vstack([b.data for b in source.cells if b.type == name])
+    cells = np.vstack([b.data for b in source.cells if b.type == _MESHIO_NAME[element]])
     mesh = Mesh(source.points[:, :2], cells, element)
     u = np.ascontiguousarray(source.point_data[displacement][:, :2], dtype=np.float64)
     return Solution(mesh, (Snapshot(nominal_strain, u),), {"source": str(path)})

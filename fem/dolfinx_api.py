@@ -1,0 +1,78 @@
+"""What differs between the supported dolfinx versions (0.9 to 0.11), and nothing else."""
+
+from __future__ import annotations
+
+import inspect
+from importlib.metadata import version
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+from dolfinx.fem import petsc as dolfinx_petsc
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from modeharvest.errors import MissingDependencyError
+from modeharvest.fem.field import Mesh
+
+VERSION = version("fenics-dolfinx")
+if tuple(int(v) for v in VERSION.split(".")[:2]) < (0, 9):
+    raise MissingDependencyError(
+        f"expected dolfinx 0.9 or newer, got {VERSION}; see 'Install' in the README"
+    )
+
+# dolfinx numbers a mid-side node by the corner opposite to it, VTK and gmsh in a round.
+_T6_FROM_VTK = [0, 1, 2, 4, 5, 3]
+
+
+def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
+    """Distribute a T6 mesh (held by rank 0, ignored elsewhere) over the communicator."""
+    if comm.rank == 0:
+        nodes, cells = mesh.nodes, mesh.cells[:, _T6_FROM_VTK]
+    else:
+        nodes, cells = np.empty((0, 2)), np.empty((0, 6), dtype=np.int64)
+    element = basix.ufl.element("Lagrange", "triangle", 2, shape=(2,))
+    return dolfinx.mesh.create_mesh(comm, cells=cells, x=nodes, e=element)
+
+
+def assemble_matrix(form: Any, bcs: list[Any], diagonal: float, matrix: Any = None) -> PETSc.Mat:
+    """Assemble a PETSc matrix, into ``matrix`` if given; constrained rows get ``diagonal``."""
+    if matrix is None:
+        matrix = dolfinx_petsc.create_matrix(form)
+    matrix.zeroEntries()
+    keywords: dict[str, Any] = {"bcs": bcs, _DIAGONAL: diagonal}
+    dolfinx_petsc.assemble_matrix(matrix, form, **keywords)
+    matrix.assemble()
+    return matrix
+
+
+def assemble_vector(form: Any, vector: PETSc.Vec) -> None:
+    """Assemble a linear form into ``vector`` and add the ghosts' shares to their owners."""
+    with vector.localForm() as local:
+        local.set(0.0)
+    dolfinx_petsc.assemble_vector(vector, form)
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+def gather_nodes(V: Any, values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Nodal values (count, 2) in the order of the nodes given to :func:`create_mesh`.
+
+    ``values`` is the local array of a function of the vector space ``V`` (quadratic, as the
+    geometry). Every rank gets the whole array.
+    """
+    mesh = V.mesh
+    given = np.asarray(mesh.geometry.input_global_indices)
+    result = np.zeros((count, 2))
+    owned = np.zeros((count, 1))
+    nodes, dofs = mesh.geometry.dofmap.ravel(), V.dofmap.list.ravel()
+    result[given[nodes]] = values.reshape(-1, 2)[dofs]
+    owned[given[nodes]] = 1.0
+    mesh.comm.Allreduce(MPI.IN_PLACE, result)
+    mesh.comm.Allreduce(MPI.IN_PLACE, owned)
+    return np.asarray(result / owned)
+
+
+_PARAMETERS = inspect.signature(dolfinx_petsc.assemble_matrix).parameters
+_DIAGONAL = "diag" if "diag" in _PARAMETERS else "diagonal"  # renamed in 0.10

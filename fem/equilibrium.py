@@ -1,0 +1,273 @@
+"""Total-Lagrangian equilibrium of a loaded specimen (dolfinx): forms, factor, Newton.
+
+The nominal strain e is the only load: constrained displacements are e * d with a fixed
+direction d. Everything a path follower asks of the structure is here: residual, tangent,
+load direction, energy, reaction, mass; how to walk the path is in ``continuation``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from modeharvest.errors import InputError
+from modeharvest.fem import dolfinx_api
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import Material
+
+FloatArray = NDArray[np.float64]
+# Degree-2 quadrature on a triangle: the three-point Gauss rule of the paper.
+_THREE_POINTS = {"quadrature_degree": 2}
+
+
+@dataclass(frozen=True)
+class Loading:
+    """Compression along x by displacing the two edges x = +-half_width towards each other.
+
+    Parameters
+    ----------
+    half_width
+        Position of the loaded edges [mm].
+    length
+        The length that nominal strain refers to [mm]; e * length is the shortening.
+    edges
+        "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
+        for one node at mid-height, which keeps the specimen in place.
+    """
+
+    half_width: float
+    length: float
+    edges: str = "clamped"
+
+    def __post_init__(self) -> None:
+        if self.edges not in ("clamped", "sliding"):
+            raise InputError(f"loaded edges: expected 'clamped' or 'sliding', got {self.edges!r}")
+
+
+class Factor:
+    """The LDL^T factorisation of a symmetric matrix by MUMPS: solutions and inertia."""
+
+    def __init__(self, matrix: PETSc.Mat) -> None:
+        pc = PETSc.PC().create(matrix.comm)
+        pc.setOperators(matrix)
+        pc.setType(PETSc.PC.Type.CHOLESKY)
+        pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+        pc.setFactorSetUpSolverType()
+        factor = pc.getFactorMatrix()
+        factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
+        factor.setMumpsIcntl(24, 1)  # null pivots are detected instead of divided by
+        factor.setMumpsIcntl(14, 60)  # room for the pivoting of an indefinite matrix [%]
+        pc.setUp()
+        if factor.getMumpsInfog(1) < 0:
+            raise ArithmeticError(f"MUMPS failed with INFOG(1) = {factor.getMumpsInfog(1)}")
+        self._pc, self._matrix = pc, factor
+
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues of the matrix, by Sylvester's law of inertia."""
+        return int(self._matrix.getInertia()[0])
+
+    def solve(self, rhs: PETSc.Vec) -> PETSc.Vec:
+        """The solution for one right-hand side."""
+        solution = rhs.duplicate()
+        self._pc.apply(rhs, solution)
+        return solution
+
+
+class Structure:
+    """A meshed hyperelastic body under one loading: what its equilibrium equations need.
+
+    Vectors are PETSc vectors over all displacement components; ``u`` includes the
+    constrained ones. ``factorisations`` counts every numerical factorisation.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh [mm] (needed on rank 0 only).
+    material
+        Strain energy density [MPa].
+    loading
+        What is prescribed where.
+    comm
+        The communicator to distribute over.
+    """
+
+    def __init__(
+        self, mesh: Mesh, material: Material, loading: Loading, comm: MPI.Comm = MPI.COMM_WORLD
+    ) -> None:
+        if mesh.element != "T6":
+            raise InputError(f"finite elements: expected a T6 mesh, got {mesh.element}")
+        self.mesh, self.comm = mesh, comm
+        domain = dolfinx_api.create_mesh(mesh, comm)
+        self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
+        self._u = dolfinx.fem.Function(self.V)
+        self._direction = dolfinx.fem.Function(self.V)
+        self._constrain(domain, loading)
+        self._define_forms(domain, material)
+        self.factorisations = 0
+        self.tangent: Any = None
+
+    def _constrain(self, domain: dolfinx.mesh.Mesh, loading: Loading) -> None:
+        tolerance = 1e-8 * loading.half_width
+
+        def on_edge(x: FloatArray) -> NDArray[np.bool_]:
+            return np.asarray(np.abs(np.abs(x[0]) - loading.half_width) < tolerance)
+
+        def anchor(x: FloatArray) -> NDArray[np.bool_]:
+            return np.asarray(
+                (np.abs(x[0] + loading.half_width) < tolerance) & (np.abs(x[1]) < tolerance)
+            )
+
+        held_y = on_edge if loading.edges == "clamped" else anchor
+        dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, held_y)
+        if self.comm.allreduce(len(dofs_x)) == 0 or self.comm.allreduce(len(dofs_y)) == 0:
+            raise InputError(
+                f"loading: expected nodes on the edges x = +-{loading.half_width} mm"
+                " (and one at mid-height for sliding edges), found none"
+            )
+        x = self.V.tabulate_dof_coordinates()
+        target = self._direction.x.array.reshape(-1, 2)
+        target[dofs_x // 2, 0] = -0.5 * loading.length * np.sign(x[dofs_x // 2, 0])
+        self._direction.x.scatter_forward()
+        self._held = np.union1d(dofs_x, dofs_y)
+        # Only the matrices use these, and there the value is of no account.
+        self._bcs = [
+            dolfinx.fem.dirichletbc(PETSc.ScalarType(0), dofs.astype(np.int32), self.V.sub(i))
+            for i, dofs in enumerate((dofs_x, dofs_y))
+        ]
+        owned = self.V.dofmap.index_map.size_local * 2
+        self._held_owned = self._held[self._held < owned]
+
+    def _component_dofs(
+        self, component: int, where: Callable[[FloatArray], NDArray[np.bool_]]
+    ) -> NDArray[np.int64]:
+        """Local numbers of the constrained displacement components, ghosts included."""
+        x = self.V.tabulate_dof_coordinates()
+        return 2 * np.flatnonzero(where(x.T)).astype(np.int64) + component
+
+    def _define_forms(self, domain: dolfinx.mesh.Mesh, material: Material) -> None:
+        u, form = self._u, dolfinx.fem.form
+        test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
+        dx = ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
+        F = ufl.Identity(2) + ufl.grad(u)
+        energy = material.energy(F) * dx
+        residual = ufl.derivative(energy, u, test)
+        self._energy = form(energy)
+        self._residual = form(residual)
+        self._tangent_form = form(ufl.derivative(residual, u, trial))
+        self._load_form = form(ufl.derivative(residual, u, self._direction))
+        self._mass_form = form(ufl.inner(trial, test) * ufl.dx(domain))
+        det_f = dolfinx.fem.Expression(ufl.det(F), _THREE_POINT_LOCATIONS)
+        count = domain.topology.index_map(2).size_local
+        self._det_f = (det_f, np.arange(count, dtype=np.int32))
+
+    # -- states -------------------------------------------------------------------------
+
+    def zero(self) -> PETSc.Vec:
+        """The undeformed state."""
+        vector = self._u.x.petsc_vec.duplicate()
+        vector.set(0.0)
+        return vector
+
+    def prescribe(self, u: PETSc.Vec, strain: float) -> None:
+        """Set the constrained components of ``u`` to what the strain demands."""
+        u.array[self._held_owned] = strain * self._direction.x.array[self._held_owned]
+
+    def nodal(self, u: PETSc.Vec) -> FloatArray:
+        """(n, 2) displacement at the mesh's nodes, in their order [mm]; on every rank."""
+        self._load(u)
+        count = self.comm.bcast(len(self.mesh.nodes))
+        return dolfinx_api.gather_nodes(self.V, self._u.x.array, count)
+
+    def from_function(self, field: Callable[[FloatArray], FloatArray]) -> PETSc.Vec:
+        """The vector of a displacement field: (n, 2) values at points (n, 2) [mm]."""
+        vector = self.zero()
+        count = self.V.dofmap.index_map.size_local
+        points = self.V.tabulate_dof_coordinates()[:count, :2]
+        vector.array[:] = field(points).ravel()
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def largest(self, u: PETSc.Vec) -> float:
+        """The largest nodal displacement of ``u`` [mm]."""
+        length = np.linalg.norm(u.array.reshape(-1, 2), axis=1)
+        return float(self.comm.allreduce(float(np.max(length, initial=0.0)), MPI.MAX))
+
+    # -- operators at a state -----------------------------------------------------------
+
+    def residual(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Internal forces [N/mm], zero at the constrained components."""
+        vector = self._assemble(self._residual, u)
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def load(self, u: PETSc.Vec) -> PETSc.Vec:
+        """d(internal forces)/d(strain) at fixed free components [N/mm]."""
+        vector = self._assemble(self._load_form, u)
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def stiffness(self, u: PETSc.Vec) -> PETSc.Mat:
+        """Tangent stiffness at ``u`` [N/mm^2], constrained rows replaced by identity.
+
+        The matrix is the same object at every call, assembled anew.
+        """
+        self._load(u)
+        self.tangent = dolfinx_api.assemble_matrix(self._tangent_form, self._bcs, 1.0, self.tangent)
+        self.tangent.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return self.tangent
+
+    def factor(self, u: PETSc.Vec) -> Factor:
+        """Factorise the tangent stiffness at ``u``."""
+        self.factorisations += 1
+        return Factor(self.stiffness(u))
+
+    def mass(self) -> PETSc.Mat:
+        """Mass matrix of unit density, constrained rows zero [mm^2]."""
+        return dolfinx_api.assemble_matrix(self._mass_form, self._bcs, 0.0)
+
+    def energy(self, u: PETSc.Vec) -> float:
+        """Stored energy per unit thickness [N]."""
+        self._load(u)
+        return float(self.comm.allreduce(dolfinx.fem.assemble_scalar(self._energy)))
+
+    def reaction(self, u: PETSc.Vec, length: float) -> float:
+        """Compressive force on a loaded edge per unit thickness [N/mm].
+
+        By virtual work: d(energy)/d(strain) = force * length at equilibrium.
+        """
+        forces = self._assemble(self._residual, u)
+        held = self._held_owned
+        work = float(forces.array[held] @ self._direction.x.array[held])
+        return float(self.comm.allreduce(work)) / length
+
+    def smallest_jacobian(self, u: PETSc.Vec) -> float:
+        """Smallest det F at the corners and mid-sides of all elements [-]."""
+        self._load(u)
+        expression, cells = self._det_f
+        values = expression.eval(self.V.mesh, cells)
+        return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), MPI.MIN))
+
+    def _load(self, u: PETSc.Vec) -> None:
+        count = len(u.array)
+        self._u.x.array[:count] = u.array
+        self._u.x.scatter_forward()
+
+    def _assemble(self, form: Any, u: PETSc.Vec) -> PETSc.Vec:
+        self._load(u)
+        vector = u.duplicate()
+        dolfinx_api.assemble_vector(form, vector)
+        return vector
+
+
+_THREE_POINT_LOCATIONS = np.array(
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]
+)

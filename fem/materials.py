@@ -1,0 +1,150 @@
+"""Compressible hyperelastic materials in plane strain: each states only its energy.
+
+UFL differentiates the energy W(F) to the first Piola-Kirchhoff stress P and the tangent, so
+a new material is one frozen dataclass with one method. F is the 2 x 2 in-plane deformation
+gradient; the stretch out of the plane is 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import ufl
+
+from modeharvest.errors import InputError
+
+
+class Material(Protocol):
+    """Anything that has a strain energy density."""
+
+    def energy(self, F: Any) -> Any:
+        """Strain energy density W [MPa] as a UFL expression of F (2 x 2) [-]."""
+
+
+@dataclass(frozen=True)
+class Ogden:
+    """Compressible Ogden material with any number of terms, no isochoric split.
+
+    W = sum_i c_i/m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3 - m_i ln J) + kappa/2 (J - 1)^2
+
+    with the principal stretches l1, l2 and l3 = 1. Small strain: shear modulus
+    mu = sum(c_i)/2, Lame's lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)).
+    The form is that of van Bree et al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333;
+    the default constants are this project's choice (mu = 0.60 MPa, nu = 0.45), because the
+    paper's own are not public.
+
+    Parameters
+    ----------
+    moduli
+        c_i [MPa].
+    exponents
+        m_i [-], any real number but 0.
+    kappa
+        Volumetric modulus [MPa].
+    """
+
+    moduli: tuple[float, ...] = (1.2,)
+    exponents: tuple[float, ...] = (3.0,)
+    kappa: float = 5.4
+
+    def __post_init__(self) -> None:
+        if len(self.moduli) != len(self.exponents) or not self.moduli:
+            raise InputError(
+                f"Ogden material: expected as many moduli as exponents, got {len(self.moduli)} "
+                f"and {len(self.exponents)}"
+            )
+        if 0.0 in self.exponents or sum(self.moduli) <= 0 or self.kappa <= 0:
+            raise InputError(
+                "Ogden material: expected nonzero exponents, a positive sum of moduli and a "
+                f"positive kappa, got {self}"
+            )
+
+    def energy(self, F: Any) -> Any:
+        """W(F) [MPa]."""
+        J = ufl.det(F)
+        terms = [
+            c / m**2 * (power_sum_of_stretches(F, m) - 2.0 - m * ufl.ln(J))
+            for c, m in zip(self.moduli, self.exponents, strict=True)
+        ]
+        return sum(terms) + 0.5 * self.kappa * (J - 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class TwoTermI1:
+    """W = c1 (I1 - 3) + c2 (I1 - 3)^2 - 2 c1 ln J + K/2 (J - 1)^2, with I1 = tr C + 1.
+
+    Bertoldi, Boyce, Deschanel, Prange & Mullin, J. Mech. Phys. Solids 56 (2008) 2642-2668,
+    doi 10.1016/j.jmps.2008.03.006; defaults are theirs (nu = 0.490).
+
+    Parameters
+    ----------
+    c1, c2, bulk
+        c1, c2 and K [MPa].
+    """
+
+    c1: float = 0.55
+    c2: float = 0.3
+    bulk: float = 55.0
+
+    def __post_init__(self) -> None:
+        if not (self.c1 > 0 and self.c2 >= 0 and self.bulk > 0):
+            raise InputError(f"I1 material: expected c1 > 0, c2 >= 0 and bulk > 0, got {self}")
+
+    def energy(self, F: Any) -> Any:
+        """W(F) [MPa]."""
+        J = ufl.det(F)
+        i1 = ufl.inner(F, F) + 1.0
+        return (
+            self.c1 * (i1 - 3.0)
+            + self.c2 * (i1 - 3.0) ** 2
+            - 2.0 * self.c1 * ufl.ln(J)
+            + 0.5 * self.bulk * (J - 1.0) ** 2
+        )
+
+
+def power_sum_of_stretches(F: Any, m: float) -> Any:
+    """l1^m + l2^m of a 2 x 2 deformation gradient [-], smooth where the stretches coincide.
+
+    The square root in the formula for the stretches has no derivative at l1 = l2, although
+    the symmetric sum has all of them. With l1/l2 = exp(2 eta),
+
+        l1^m + l2^m = 2 J^(m/2) cosh(m eta),    sinh(eta)^2 = s,
+        s = ((F11 - F22)^2 + (F12 + F21)^2) / (4 J),
+
+    where s >= 0 is a smooth function of F, free of cancellation. cosh(m asinh(sqrt(s))) is
+    analytic in s; near s = 0 its power series is used, elsewhere the closed form.
+    """
+    J = ufl.det(F)
+    s = ((F[0, 0] - F[1, 1]) ** 2 + (F[0, 1] + F[1, 0]) ** 2) / (4.0 * J)
+    return 2.0 * J ** (0.5 * m) * _cosh_m_asinh_sqrt(s, m)
+
+
+_SERIES_LIMIT = 0.02
+_SERIES_TERMS = 9  # the first one left out is below 1e-15 at the limit for |m| <= 10
+
+
+def _cosh_m_asinh_sqrt(s: Any, m: float) -> Any:
+    near = ufl.lt(s, _SERIES_LIMIT)
+    # The closed form must stay differentiable where it isn't used: 0 * NaN would be NaN.
+    root = ufl.sqrt(ufl.conditional(near, _SERIES_LIMIT, s))
+    growth = (root + ufl.sqrt(1.0 + root**2)) ** m
+    closed = 0.5 * (growth + 1.0 / growth)
+    return ufl.conditional(near, _series(s, m), closed)
+
+
+def _series(s: Any, m: float) -> Any:
+    """Taylor series of cosh(m asinh(sqrt(s))), by Horner's rule.
+
+    y(s) solves s (1 + s) y'' + (1/2 + s) y' = m^2/4 y, which gives the ratio of
+    coefficients a_{k+1}/a_k = (m^2/4 - k^2) / ((k + 1) (k + 1/2)); for an even m the series
+    ends.
+    """
+    coefficients = [1.0]
+    for k in range(_SERIES_TERMS):
+        ratio = (0.25 * m**2 - k**2) / ((k + 1.0) * (k + 0.5))
+        coefficients.append(coefficients[-1] * ratio)
+    value = coefficients[-1]
+    for a in reversed(coefficients[:-1]):
+        value = value * s + a
+    return value

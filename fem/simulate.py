@@ -1,0 +1,263 @@
+"""From a specimen to its solution: mesh it, walk the path, keep the snapshots asked for."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from modeharvest import __version__
+from modeharvest.errors import InputError
+from modeharvest.fem import dolfinx_api
+from modeharvest.fem.continuation import Critical, PathOptions, State, Walker
+from modeharvest.fem.equilibrium import Loading, Structure
+from modeharvest.fem.field import Mesh, Snapshot, Solution
+from modeharvest.fem.imperfection import Imperfection, perturb
+from modeharvest.fem.materials import Material, Ogden
+from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.specimen import Specimen
+from modeharvest.fem.stability import Mode
+from modeharvest.progress import Progress, silent
+
+Branches = tuple[str, ...]
+BRANCHES = ("primary", "buckled+", "buckled-")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
+
+    Parameters
+    ----------
+    specimen
+        Geometry [mm].
+    material
+        Strain energy density [MPa].
+    strains
+        Nominal strains of the snapshots, ascending, compression positive [-].
+    mesh_size
+        Target edge length of the T6 elements [mm].
+    edges
+        Loaded edges "clamped" or "sliding".
+    branches
+        What to keep above the critical strain, out of "primary" (unstable there), "buckled+"
+        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern``).
+    imperfection
+        Scatter of the holes; with any, there is no bifurcation to find and the one natural
+        path is followed.
+    path
+        How the path is walked.
+    """
+
+    specimen: Specimen = field(default_factory=Specimen)
+    material: Material = field(default_factory=Ogden)
+    strains: tuple[float, ...] = (0.078, 0.128)
+    mesh_size: float = 0.2
+    edges: str = "clamped"
+    branches: Branches = ("buckled+",)
+    imperfection: Imperfection = field(default_factory=Imperfection)
+    path: PathOptions = field(default_factory=PathOptions)
+
+    def __post_init__(self) -> None:
+        strains = self.strains
+        if not strains or strains[0] <= 0 or any(b <= a for a, b in pairwise(strains)):
+            raise InputError(
+                f"strains: expected ascending positive nominal strains such as 0.078, 0.128, got "
+                f"{list(strains)}"
+            )
+        if strains[-1] >= 0.5:
+            raise InputError(
+                f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"
+            )
+        if not self.branches or not set(self.branches) <= set(BRANCHES):
+            raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
+
+
+def simulate(
+    experiment: Experiment, progress: Progress = silent, comm: MPI.Comm = MPI.COMM_WORLD
+) -> Solution:
+    """Run a virtual compression test (collective over ``comm``; every rank gets the result).
+
+    The solution's ``info["outcome"]`` says in words how far the path went; where it ended
+    early, the snapshots reached are there. ``info["critical"]`` is None where the specimen
+    stays stable, or is imperfect.
+    """
+    spec = experiment.specimen
+    mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
+    loading = Loading(spec.half_size[0], spec.length, experiment.edges)
+    structure = Structure(mesh, experiment.material, loading, comm)
+    return _Run(experiment, mesh, Walker(structure, experiment.path, progress)).solution()
+
+
+@dataclass(eq=False)
+class _Run:
+    experiment: Experiment
+    mesh: Mesh
+    walker: Walker
+
+    def solution(self) -> Solution:
+        """Walk the path and put together what it gave."""
+        strains = self.experiment.strains
+        perfect = self.experiment.imperfection.is_none
+        path = [self.walker.start()]
+        arrived = self.walker.primary(
+            path, strains, until_unstable=perfect, refuse_unstable=not perfect
+        )
+        critical, branches = None, {}
+        if path[-1].negative_pivots > 0:
+            critical = self.walker.locate_critical(path[-2], path[-1])
+            arrived = self.walker.primary(path, strains)
+            if critical is not None:
+                branches = self._branches(self._oriented(critical))
+        snapshots = self._snapshots(path, critical, branches)
+        info = self._info(path, critical, branches)
+        info["outcome"] = self._outcome(arrived, snapshots)
+        return Solution(self.mesh, tuple(snapshots), info)
+
+    def _oriented(self, critical: Critical) -> Critical:
+        """The critical point with its mode turned to a positive overlap with the pattern."""
+        if self._pattern_overlap(critical.modes[0]) < 0:
+            critical.modes[0] = critical.modes[0].reversed()
+        return critical
+
+    def _pattern_overlap(self, mode: Mode) -> float:
+        pattern = self.walker.structure.from_function(self.experiment.specimen.pattern)
+        weighted = self.walker.mass * pattern
+        return mode.overlap(pattern) / float(np.sqrt(pattern.dot(weighted)))
+
+    def _pattern_share(self, mode: Mode) -> float:
+        """Overlap with the pattern if its amplitude may differ from cell to cell.
+
+        The root of the part of x . M x that lies in the span of the pattern's restrictions
+        to single unit cells: 1 for the pattern with any smooth envelope.
+        """
+        structure, spec = self.walker.structure, self.experiment.specimen
+        pattern = spec.pattern(self.mesh.nodes)
+        cell = _cell_of(self.mesh.nodes, spec)
+        inside = cell >= 0
+        with_mode = np.sum(pattern * structure.nodal(mode.weighted), axis=1)[inside]
+        mass_of = structure.nodal(self.walker.mass * structure.from_function(spec.pattern))
+        with_self = np.sum(pattern * mass_of, axis=1)[inside]
+        numerator = np.bincount(cell[inside], with_mode)
+        return float(np.sqrt(np.sum(numerator**2 / np.bincount(cell[inside], with_self))))
+
+    def _branches(self, critical: Critical) -> dict[str, list[State]]:
+        targets = [e for e in self.experiment.strains if e > critical.strain]
+        pitch = self.experiment.specimen.pitch
+        signs = {"buckled+": 1, "buckled-": -1}
+        wanted = [b for b in self.experiment.branches if b in signs]
+        return {b: self.walker.branch(critical, targets, signs[b], pitch) for b in wanted}
+
+    def _snapshots(
+        self, path: Sequence[State], critical: Critical | None, branches: dict[str, list[State]]
+    ) -> list[Snapshot]:
+        limit = np.inf if critical is None else critical.strain
+        kept: list[tuple[State, str]] = [
+            (state, "primary")
+            for state in path
+            if _is_among(state.strain, self.experiment.strains)
+            and (state.strain <= limit or "primary" in self.experiment.branches)
+        ]
+        kept += [(state, name) for name, states in branches.items() for state in states]
+        kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
+        return [self._snapshot(state, name) for state, name in kept]
+
+    def _snapshot(self, state: State, branch: str) -> Snapshot:
+        structure = self.walker.structure
+        return Snapshot(
+            nominal_strain=_exact(state.strain, self.experiment.strains),
+            displacement=structure.nodal(state.u),
+            reaction=structure.reaction(state.u, self.experiment.specimen.length),
+            energy=structure.energy(state.u),
+            negative_pivots=state.negative_pivots,
+            eigenvalues=state.eigenvalues,
+            branch=branch,
+        )
+
+    def _info(
+        self, path: list[State], critical: Critical | None, branches: dict[str, list[State]]
+    ) -> dict[str, Any]:
+        e = self.experiment
+        return {
+            "specimen": asdict(e.specimen),
+            "material": {"kind": type(e.material).__name__, **asdict(e.material)},  # type: ignore[call-overload]
+            "loading": {"edges": e.edges, "length_mm": e.specimen.length},
+            "mesh_size_mm": e.mesh_size,
+            "imperfection": asdict(e.imperfection),
+            "critical": None if critical is None else self._critical_info(critical),
+            "path": {
+                name: self._curve(states) for name, states in {"primary": path, **branches}.items()
+            },
+            "factorisations": self.walker.structure.factorisations,
+            "unknowns": 2 * len(self.mesh.nodes),
+            "versions": {
+                "modeharvest": __version__,
+                "dolfinx": dolfinx_api.VERSION,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+        }
+
+    def _critical_info(self, critical: Critical) -> dict[str, Any]:
+        mode = critical.modes[0]
+        return {
+            "strain": critical.strain,
+            "tolerance": self.experiment.path.critical_tolerance,
+            "negative_pivots_below": critical.below,
+            "negative_pivots_above": critical.above,
+            "pattern_overlap": self._pattern_overlap(mode),
+            "pattern_overlap_by_cell": self._pattern_share(mode),
+            "eigenvalues_N_per_mm4": [list(pair) for pair in sorted(critical.eigenvalues)],
+            "nearest_eigenvalues_N_per_mm4": [m.eigenvalue for m in critical.modes],
+        }
+
+    def _curve(self, states: list[State]) -> dict[str, Any]:
+        """What happened along a path, for plots: one entry for each state."""
+        structure, length = self.walker.structure, self.experiment.specimen.length
+        return {
+            "nominal_strain": [s.strain for s in states],
+            "reaction_N_per_mm": [structure.reaction(s.u, length) for s in states],
+            "energy_N": [structure.energy(s.u) for s in states],
+            "negative_pivots": [s.negative_pivots for s in states],
+            "lowest_eigenvalues_N_per_mm4": [list(s.eigenvalues) for s in states],
+        }
+
+    def _outcome(self, arrived: bool, snapshots: list[Snapshot]) -> str:
+        missing = [
+            e
+            for e in self.experiment.strains
+            if not _is_among(e, [s.nominal_strain for s in snapshots])
+        ]
+        if not missing:
+            return "complete"
+        listed = ", ".join(f"{100 * e:g} %" for e in missing)
+        reached = max((s.nominal_strain for s in snapshots), default=0.0)
+        why = (
+            "Newton's method did not converge"
+            if not arrived
+            else "the branch could not be followed"
+        )
+        return f"incomplete: no snapshot at {listed}; {why} beyond {100 * reached:g} % strain"
+
+
+def _cell_of(nodes: NDArray[np.float64], specimen: Specimen) -> NDArray[np.int64]:
+    """(n,) number of the unit cell that each node lies in, -1 in the bulk edges."""
+    a, b = specimen.cellular_half_size
+    column = np.floor((nodes[:, 0] + a) / specimen.pitch).astype(np.int64)
+    row = np.floor((nodes[:, 1] + b) / specimen.pitch).astype(np.int64)
+    inside = (column >= 0) & (column < specimen.holes_x) & (row >= 0) & (row < specimen.holes_y)
+    return np.where(inside, column * specimen.holes_y + row, -1)
+
+
+def _is_among(strain: float, strains: Sequence[float]) -> bool:
+    return any(abs(strain - e) < 1e-12 for e in strains)
+
+
+def _exact(strain: float, strains: Sequence[float]) -> float:
+    return min(strains, key=lambda e: abs(strain - e))

@@ -1,0 +1,90 @@
+"""The finite specimen: holes on a square lattice inside a rectangle with bulk edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A rectangular specimen with ``holes_x`` x ``holes_y`` circular holes.
+
+    The origin is the specimen's centre; x is the loading direction. Defaults are the
+    virtual experiment of the paper (section "Virtual Experiments").
+
+    Parameters
+    ----------
+    holes_x, holes_y
+        Number of holes in the loading and in the transverse direction [-].
+    diameter
+        Hole diameter d [mm].
+    pitch
+        Centre-to-centre distance l, the unit cell size [mm].
+    bulk_x, bulk_y
+        Width of the solid strips beside the cellular part, at the loaded edges and at the
+        free edges [mm]; 0 leaves them out.
+    """
+
+    holes_x: int = 6
+    holes_y: int = 10
+    diameter: float = 1.5
+    pitch: float = 1.9
+    bulk_x: float = 1.9
+    bulk_y: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.holes_x < 1 or self.holes_y < 1:
+            raise InputError(
+                "specimen: expected at least 1 x 1 holes, got "
+                f"{self.holes_x} x {self.holes_y}; set holes_x and holes_y"
+            )
+        if not 0 < self.diameter < self.pitch:
+            raise InputError(
+                "specimen: expected 0 < diameter < pitch (holes must not touch), got "
+                f"diameter = {self.diameter} mm, pitch = {self.pitch} mm"
+            )
+        if self.bulk_x < 0 or self.bulk_y < 0:
+            raise InputError(
+                "specimen: expected bulk edges of 0 mm or more, got "
+                f"bulk_x = {self.bulk_x} mm, bulk_y = {self.bulk_y} mm"
+            )
+
+    @property
+    def length(self) -> float:
+        """L, the length of the cellular part, which nominal strain refers to [mm]."""
+        return self.holes_x * self.pitch
+
+    @property
+    def cellular_half_size(self) -> tuple[float, float]:
+        """Half the width and height of the cellular part [mm]."""
+        return 0.5 * self.holes_x * self.pitch, 0.5 * self.holes_y * self.pitch
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        """Half the width and height of the whole specimen [mm]."""
+        a, b = self.cellular_half_size
+        return a + self.bulk_x, b + self.bulk_y
+
+    @property
+    def hole_centres(self) -> NDArray[np.float64]:
+        """(holes_x * holes_y, 2) positions of the hole centres [mm], exactly symmetric."""
+        x = (np.arange(self.holes_x) - 0.5 * (self.holes_x - 1)) * self.pitch
+        y = (np.arange(self.holes_y) - 0.5 * (self.holes_y - 1)) * self.pitch
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    def pattern(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The square lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
+
+        u_x = -cos(pi x/l) sin(pi y/l), u_y = sin(pi x/l) cos(pi y/l) with the origin at a
+        solid junction between four holes (Eq. (mode) of the paper); holes rotate into
+        ellipses, neighbours in opposite senses.
+        """
+        a, b = self.cellular_half_size
+        x = np.pi * (points[:, 0] + a) / self.pitch
+        y = np.pi * (points[:, 1] + b) / self.pitch
+        return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
