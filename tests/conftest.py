@@ -39,7 +39,9 @@ def _dolfinx_is_missing() -> bool:
     return not required and importlib.util.find_spec("dolfinx") is None
 
 
-def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+def pytest_pycollect_makemodule(
+    module_path: Path, parent: pytest.Collector
+) -> pytest.Module | None:
     """Skip the files ``test_fem_*.py`` as a whole where there is no dolfinx."""
     if module_path.name.startswith("test_fem_") and _dolfinx_is_missing():
         return _ModuleThatNeedsDolfinx.from_parent(parent, path=module_path)

@@ -1,0 +1,77 @@
+"""Imports go one way: fem → imaging → idic → validation → cli (contracts in pyproject.toml).
+
+The property is checked by import-linter; that the check sees through the symbolic links of
+``src/modeharvest`` is itself tested, by breaking each contract in a copy.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parent.parent
+PACKAGES = ("fem", "imaging", "idic", "validation")
+
+
+def lint_imports(project: Path) -> subprocess.CompletedProcess[str]:
+    """Run import-linter on the checkout in ``project``."""
+    script = "from importlinter.cli import lint_imports_command as main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", script, "--no-cache"],
+        cwd=project,
+        env={**os.environ, "PYTHONPATH": str(project / "src"), "PYTHONIOENCODING": "utf-8"},
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        check=False,
+    )
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the checkout's code, with its links, to break."""
+    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    for folder in ("src", *PACKAGES):
+        shutil.copytree(PROJECT / folder, tmp_path / folder, symlinks=True, ignore=ignore)
+    shutil.copy(PROJECT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def test_the_code_keeps_its_contracts() -> None:
+    result = lint_imports(PROJECT)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "0 broken" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported"),
+    [
+        ("fem", "modeharvest.imaging.grid"),
+        ("imaging", "modeharvest.idic"),
+        ("idic", "modeharvest.validation"),
+        ("imaging", "dolfinx"),
+        ("validation", "gmsh"),
+    ],
+)
+def test_an_import_the_wrong_way_is_reported(copy: Path, importer: str, imported: str) -> None:
+    (copy / importer / "offender.py").write_text(f"import {imported}\n", encoding="utf-8")
+    result = lint_imports(copy)
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert f"modeharvest.{importer}.offender" in result.stdout
+
+
+def test_an_import_of_the_package_root_is_reported_too(copy: Path) -> None:
+    (copy / "src/modeharvest/errors.py").write_text("import modeharvest.files\n", encoding="utf-8")
+    assert lint_imports(copy).returncode == 1
+
+
+def test_every_package_is_reached_by_a_relative_link() -> None:
+    for package in PACKAGES:
+        link = PROJECT / "src/modeharvest" / package
+        assert link.is_symlink(), f"{link} must be a link (does git check out links here?)"
+        assert os.readlink(link) == f"../../{package}"
