@@ -31,10 +31,10 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import quantise, read_image, read_mask, write_image
-from modeharvest.imaging.isoparametric import locate
+from modeharvest.imaging.isoparametric import Located, locate
 from modeharvest.imaging.render import Rendering, Truth, render_deformed, render_reference
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import Speckle
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 from modeharvest.imaging.truth import read_truth, write_truth
 from modeharvest.progress import Progress, silent
 
@@ -81,6 +81,12 @@ class ImageSet:
         return PixelGrid(**self.info["grid"])
 
     @property
+    def spec(self) -> ImagingSpec:
+        """How the set was imaged."""
+        values = dict(self.info["spec"])
+        return ImagingSpec(**(values | {"speckle": SpeckleSpec(**values["speckle"])}))
+
+    @property
     def strains(self) -> tuple[float, ...]:
         """Nominal strains of the deformed images [-]."""
         return tuple(s["nominal_strain"] for s in self.info["snapshots"])
@@ -113,9 +119,9 @@ class ImageSet:
     def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
         path = self.folder / entry["camera_image" if camera else "image"]
         image = read_image(path)
-        if camera and self.info["spec"]["bits"] not in (8, 16):
-            full = 255.0 if self.info["spec"]["bits"] < 8 else 65535.0
-            image *= np.float32(full / (2 ** self.info["spec"]["bits"] - 1))
+        if camera:  # a 12-bit camera's white is 4095, which the file's 16 bits don't know
+            full_scale = 255.0 if self.spec.bits <= 8 else 65535.0
+            image *= np.float32(full_scale / (2**self.spec.bits - 1))
         return image
 
     def _snapshot(self, strain: float) -> dict[str, Any]:
@@ -215,7 +221,8 @@ def _write_set(
     folder: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    steps = 1 + 2 * len(wanted) + 1
+    """Write all files but the sidecar, and return the sidecar's content."""
+    steps = 1 + len(wanted)
     progress(0, steps, "images: reference")
     mesh = solution.mesh
     grid = choose_grid(solution, [strain for strain, _ in wanted], spec)
@@ -223,33 +230,51 @@ def _write_set(
     speckle = Speckle(spec.speckle, grid.shape)
     rendering = render_reference(located, speckle, spec.background)
     reference = _write_rendering(folder, "reference", "mask.tif", rendering, spec)
-    residual = located.max_residual_px
     snapshots = []
     for k, (strain, label) in enumerate(wanted):
-        name = f"deformed_{label}"
-        progress(1 + 2 * k, steps, f"images: strain {100 * strain:.2f} %")
-        rendering, truth = render_deformed(
-            mesh, solution.at(strain).displacement, located, grid, speckle, spec.background,
-            f"snapshot at strain {strain:.4f}",
-        )  # fmt: skip
-        progress(2 + 2 * k, steps, f"images: writing strain {100 * strain:.2f} %")
-        entry = _write_rendering(folder, name, f"{name}_mask.tif", rendering, spec)
-        write_truth(folder / f"truth_{label}.h5", truth, strain, grid)
-        worst = float(np.nanmax(truth.residual_px))
-        residual = max(residual, worst)
+        progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         snapshots.append(
-            {"nominal_strain": float(strain), **entry, "truth": f"truth_{label}.h5",
-             "branch": solution.at(strain).branch, "inverse_map_max_residual_px": worst}
-        )  # fmt: skip
+            _write_snapshot(solution, strain, label, located, grid, speckle, spec, folder)
+        )
+    residuals = [s["inverse_map_max_residual_px"] for s in snapshots]
     return {
         "grid": asdict(grid),
         "spec": asdict(spec),
         "speckle_period_px": list(speckle.period),
-        "inverse_map_max_residual_px": residual,
+        "inverse_map_max_residual_px": max(located.max_residual_px, *residuals),
         "reference": reference,
         "snapshots": snapshots,
         "solution": dict(solution.info),
         "versions": _versions(),
+    }
+
+
+def _write_snapshot(
+    solution: Solution,
+    strain: float,
+    label: str,
+    located_reference: Located,
+    grid: PixelGrid,
+    speckle: Speckle,
+    spec: ImagingSpec,
+    folder: Path,
+) -> dict[str, Any]:
+    """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
+    snapshot = solution.at(strain)
+    where = f"snapshot at strain {strain:.4f}"
+    rendering, truth = render_deformed(
+        solution.mesh, snapshot.displacement, located_reference, grid, speckle, spec.background,
+        where,
+    )  # fmt: skip
+    name, truth_name = f"deformed_{label}", f"truth_{label}.h5"
+    images = _write_rendering(folder, name, f"{name}_mask.tif", rendering, spec)
+    write_truth(folder / truth_name, truth, strain, grid)
+    return {
+        "nominal_strain": float(strain),
+        "branch": snapshot.branch,
+        **images,
+        "truth": truth_name,
+        "inverse_map_max_residual_px": float(np.nanmax(truth.residual_px)),
     }
 
 

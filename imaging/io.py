@@ -127,6 +127,8 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
 def _read(path: Path) -> NDArray[Any]:
     if not path.is_file():
         raise InputError(f"expected an image at {path}, found no such file")
+    if path.stat().st_size == 0:
+        raise InputError(f"expected an image at {path}, got an empty file cut short at 0 bytes")
     try:
         if path.suffix.lower() in _TIFF:
             return np.asarray(tifffile.imread(path))

@@ -1,0 +1,226 @@
+"""Guards the folder of images: finished or not, never taken for what it isn't."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Mesh, Snapshot, Solution
+from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
+from modeharvest.imaging.spec import ImagingSpec, choose_grid
+from modeharvest.imaging.speckle import SpeckleSpec
+from modeharvest.imaging.truth import read_truth
+
+SPEC = ImagingSpec(pixel_size=0.05, margin_px=5, background=0.1)
+STRAINS = (0.078, 0.128)
+
+
+def plate() -> Solution:
+    """Two Q4 elements, 2 mm x 1 mm off the origin, compressed along x."""
+    nodes = np.array([[3, -1], [4, -1], [5, -1], [3, 0], [4, 0], [5, 0]], dtype=np.float64)
+    mesh = Mesh(nodes, np.array([[0, 1, 4, 3], [1, 2, 5, 4]]), "Q4")
+    shape = (nodes - [4.0, -0.5]) * [-1.0, 0.3]
+    snapshots = tuple(Snapshot(s, s * shape) for s in STRAINS)
+    return Solution(mesh, snapshots, {"note": "affine"})
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> ImageSet:
+    return make_images(plate(), STRAINS, SPEC, tmp_path / "set")
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
+
+
+def test_holds_the_promised_files_and_nothing_else(made: ImageSet) -> None:
+    names = {"reference.tif", "reference_8bit.tif", "mask.tif", "images.json"}
+    for label in ("0780", "1280"):
+        names |= {f"deformed_{label}.tif", f"deformed_{label}_8bit.tif"}
+        names |= {f"deformed_{label}_mask.tif", f"truth_{label}.h5"}
+    assert {p.name for p in made.folder.iterdir()} == names
+
+
+def test_reads_back(made: ImageSet) -> None:
+    reopened = ImageSet.read(made.folder)
+    assert reopened.strains == STRAINS
+    assert reopened.spec == SPEC
+    assert reopened.max_residual_px <= 1e-10
+    assert reopened.reference().shape == reopened.mask().shape == reopened.grid.shape
+    mask = reopened.mask()
+    assert mask.sum() == 41 * 21  # 2 mm x 1 mm at 0.05 mm, edges on pixel centres included
+    assert (reopened.reference()[~mask] == np.float32(0.1)).all()
+    for strain in STRAINS:
+        truth = reopened.truth(strain)
+        inside = reopened.deformed_mask(strain)
+        np.testing.assert_array_equal(np.isnan(truth.residual_px), ~inside)
+        x, y = np.meshgrid(reopened.grid.x, reopened.grid.y)
+        exact = np.stack([-strain * (x - 4.0), 0.3 * strain * (y + 0.5)])
+        np.testing.assert_allclose(truth.displacement[:, mask], exact[:, mask], atol=1e-14)
+
+
+@pytest.mark.parametrize("bits", [4, 8, 12, 16])
+def test_camera_images_differ_by_half_a_level(tmp_path: Path, bits: int) -> None:
+    made = make_images(plate(), STRAINS[:1], replace(SPEC, bits=bits), tmp_path)
+    assert (tmp_path / f"reference_{bits}bit.tif").is_file()
+    off = made.reference(camera=True) - made.reference()
+    assert np.abs(off).max() <= 0.5 / (2**bits - 1) + 1e-6  # and float32 rounding
+    off = made.deformed(STRAINS[0], camera=True) - made.deformed(STRAINS[0])
+    assert np.abs(off).max() <= 0.5 / (2**bits - 1) + 1e-6
+
+
+def test_truth_states_units_and_precision(made: ImageSet) -> None:
+    with h5py.File(made.folder / "truth_0780.h5") as file:
+        units = {name: file[name].attrs["unit"] for name in file}
+        types = {name: str(file[name].dtype) for name in file}
+        assert file.attrs["nominal_strain"] == 0.078
+        assert file.attrs["pixel_size"] == 0.05
+    assert units == {
+        "displacement": "mm",
+        "reference_point": "mm",
+        "deformed_displacement": "mm",
+        "element": "-",
+        "residual_px": "px",
+    }
+    assert types["displacement"] == types["reference_point"] == "float64"
+
+
+def test_again_does_nothing(made: ImageSet) -> None:
+    before = stamps(made.folder)
+    make_images(plate(), STRAINS, SPEC, made.folder)
+    assert stamps(made.folder) == before
+
+
+def test_same_input_same_bits(made: ImageSet, tmp_path: Path) -> None:
+    other = make_images(plate(), STRAINS, SPEC, tmp_path / "other")
+    assert other.info["files"] == made.info["files"]
+
+
+@pytest.mark.parametrize(
+    ("strains", "spec"),
+    [
+        (STRAINS, replace(SPEC, speckle=SpeckleSpec(seed=1))),
+        (STRAINS, replace(SPEC, bits=12)),
+        (STRAINS[1:], SPEC),
+    ],
+)
+def test_another_set_replaces_it_without_leftovers(
+    made: ImageSet, strains: tuple[float, ...], spec: ImagingSpec
+) -> None:
+    (made.folder / "notes.txt").write_text("the user's own")
+    again = make_images(plate(), strains, spec, made.folder)
+    listed = {*again.info["files"], "images.json", "notes.txt"}
+    assert {p.name for p in made.folder.iterdir()} == listed
+    assert is_complete(made.folder, image_key(plate(), strains, spec), verify=True)
+    assert not is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
+
+
+def test_key_depends_on_the_displacement() -> None:
+    one, other = plate(), plate()
+    other.snapshots[1].displacement[3, 1] += 1e-15
+    assert image_key(one, STRAINS, SPEC) != image_key(other, STRAINS, SPEC)
+    assert image_key(one, STRAINS[:1], SPEC) == image_key(other, STRAINS[:1], SPEC)
+
+
+@pytest.mark.parametrize("at", [0, 1, 2])
+def test_interrupted_set_is_not_taken_for_finished(tmp_path: Path, at: int) -> None:
+    def interrupt(done: float, total: float, what: str) -> None:
+        if done >= at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_images(plate(), STRAINS, SPEC, tmp_path, interrupt)
+    assert not is_complete(tmp_path, image_key(plate(), STRAINS, SPEC))
+    with pytest.raises(InputError, match="expected a finished image set"):
+        ImageSet.read(tmp_path)
+    assert make_images(plate(), STRAINS, SPEC, tmp_path).strains == STRAINS
+
+
+def test_interrupted_replacement_does_not_pass_for_the_old_set(made: ImageSet) -> None:
+    def interrupt(done: float, total: float, what: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_images(plate(), STRAINS, replace(SPEC, bits=12), made.folder, interrupt)
+    assert not is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
+
+
+@pytest.mark.parametrize("name", ["truth_1280.h5", "reference.tif", "mask.tif"])
+def test_damage_is_noticed_and_repaired(made: ImageSet, name: str) -> None:
+    key = image_key(plate(), STRAINS, SPEC)
+    path = made.folder / name
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    assert not is_complete(made.folder, key)
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert not is_complete(made.folder, key, verify=True)
+    path.unlink()
+    assert not is_complete(made.folder, key)
+    make_images(plate(), STRAINS, SPEC, made.folder)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
+def test_truth_cut_short(made: ImageSet, kept: float) -> None:
+    path = made.folder / "truth_0780.h5"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InputError, match="expected a truth file") as error:
+        read_truth(path)
+    assert "\n" not in str(error.value)
+
+
+def test_sidecar_cut_short(made: ImageSet) -> None:
+    path = made.folder / "images.json"
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(InputError, match="expected a JSON file"):
+        ImageSet.read(made.folder)
+    path.write_text(json.dumps({"format": "something else"}))
+    with pytest.raises(InputError, match="modeharvest-images-1"):
+        ImageSet.read(made.folder)
+
+
+def test_asks_for_what_is_there(made: ImageSet) -> None:
+    with pytest.raises(InputError, match=r"have: 0\.0780, 0\.1280"):
+        made.deformed(0.1)
+    with pytest.raises(InputError, match=r"expected a snapshot at strain 0\.2"):
+        make_images(plate(), (0.2,), SPEC, made.folder)
+    for clash in ((), (0.078, 0.078)):
+        with pytest.raises(InputError, match=r"differ by 0\.01 %"):
+            make_images(plate(), clash, SPEC, made.folder)
+    assert is_complete(made.folder, image_key(plate(), STRAINS, SPEC), verify=True)
+
+
+def test_grid_is_centred_and_holds_every_state_with_its_margin() -> None:
+    solution = plate()
+    grid = choose_grid(solution, STRAINS, SPEC)
+    assert grid.x[0] + grid.x[-1] == pytest.approx(2 * 4.0, abs=1e-12)
+    assert grid.y[0] + grid.y[-1] == pytest.approx(2 * -0.5, abs=1e-12)
+    # Half width 1 mm at rest, half height 0.5 (1 + 0.3 * 0.128) mm at the end: 20 and 10.4 px.
+    assert grid.shape == (2 * (11 + 5) + 1, 2 * (20 + 5) + 1)
+
+
+def test_prescribed_shape_must_hold_the_specimen() -> None:
+    assert choose_grid(plate(), STRAINS, replace(SPEC, shape=(60, 50))).shape == (60, 50)
+    with pytest.raises(InputError, match=r"at least 23 x 41 px .* got 60 x 40"):
+        choose_grid(plate(), STRAINS, replace(SPEC, shape=(60, 40)))
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"pixel_size": 0.0}, "pixel size"),
+        ({"pixel_size": float("inf")}, "pixel size"),
+        ({"margin_px": -1}, "margin"),
+        ({"background": 1.5}, "background"),
+        ({"bits": 17}, "bits"),
+    ],
+)
+def test_refuses_impossible_imaging(bad: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        ImagingSpec(**bad)
