@@ -61,9 +61,9 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     threshold = _ROUNDING * np.abs(coefficients).max(axis=1)
     bad = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(_DEEPEST):
-        limit = threshold[owner, None]
-        bad[owner[(coefficients[:, corners] <= limit).any(axis=1)]] = True
-        open_ = (coefficients <= limit).any(axis=1) & ~bad[owner]
+        positive = coefficients > threshold[owner, None]  # False for NaN
+        bad[owner[~positive[:, corners].all(axis=1)]] = True
+        open_ = ~positive.all(axis=1) & ~bad[owner]
         if not open_.any():
             break
         coefficients = np.einsum("spq,eq->esp", split, coefficients[open_])
@@ -78,6 +78,12 @@ def require_positive_jacobian(
     positions: FloatArray, cells: IntArray, element: str, where: str = "mesh"
 ) -> None:
     """Raise InputError, naming the first cell, unless all Jacobians are positive."""
+    lost = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if lost.size:
+        raise InputError(
+            f"{where}: expected finite node positions, got NaN or infinity at {lost.size} nodes, "
+            f"the first is node {lost[0]}; check the displacement's file"
+        )
     bad = non_positive_jacobians(positions, cells, element)
     if bad.size:
         centre = positions[cells[bad[0]]].mean(axis=0)

@@ -101,8 +101,8 @@ class SpeckleSpec:
 def gaussian_field(spec: SpeckleSpec, period: tuple[int, int]) -> FloatArray:
     """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [px].
 
-    White noise is filtered by the square root of the spectral density; the field has zero
-    mean (also as a sample, so that its median is 0) and unit variance in expectation.
+    White noise is filtered by the square root of the spectral density. The sample's mean is
+    zero; in expectation the variance is one and the median, the threshold, zero.
     """
     noise = np.random.default_rng(spec.seed).standard_normal(period)
     amplitude = np.exp(-_squared_frequency(period) / (4.0 * spec.cycles_per_px**2))

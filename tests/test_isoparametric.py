@@ -373,6 +373,14 @@ def test_refused_exactly_where_the_jacobian_fails(
         assert determinant.min() < 0.02 * np.abs(determinant).max()
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_lost_nodes_are_refused_by_number(value: float) -> None:
+    nodes, cells = patch(1, 0, 0.0)
+    nodes[4, 1] = value
+    with pytest.raises(InputError, match=r"finite node positions, .* the first is node 4"):
+        locate(nodes, cells, "T6", PixelGrid.centred(8, 8, 0.1))
+
+
 def test_valid_mesh_passes() -> None:
     nodes, cells = patch(3, 1, 0.2)
     require_positive_jacobian(nodes, cells, "T6")
