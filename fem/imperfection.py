@@ -30,7 +30,7 @@ class Imperfection:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.position_sd < 0 or self.diameter_sd < 0:
+        if not (self.position_sd >= 0 and self.diameter_sd >= 0):
             raise InputError(f"imperfection: expected standard deviations >= 0 mm, got {self}")
 
     @property

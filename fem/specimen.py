@@ -48,7 +48,9 @@ class Specimen:
                 "specimen: expected 0 < diameter < pitch (holes must not touch), got "
                 f"diameter = {self.diameter} mm, pitch = {self.pitch} mm"
             )
-        if self.bulk_x < 0 or self.bulk_y < 0:
+        if not np.isfinite(self.pitch):
+            raise InputError(f"specimen: expected a finite pitch, got {self.pitch} mm")
+        if not (0 <= self.bulk_x < np.inf and 0 <= self.bulk_y < np.inf):
             raise InputError(
                 "specimen: expected bulk edges of 0 mm or more, got "
                 f"bulk_x = {self.bulk_x} mm, bulk_y = {self.bulk_y} mm"
