@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.optimize import brentq
 
 from modeharvest.fem.corrector import Constraint, Outcome, correct, path_tangent
 from modeharvest.fem.equilibrium import Factor, Structure
@@ -44,8 +45,8 @@ class PathOptions:
     first_step: float = 0.026
     largest_step: float = 0.03
     critical_tolerance: float = 1e-7
-    first_amplitude: float = 0.03
-    growth: float = 3.0
+    first_amplitude: float = 0.04
+    growth: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,31 +273,34 @@ class Walker:
         rate = mode.vector.copy()
         rate.scale(unit)
         points = [_BranchPoint(0.0, critical.strain, 0.0, critical.u, rate)]
-        amplitude = self.options.first_amplitude * length
         found: list[State] = []
+        shortest = 0.01 * self.options.first_amplitude * length
+        reach = self.options.first_amplitude * length  # the largest amplitude to try next
         self.factor = None
         while len(found) < len(targets):
             target = targets[len(found)]
-            wanted = _amplitude_at(points, target)
-            if len(points) > 1 and wanted <= self.options.growth * points[-1].amplitude:
-                _, guess = _predict(points, wanted)
-                state = self.equilibrium(target, guess)
-                if state is not None:
-                    point = _branch_point(state, weights, critical.u)
-                    if point.amplitude > 0.2 * wanted:  # else it fell back to the primary path
-                        found.append(state)
-                        points.append(point)
-                        self.progress(state.strain, targets[-1], "buckled branch")
-                        continue
-                wanted = 0.5 * (wanted + points[-1].amplitude)
-            if len(points) > 1:
-                amplitude = min(wanted, self.options.growth * points[-1].amplitude)
-            strain, guess = _predict(points, amplitude)
-            constraint = Constraint(weights, critical.u, amplitude)
-            state = self.equilibrium(strain, guess, constraint)
-            if state is None:
-                return found
-            points.append(_branch_point(state, weights, critical.u))
+            wanted = _amplitude_at(points, target, reach)
+            aimed = wanted <= reach
+            if aimed:
+                state = self.equilibrium(target, _predict(points, wanted)[1])
+            else:
+                amplitude = min(wanted, reach)
+                strain, guess = _predict(points, amplitude)
+                constraint = Constraint(weights, critical.u, amplitude)
+                state = self.equilibrium(strain, guess, constraint)
+            point = None if state is None else _branch_point(state, weights, critical.u)
+            # Under prescribed strain Newton may fall back to the primary path.
+            if state is None or point is None or point.amplitude < 0.2 * min(wanted, reach):
+                reach = 0.5 * (points[-1].amplitude + min(wanted, reach))
+                if reach - points[-1].amplitude < shortest:
+                    return found
+                self.factor = None  # it may belong to the failed state
+                continue
+            points.append(point)
+            reach = self.options.growth * point.amplitude
+            if aimed:
+                found.append(state)
+                self.progress(state.strain, targets[-1], "buckled branch")
         return found
 
 
@@ -327,18 +331,25 @@ def _predict(points: list[_BranchPoint], amplitude: float) -> tuple[float, PETSc
         u.axpy(amplitude - p.amplitude, p.rate)
         return p.strain, u
     p, q = points[-2:]
+    weights = _hermite(p.amplitude, q.amplitude, amplitude)
+    return _strain_at(points, amplitude), _combine(weights, (p.u, p.rate, q.u, q.rate))
+
+
+def _strain_at(points: list[_BranchPoint], amplitude: float) -> float:
+    p, q = points[-2:]
     w = _hermite(p.amplitude, q.amplitude, amplitude)
-    strain = w[0] * p.strain + w[1] * p.strain_rate + w[2] * q.strain + w[3] * q.strain_rate
-    return strain, _combine(w, (p.u, p.rate, q.u, q.rate))
+    return w[0] * p.strain + w[1] * p.strain_rate + w[2] * q.strain + w[3] * q.strain_rate
 
 
-def _amplitude_at(points: list[_BranchPoint], strain: float) -> float:
-    """The amplitude at which strain = a + b amplitude^2 through the last point meets ``strain``."""
-    first, last = points[0], points[-1]
-    rise = last.strain - first.strain
-    if rise <= 0.0:
+def _amplitude_at(points: list[_BranchPoint], strain: float, reach: float) -> float:
+    """The amplitude up to ``reach`` at which the branch is expected to meet ``strain``.
+
+    Infinite if it is expected beyond.
+    """
+    if len(points) == 1 or _strain_at(points, reach) < strain:
         return np.inf
-    return last.amplitude * float(np.sqrt((strain - first.strain) / rise))
+    here = points[-1].amplitude
+    return float(brentq(lambda a: _strain_at(points, a) - strain, here, reach))
 
 
 def _extrapolate(states: Sequence[State], strain: float) -> PETSc.Vec:

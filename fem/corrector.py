@@ -16,6 +16,7 @@ from modeharvest.fem.equilibrium import Factor, Structure
 
 _SHRINKS = 0.35  # a chord step that leaves more than this of the residual calls for a new factor
 _MAX_FACTORS = 8
+_SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
 _MAX_ITERATIONS = 60
 # The residual must be smaller than what a change of the nominal strain by this would make.
 STRAIN_TOLERANCE = 1e-11
@@ -76,38 +77,93 @@ def correct(
     constraint
         Prescribe an amplitude instead of the strain.
     """
-    u = guess.copy()
-    structure.prescribe(u, strain)
-    solver = factor
-    tangent = None
-    previous, factors = math.inf, 0
+    iterate = _Iterate(structure, guess, strain, factor, constraint)
     for _ in range(_MAX_ITERATIONS):
-        residual = structure.residual(u)
-        load = structure.load(u)
-        miss = 0.0 if constraint is None else constraint.value(u)
-        size = residual.norm()
-        if not math.isfinite(size):
-            return Correction(u, strain, Outcome.DIVERGED)
-        if size <= STRAIN_TOLERANCE * load.norm() and abs(miss) <= 1e-9:
-            return Correction(u, strain, Outcome.CONVERGED)
-        if solver is None or size > _SHRINKS * previous:
-            if factors == _MAX_FACTORS or (factors > 2 and size > 2.0 * previous):
-                return Correction(u, strain, Outcome.DIVERGED)
-            solver, tangent = structure.factor(u), None
-            factors += 1
-        previous = size
-        step = solver.solve(residual)
+        iterate.evaluate()
+        if iterate.is_solved:
+            return Correction(iterate.u, iterate.strain, Outcome.CONVERGED)
+        if not iterate.prepare_step():
+            return Correction(iterate.u, iterate.strain, Outcome.DIVERGED)
+        iterate.step()
+    return Correction(iterate.u, iterate.strain, Outcome.SLOW)
+
+
+class _Iterate:
+    """A Newton iteration under way: where it is, and how the last step went."""
+
+    def __init__(
+        self,
+        structure: Structure,
+        guess: PETSc.Vec,
+        strain: float,
+        factor: Factor | None,
+        constraint: Constraint | None,
+    ) -> None:
+        self.structure, self.constraint, self.factor = structure, constraint, factor
+        self.u, self.strain = guess.copy(), strain
+        structure.prescribe(self.u, strain)
+        self.tangent: PETSc.Vec | None = None
+        self.factors, self.is_fresh = 0, False
+        self.best = math.inf  # smallest residual so far, before the last step
+        self.last: tuple[PETSc.Vec, float] | None = None  # where the last step came from
+        self.share = 1.0  # of the full step, where that was too long
+
+    def evaluate(self) -> None:
+        """Residual, load and the constraint's miss at the present state."""
+        self.residual = self.structure.residual(self.u)
+        self.load = self.structure.load(self.u)
+        self.miss = 0.0 if self.constraint is None else self.constraint.value(self.u)
+        self.size = float(self.residual.norm())
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the residual and the constraint are within tolerance."""
+        small = STRAIN_TOLERANCE * self.load.norm()
+        return math.isfinite(self.size) and self.size <= small and abs(self.miss) <= 1e-9
+
+    def prepare_step(self) -> bool:
+        """Decide from where, and with which factor, to step next; False to give up.
+
+        A step that did not lower the residual is taken back: it is halved if its factor was
+        fresh, and tried with a fresh factor otherwise.
+        """
+        if self.last is not None and not self.size < self.best:
+            self.u, self.strain = self.last[0].copy(), self.last[1]
+            self.evaluate()
+            if self.is_fresh:
+                self.share *= 0.5
+                return self.share > _SMALLEST_SHARE
+            return self._refactor()
+        slow = self.size > _SHRINKS * self.best and self.share == 1.0
+        self.share = 1.0
+        if self.factor is None or slow:
+            return self._refactor()
+        self.is_fresh = False
+        return True
+
+    def _refactor(self) -> bool:
+        if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
+            return False
+        self.factor, self.tangent = self.structure.factor(self.u), None
+        self.factors += 1
+        self.is_fresh = True
+        return True
+
+    def step(self) -> None:
+        """Move by (a share of) the Newton step, along the constraint if there is one."""
+        assert self.factor is not None
+        self.best, self.last = self.size, (self.u.copy(), self.strain)
+        step, change = self.factor.solve(self.residual), 0.0
         step.scale(-1.0)
-        if constraint is not None:
-            if tangent is None:
-                tangent = path_tangent(structure, solver, load)
-            along = float(constraint.weights.dot(tangent))
-            change = -(miss + float(constraint.weights.dot(step))) / along
-            step.axpy(change, tangent)
-            strain += change
-        u.axpy(1.0, step)
-        structure.prescribe(u, strain)
-    return Correction(u, strain, Outcome.SLOW)
+        if self.constraint is not None:
+            if self.tangent is None:
+                self.tangent = path_tangent(self.structure, self.factor, self.load)
+            weights = self.constraint.weights
+            change = -(self.miss + float(weights.dot(step))) / float(weights.dot(self.tangent))
+            step.axpy(change, self.tangent)
+        self.u.axpy(self.share, step)
+        self.strain += self.share * change
+        self.structure.prescribe(self.u, self.strain)
 
 
 def path_tangent(structure: Structure, factor: Factor, load: PETSc.Vec) -> PETSc.Vec:
