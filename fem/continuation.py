@@ -18,35 +18,12 @@ from scipy.optimize import brentq
 
 from modeharvest.fem.corrector import Constraint, Outcome, correct, path_tangent
 from modeharvest.fem.equilibrium import Factor, Structure
+from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.stability import Mode, modes_nearest_zero
 from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
 _MODES = 8  # followed near the critical point
-
-
-@dataclass(frozen=True)
-class PathOptions:
-    """How the path is walked.
-
-    Parameters
-    ----------
-    first_step, largest_step
-        Steps of nominal strain along the primary path [-].
-    critical_tolerance
-        To which the critical strain is located [-].
-    first_amplitude
-        Largest nodal displacement of the first step onto the branch, as a share of the pitch
-        or whatever length is passed to :func:`follow_branch` [-].
-    growth
-        Most by which the mode's amplitude may grow in one step along the branch [-].
-    """
-
-    first_step: float = 0.026
-    largest_step: float = 0.03
-    critical_tolerance: float = 1e-7
-    first_amplitude: float = 0.04
-    growth: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)

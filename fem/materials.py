@@ -2,15 +2,14 @@
 
 UFL differentiates the energy W(F) to the first Piola-Kirchhoff stress P and the tangent, so
 a new material is one frozen dataclass with one method. F is the 2 x 2 in-plane deformation
-gradient; the stretch out of the plane is 1.
+gradient; the stretch out of the plane is 1. UFL is imported where an energy is asked for, so
+that constants can be stated and checked without it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, Protocol
-
-import ufl
 
 from modeharvest.errors import InputError
 
@@ -62,6 +61,8 @@ class Ogden:
 
     def energy(self, F: Any) -> Any:
         """W(F) [MPa]."""
+        import ufl
+
         J = ufl.det(F)
         terms = [
             c / m**2 * (power_sum_of_stretches(F, m) - 2.0 - m * ufl.ln(J))
@@ -93,6 +94,8 @@ class TwoTermI1:
 
     def energy(self, F: Any) -> Any:
         """W(F) [MPa]."""
+        import ufl
+
         J = ufl.det(F)
         i1 = ufl.inner(F, F) + 1.0
         return (
@@ -115,6 +118,8 @@ def power_sum_of_stretches(F: Any, m: float) -> Any:
     where s >= 0 is a smooth function of F, free of cancellation. cosh(m asinh(sqrt(s))) is
     analytic in s; near s = 0 its power series is used, elsewhere the closed form.
     """
+    import ufl
+
     J = ufl.det(F)
     s = ((F[0, 0] - F[1, 1]) ** 2 + (F[0, 1] + F[1, 0]) ** 2) / (4.0 * J)
     return 2.0 * J ** (0.5 * m) * _cosh_m_asinh_sqrt(s, m)
@@ -125,6 +130,8 @@ _SERIES_TERMS = 9  # the first one left out is below 1e-15 at the limit for |m| 
 
 
 def _cosh_m_asinh_sqrt(s: Any, m: float) -> Any:
+    import ufl
+
     near = ufl.lt(s, _SERIES_LIMIT)
     # The closed form must stay differentiable where it isn't used: 0 * NaN would be NaN.
     root = ufl.sqrt(ufl.conditional(near, _SERIES_LIMIT, s))

@@ -84,7 +84,27 @@ def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
     """
     if not size > 0:
         raise InputError(f"mesh size: expected a positive length in mm, got {size}")
-    return _merge(list(_tiles(specimen, size)), tolerance=1e-7 * specimen.pitch)
+    return join(list(_tiles(specimen, size)), tolerance=1e-7 * specimen.pitch)
+
+
+def join(blocks: list[Block], tolerance: float) -> Mesh:
+    """One T6 mesh of blocks whose shared sides are divided alike.
+
+    Parameters
+    ----------
+    blocks
+        Already placed.
+    tolerance
+        Nodes closer than this become one [mm].
+    """
+    offsets = np.cumsum([0] + [len(b.nodes) for b in blocks[:-1]])
+    nodes = np.vstack([b.nodes for b in blocks])
+    cells = np.vstack([b.cells + k for b, k in zip(blocks, offsets, strict=True)])
+    pairs = cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes), len(nodes)))
+    _, label = connected_components(links, directed=False)
+    _, first = np.unique(label, return_index=True)
+    return Mesh(nodes[first], label[cells].astype(np.int64), "T6")
 
 
 def _divisions(length: float, size: float) -> int:
@@ -149,15 +169,3 @@ def _current_block() -> Block:
     position = dict(zip(tags, coordinates.reshape(-1, 3)[:, :2], strict=True))
     nodes = np.array([position[tag] for tag in used])
     return Block(nodes, np.searchsorted(used, cells).astype(np.int64))
-
-
-def _merge(blocks: list[Block], tolerance: float) -> Mesh:
-    """Join blocks; nodes closer than ``tolerance`` [mm] become one."""
-    offsets = np.cumsum([0] + [len(b.nodes) for b in blocks[:-1]])
-    nodes = np.vstack([b.nodes for b in blocks])
-    cells = np.vstack([b.cells + k for b, k in zip(blocks, offsets, strict=True)])
-    pairs = cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes), len(nodes)))
-    _, label = connected_components(links, directed=False)
-    _, first = np.unique(label, return_index=True)
-    return Mesh(nodes[first], label[cells].astype(np.int64), "T6")

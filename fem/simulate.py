@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from itertools import pairwise
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -13,70 +12,16 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from modeharvest import __version__
-from modeharvest.errors import InputError
 from modeharvest.fem import dolfinx_api
-from modeharvest.fem.continuation import Critical, PathOptions, State, Walker
+from modeharvest.fem.continuation import Critical, State, Walker
 from modeharvest.fem.equilibrium import Loading, Structure
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.imperfection import Imperfection, perturb
-from modeharvest.fem.materials import Material, Ogden
+from modeharvest.fem.imperfection import perturb
 from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.specimen import Specimen
 from modeharvest.fem.stability import Mode
 from modeharvest.progress import Progress, silent
-
-Branches = tuple[str, ...]
-BRANCHES = ("primary", "buckled+", "buckled-")
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
-
-    Parameters
-    ----------
-    specimen
-        Geometry [mm].
-    material
-        Strain energy density [MPa].
-    strains
-        Nominal strains of the snapshots, ascending, compression positive [-].
-    mesh_size
-        Target edge length of the T6 elements [mm].
-    edges
-        Loaded edges "clamped" or "sliding".
-    branches
-        What to keep above the critical strain, out of "primary" (unstable there), "buckled+"
-        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern``).
-    imperfection
-        Scatter of the holes; with any, there is no bifurcation to find and the one natural
-        path is followed.
-    path
-        How the path is walked.
-    """
-
-    specimen: Specimen = field(default_factory=Specimen)
-    material: Material = field(default_factory=Ogden)
-    strains: tuple[float, ...] = (0.078, 0.128)
-    mesh_size: float = 0.2
-    edges: str = "clamped"
-    branches: Branches = ("buckled+",)
-    imperfection: Imperfection = field(default_factory=Imperfection)
-    path: PathOptions = field(default_factory=PathOptions)
-
-    def __post_init__(self) -> None:
-        strains = self.strains
-        if not strains or strains[0] <= 0 or any(b <= a for a, b in pairwise(strains)):
-            raise InputError(
-                f"strains: expected ascending positive nominal strains such as 0.078, 0.128, got "
-                f"{list(strains)}"
-            )
-        if strains[-1] >= 0.5:
-            raise InputError(
-                f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"
-            )
-        if not self.branches or not set(self.branches) <= set(BRANCHES):
-            raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
 
 
 def simulate(

@@ -1,0 +1,90 @@
+"""What a virtual compression test is: plain dataclasses, no dolfinx.
+
+``simulate`` runs it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from modeharvest.errors import InputError
+from modeharvest.fem.imperfection import Imperfection
+from modeharvest.fem.materials import Material, Ogden
+from modeharvest.fem.specimen import Specimen
+
+BRANCHES = ("primary", "buckled+", "buckled-")
+
+
+@dataclass(frozen=True)
+class PathOptions:
+    """How the path is walked.
+
+    Parameters
+    ----------
+    first_step, largest_step
+        Steps of nominal strain along the primary path [-].
+    critical_tolerance
+        To which the critical strain is located [-].
+    first_amplitude
+        Largest nodal displacement of the first step onto the branch, as a share of the pitch
+        or whatever length is the branch is given [-].
+    growth
+        Most by which the mode's amplitude may grow in one step along the branch [-].
+    """
+
+    first_step: float = 0.026
+    largest_step: float = 0.03
+    critical_tolerance: float = 1e-7
+    first_amplitude: float = 0.04
+    growth: float = 2.0
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
+
+    Parameters
+    ----------
+    specimen
+        Geometry [mm].
+    material
+        Strain energy density [MPa].
+    strains
+        Nominal strains of the snapshots, ascending, compression positive [-].
+    mesh_size
+        Target edge length of the T6 elements [mm].
+    edges
+        Loaded edges "clamped" or "sliding".
+    branches
+        What to keep above the critical strain, out of "primary" (unstable there), "buckled+"
+        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern``).
+    imperfection
+        Scatter of the holes; with any, there is no bifurcation to find and the one natural
+        path is followed.
+    path
+        How the path is walked.
+    """
+
+    specimen: Specimen = field(default_factory=Specimen)
+    material: Material = field(default_factory=Ogden)
+    strains: tuple[float, ...] = (0.078, 0.128)
+    mesh_size: float = 0.2
+    edges: str = "clamped"
+    branches: tuple[str, ...] = ("buckled+",)
+    imperfection: Imperfection = field(default_factory=Imperfection)
+    path: PathOptions = field(default_factory=PathOptions)
+
+    def __post_init__(self) -> None:
+        strains = self.strains
+        if not strains or strains[0] <= 0 or any(b <= a for a, b in pairwise(strains)):
+            raise InputError(
+                f"strains: expected ascending positive nominal strains such as 0.078, 0.128, got "
+                f"{list(strains)}"
+            )
+        if strains[-1] >= 0.5:
+            raise InputError(
+                f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"
+            )
+        if not self.branches or not set(self.branches) <= set(BRANCHES):
+            raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
