@@ -9,11 +9,12 @@ that constants can be stated and checked without it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from modeharvest.errors import InputError
 
 
+@runtime_checkable
 class Material(Protocol):
     """Anything that has a strain energy density."""
 

@@ -1,0 +1,86 @@
+"""How a specimen's images are correlated: degrees, start, options; from a specimen to an ansatz."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions
+from modeharvest.idic.fourier import FourierMode, square_family
+from modeharvest.idic.support import Taper
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The paper's choices (section "Virtual Experiments"), for a square stacking of holes.
+
+    Parameters
+    ----------
+    v0_degree, v_degree
+        Total degree of the Chebyshev polynomials of v0 and of v1: 42 + 28 unknowns, and the
+        mode's 7 make 77.
+    start_amplitude
+        The small constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a
+        pattern of 40 um.
+    edge_px
+        Pixels of the reference closer than this to the edge of a hole are left out [px].
+    order
+        Of the spline that samples the deformed image: 5 or 3.
+    camera
+        Correlate the quantised images instead of the float ones.
+    """
+
+    v0_degree: int = 5
+    v_degree: int = 6
+    start_amplitude: float = 1.0
+    edge_px: int = 3
+    order: int = 5
+    camera: bool = False
+
+    def __post_init__(self) -> None:
+        if self.v0_degree < 1 or self.v_degree < 0:
+            raise InputError(
+                "correlation: expected v0_degree >= 1 and v_degree >= 0, got "
+                f"{self.v0_degree} and {self.v_degree}"
+            )
+        if self.start_amplitude == 0.0:
+            raise InputError(
+                "correlation: expected a start_amplitude that is not 0 mm (the mode could not be "
+                "seen), got 0"
+            )
+        self.options()  # checks edge_px and order
+
+    def options(self) -> CorrelationOptions:
+        """The options of :func:`modeharvest.idic.correlate.correlate`."""
+        return CorrelationOptions(edge_px=self.edge_px, order=self.order)
+
+    def ansatz(self, specimen: Specimen) -> Ansatz:
+        """The paper's ansatz on a specimen."""
+        (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
+        taper = Taper(Box(-a, a, -b, b), 0.5 * specimen.pitch)
+        mode = FourierMode.scaled(square_family("junction"), specimen.pitch, taper)
+        domain = Box(-width, width, -height, height)
+        return Ansatz(domain, (mode,), self.v0_degree, self.v_degree)
+
+    def start(self, ansatz: Ansatz, specimen: Specimen, strain: float) -> FloatArray:
+        """The unknowns to start from: the applied strain, and the mode with its right origin.
+
+        The mode's phases put its origin on a solid junction between four holes, whatever the
+        number of holes: [1, 1, 1, -1, 1, 0, 0] where it is even both ways.
+        """
+        unknowns = ansatz.start(strain, self.start_amplitude)
+        a, b = specimen.cellular_half_size
+        x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
+        y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.pitch
+        mode = unknowns[ansatz.phi_slice(0)]  # a view
+        mode[5] = -(mode[1] * x0 + mode[2] * y0)
+        mode[6] = -(mode[3] * x0 + mode[4] * y0)
+        return unknowns

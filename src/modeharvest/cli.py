@@ -1,0 +1,187 @@
+"""The command line: ``modeharvest run CASE --out DIR``, and its stages one by one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from modeharvest import __version__
+from modeharvest.case import case_text, read_case, shipped_cases
+from modeharvest.console import ProgressBars
+from modeharvest.errors import InputError, MissingDependencyError
+
+app = typer.Typer(
+    help=(
+        "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
+        "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
+        "every pixel, measure them, and see how wrong the measurement was, and why.\n\n"
+        "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold]"
+    ),
+    epilog="Exit codes: 0 done, 2 the input can't be used (one line says why), 130 interrupted.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+_errors = Console(stderr=True)
+
+CaseName = Annotated[
+    str,
+    typer.Argument(
+        metavar="CASE", help="A shipped case ('modeharvest cases' lists them) or a TOML file."
+    ),
+]
+OutFolder = Annotated[
+    Path, typer.Option("--out", help="Folder for everything this case leaves.", metavar="DIR")
+]
+SolutionFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--solution", help="Use this solution (HDF5) instead of DIR/solution.h5.", metavar="FILE"
+    ),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Run a whole case: simulate, image, correlate, validate.
+
+    Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
+    same command again after an interruption: finished stages are not repeated.
+    """
+    summary = _with_bars(case, out, solution, lambda stages: stages.all())
+    _print_summary(summary, out)
+
+
+@app.command()
+def fem(case: CaseName, out: OutFolder) -> None:
+    """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
+
+    Finds the critical strain, proves stability by the tangent's inertia, follows the buckled
+    branch. Under mpirun it runs in parallel.
+    """
+    solution = _with_bars(case, out, None, lambda stages: stages.fem())
+    critical = solution.info.get("critical")
+    if critical is not None:
+        print(f"critical strain {100 * critical['strain']:.4f} %")
+    for s in solution.snapshots:
+        print(f"{100 * s.nominal_strain:6.2f} %  {s.branch:9}  negative pivots {s.negative_pivots}")
+    outcome = str(solution.info.get("outcome", "complete"))
+    if outcome != "complete":
+        raise InputError(f"simulation {outcome}; what was reached is in {out / 'solution.h5'}")
+
+
+@app.command()
+def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Make speckle images and their truth from a solution: DIR/images."""
+    images = _with_bars(case, out, solution, lambda stages: stages.image())
+    rows, cols = images.grid.shape
+    print(f"{len(images.strains) + 1} images of {rows} x {cols} px in {images.folder}")
+    print(f"largest residual of the inverse mapping {images.max_residual_px:.1e} px")
+
+
+@app.command()
+def correlate(case: CaseName, out: OutFolder) -> None:
+    """Measure the images by micromorphic IDIC: DIR/correlation."""
+    for strain, result in _with_bars(case, out, None, lambda s: s.correlate()).items():
+        print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
+
+
+@app.command()
+def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
+    _print_summary(_with_bars(case, out, solution, lambda stages: stages.validate()), out)
+
+
+@app.command()
+def cases(
+    name: Annotated[str | None, typer.Argument(help="Print this case's TOML file.")] = None,
+) -> None:
+    """List the shipped cases, or print one as a start for your own.
+
+    For example: modeharvest cases paper-virtual > mine.toml
+    """
+    if name is not None:
+        print(case_text(name), end="")
+        return
+    for shipped, title in shipped_cases().items():
+        print(f"{shipped:16}  {title}")
+
+
+def _with_bars(case: str, out: Path, solution: Path | None, work: Callable[[Any], Any]) -> Any:
+    """Read the case, then run a stage of it under progress bars."""
+    checked = read_case(case)  # before the heavy imports, so that a typo is told at once
+    from modeharvest.pipeline import Run
+
+    try:
+        with ProgressBars(_errors) as bars:
+            return work(Run(checked, out, bars, solution))
+    except KeyboardInterrupt as error:
+        raise _InterruptedError from error
+
+
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
+    table = Table(title=str(summary.get("title", "")), title_justify="left")
+    table.add_column("quantity")
+    for s in summary["snapshots"]:
+        table.add_column(f"{100 * s['nominal_strain']:.2f} %", justify="right")
+    rows = {
+        "negative pivots of the tangent": "negative_pivots",
+        "pattern amplitude [px]": "pattern_amplitude_px",
+        "w = truth - IDIC, rms [px]": "rms_w_px",
+        "best possible fit, rms [px]": "rms_best_fit_px",
+        "IDIC - best fit, rms [px]": "rms_idic_to_best_fit_px",
+        "grey-level residual, rms": "rms_residual",
+        "iterations": "iterations",
+        "outcome": "outcome",
+    }
+    for label, key in rows.items():
+        table.add_row(label, *(_cell(s.get(key)) for s in summary["snapshots"]))
+    console = Console()
+    console.print(table)
+    if summary.get("critical_strain") is not None:
+        console.print(f"critical strain {100 * summary['critical_strain']:.4f} %")
+    console.print(f"report: {out / 'report.html'}")
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+class _InterruptedError(Exception):
+    """Ctrl-C, under a name that the command-line library does not take for its own."""
+
+
+def main() -> None:
+    """Entry point of the ``modeharvest`` command."""
+    try:
+        app()
+    except (InputError, MissingDependencyError) as error:
+        message = " ".join(str(error).split())
+        _errors.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except _InterruptedError:
+        _errors.print("interrupted; run the same command again to continue where it stopped")
+        sys.exit(130)

@@ -1,0 +1,247 @@
+"""A case from beginning to end in one folder, in stages that can be run apart and resumed.
+
+::
+
+    solution.h5 solution.vtu    fem        what the finite elements found
+    images/                     image      speckle images, masks, truth
+    correlation/                correlate  one result for each image
+    report.html summary.json    validate   how wrong it was, and why
+    stages.json                            which stages are finished, and what they took
+
+A stage whose inputs have not changed is not run again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from modeharvest import __version__
+from modeharvest.case import Case, read_case, shipped_cases, shipped_solution
+from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.fem.field import Solution
+from modeharvest.files import read_json, write_json
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.result import Result
+from modeharvest.imaging.imageset import ImageSet, image_key, make_images
+from modeharvest.progress import Progress, silent
+from modeharvest.validation.study import validate
+
+STAGES = ("fem", "image", "correlate", "validate")
+_NO_DOLFINX = (
+    "the finite-element stage needs dolfinx >= 0.9 and gmsh: install them with 'conda install -c "
+    "conda-forge fenics-dolfinx python-gmsh' or, on Debian 13, 'apt install python3-dolfinx "
+    "python3-gmsh'; or take a solution made elsewhere: --solution FILE"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A case, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    case
+        What to do.
+    folder
+        Where; made if it does not exist.
+    progress
+        Listener.
+    solution
+        A solution file to use instead of the folder's own.
+    """
+
+    case: Case
+    folder: Path
+    progress: Progress = silent
+    solution: Path | None = None
+
+    def fem(self) -> Solution:
+        """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
+
+        Without dolfinx, a shipped case's own solution is taken instead.
+
+        Raises
+        ------
+        MissingDependencyError
+            If dolfinx is not there and no solution of this case is shipped.
+        """
+        path = self.folder / "solution.h5"
+
+        def work() -> None:
+            solution, is_writer = self._simulate()
+            if is_writer:
+                solution.write(path)
+                solution.write_vtu(path.with_suffix(".vtu"))
+
+        self._stage("fem", _digest(self._experiment()), work, path)
+        return Solution.read(path)
+
+    def image(self) -> ImageSet:
+        """Make images and truth of the solution's snapshots in ``images/``."""
+        solution, folder = self._solution(), self.folder / "images"
+        strains = self._strains(solution)
+        spec = self.case.imaging
+        key = image_key(solution, strains, spec)
+        self._stage(
+            "image",
+            key,
+            lambda: make_images(solution, strains, spec, folder, self.progress),
+            folder / "images.json",
+        )
+        return ImageSet.read(folder)
+
+    def correlate(self) -> dict[float, Result]:
+        """Correlate every deformed image with the reference; leaves ``correlation/``."""
+        images = ImageSet.read(self.folder / "images")
+        paths = {strain: self._result_path(strain) for strain in images.strains}
+        key = _digest([images.info["key"], self.case.plain()["correlation"], __version__])
+
+        def work() -> None:
+            for strain, path in paths.items():
+                self._correlate_one(images, strain).write(path)
+
+        self._stage("correlate", key, work, *paths.values())
+        return {strain: Result.read(path) for strain, path in paths.items()}
+
+    def validate(self) -> dict[str, Any]:
+        """Compare the results with the truth; leaves ``report.html`` and ``summary.json``."""
+        images = ImageSet.read(self.folder / "images")
+        results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
+        path = self.folder / "summary.json"
+        key = _digest([self._finished("correlate").get("key"), __version__])
+
+        def work() -> None:
+            solution = self._solution()
+            taken = {stage: self._finished(stage).get("seconds") for stage in STAGES[:-1]}
+            validate(
+                self.case.plain(), solution, images, results, taken, self.folder, self.progress
+            )
+
+        self._stage("validate", key, work, path, self.folder / "report.html")
+        summary: dict[str, Any] = read_json(path)
+        return summary
+
+    def all(self) -> dict[str, Any]:
+        """Run every stage that is not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            At the end, if the simulation did not reach all strains asked for: what it did
+            reach is reported.
+        """
+        solution = self.fem() if self.solution is None else self._solution()
+        self.image()
+        self.correlate()
+        summary = self.validate()
+        outcome = str(solution.info.get("outcome", "complete"))
+        if outcome != "complete":
+            raise InputError(f"simulation {outcome}; what was reached is in {self.folder}")
+        return summary
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _experiment(self) -> list[Any]:
+        return [self.case.plain()["experiment"], __version__]
+
+    def _simulate(self) -> tuple[Solution, bool]:
+        try:
+            from mpi4py import MPI
+
+            from modeharvest.fem.simulate import simulate
+        except ImportError as error:
+            shipped = self._shipped()
+            if shipped is None:
+                raise MissingDependencyError(_NO_DOLFINX) from error
+            return shipped, True
+        return simulate(self.case.experiment, self.progress), MPI.COMM_WORLD.rank == 0
+
+    def _shipped(self) -> Solution | None:
+        """The solution that comes with the package, if it is of this very experiment."""
+        for name in shipped_cases():
+            path = shipped_solution(name)
+            if path is not None and read_case(name).experiment == self.case.experiment:
+                return Solution.read(path)
+        return None
+
+    def _solution(self) -> Solution:
+        return Solution.read(self.solution or self.folder / "solution.h5")
+
+    def _strains(self, solution: Solution) -> list[float]:
+        """The strains asked for that the solution has."""
+        reached = {round(s.nominal_strain, 9) for s in solution.snapshots}
+        strains = [e for e in self.case.experiment.strains if round(e, 9) in reached]
+        if not strains:
+            raise InputError(
+                f"expected snapshots at strains {list(self.case.experiment.strains)} in the "
+                f"solution, got {sorted(reached)}; simulation {solution.info.get('outcome', '')}"
+            )
+        return strains
+
+    def _result_path(self, strain: float) -> Path:
+        return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
+
+    def _correlate_one(self, images: ImageSet, strain: float) -> Result:
+        how, specimen = self.case.correlation, self.case.experiment.specimen
+        ansatz = how.ansatz(specimen)
+        return correlate(
+            images.reference(camera=how.camera),
+            images.deformed(strain, camera=how.camera),
+            images.grid,
+            ansatz,
+            how.start(ansatz, specimen, strain),
+            images.mask(),
+            images.deformed_mask(strain),
+            how.options(),
+            self.progress,
+        )
+
+    # -- what is finished ---------------------------------------------------------------
+
+    def _finished(self, stage: str) -> dict[str, Any]:
+        path = self.folder / "stages.json"
+        stages = read_json(path) if path.is_file() else {}
+        return dict(stages.get(stage, {}))
+
+    def _stage(self, name: str, key: str, work: Callable[[], object], *outputs: Path) -> None:
+        """Do the work unless it was finished with the same key and its files are there."""
+        done = self._finished(name)
+        if done.get("key") == key and all(path.is_file() for path in outputs):
+            return
+        begin = time.perf_counter()
+        work()
+        record = {"key": key, "seconds": time.perf_counter() - begin}
+        path = self.folder / "stages.json"
+        stages = read_json(path) if path.is_file() else {}
+        write_json(path, {**stages, name: record})
+
+
+def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
+    """Run a case from simulation to report; what ``modeharvest run`` does.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a Case.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    case = case if isinstance(case, Case) else read_case(case)
+    return Run(case, Path(folder), progress).all()
+
+
+def _digest(content: object) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
