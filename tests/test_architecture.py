@@ -65,9 +65,25 @@ def test_an_import_the_wrong_way_is_reported(copy: Path, importer: str, imported
     assert f"modeharvest.{importer}.offender" in result.stdout
 
 
-def test_an_import_of_the_package_root_is_reported_too(copy: Path) -> None:
+def test_a_module_without_a_place_is_reported(copy: Path) -> None:
+    (copy / "src/modeharvest/offender.py").write_text("", encoding="utf-8")
+    result = lint_imports(copy)
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "modeharvest.offender" in result.stdout
+
+
+def test_only_fem_may_import_dolfinx(copy: Path) -> None:
+    (copy / "src/modeharvest/errors.py").write_text("import dolfinx\n", encoding="utf-8")
+    result = lint_imports(copy)
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "modeharvest.errors -> dolfinx" in result.stdout
+
+
+def test_an_import_among_the_root_modules_is_reported_too(copy: Path) -> None:
     (copy / "src/modeharvest/errors.py").write_text("import modeharvest.files\n", encoding="utf-8")
-    assert lint_imports(copy).returncode == 1
+    result = lint_imports(copy)
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "modeharvest.errors -> modeharvest.files" in result.stdout
 
 
 def test_every_package_is_reached_by_a_relative_link() -> None:
