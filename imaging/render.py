@@ -41,17 +41,17 @@ class Rendering:
 class Truth:
     """What a measurement of one deformed image should find.
 
-    The leading axis of length 2 holds the components (x, y) along the physical axes; NaN
-    where there is no material.
+    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where
+    there is no material.
 
     Parameters
     ----------
     displacement
-        (2, rows, cols) u at the *reference* image's pixels [mm].
+        (rows, cols, 2) u at the *reference* image's pixels [mm].
     reference_point
-        (2, rows, cols) X of the material that the *deformed* image's pixels show [mm].
+        (rows, cols, 2) X of the material that the *deformed* image's pixels show [mm].
     deformed_displacement
-        (2, rows, cols) float32 u at the *deformed* image's pixels [mm].
+        (rows, cols, 2) float32 u at the *deformed* image's pixels [mm].
     element
         (rows, cols) int32 element shown by the deformed image's pixels, -1 for background.
     residual_px
@@ -106,10 +106,11 @@ def render_deformed(
     located = locate(mesh.nodes + displacement, mesh.cells, mesh.element, grid, where)
     point = interpolate(located, mesh.cells, mesh.element, mesh.nodes)
     moved = interpolate(located, mesh.cells, mesh.element, displacement)
+    at_reference = interpolate(located_reference, mesh.cells, mesh.element, displacement)
     truth = Truth(
-        displacement=interpolate(located_reference, mesh.cells, mesh.element, displacement),
-        reference_point=point,
-        deformed_displacement=moved.astype(np.float32),
+        displacement=np.moveaxis(at_reference, 0, -1),
+        reference_point=np.moveaxis(point, 0, -1),
+        deformed_displacement=np.moveaxis(moved.astype(np.float32), 0, -1),
         element=located.element,
         residual_px=located.residual_px,
     )

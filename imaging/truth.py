@@ -8,8 +8,9 @@
     element                (rows, cols)    int32   [-]   at the deformed image's pixels
     residual_px            (rows, cols)    float32 [px]  of the inverse mapping there
 
-The leading axis holds the components (x, y), x right, y up; rows run down the image. NaN (in
-``element``: -1) marks background. Attributes: nominal_strain and the pixel grid.
+In the file the leading axis holds the components (x, y), so that each is one contiguous image;
+in Python they come last. x right, y up; rows run down the image. NaN (in ``element``: -1) marks
+background. Attributes: nominal_strain and the pixel grid.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def write_truth(path: Path | str, truth: Truth, nominal_strain: float, grid: Pix
             file.attrs[name] = value
         for name, (unit, meaning) in _CONTENT.items():
             data = getattr(truth, name)
+            data = np.moveaxis(data, -1, 0) if data.ndim == 3 else data
             chunk = (1,) * (data.ndim - 2) + (min(_CHUNK_ROWS, grid.rows), grid.cols)
             dataset = file.create_dataset(
                 name, data=data, chunks=chunk, compression="lzf", shuffle=True
@@ -63,7 +65,10 @@ def read_truth(path: Path | str) -> Truth:
                     f"expected a {FORMAT} file at {path}, got format "
                     f"{file.attrs.get('format')!r}; make it again with 'modeharvest image'"
                 )
-            return Truth(**{name: np.asarray(file[name]) for name in _CONTENT})
+            planes = {name: np.asarray(file[name]) for name in _CONTENT}
+            return Truth(
+                **{n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()}
+            )
     except (OSError, KeyError) as error:
         raise InputError(
             f"expected a truth file (HDF5) at {path}, got: {error}; "
