@@ -28,7 +28,7 @@ class PathOptions:
         To which the critical strain is located [-].
     first_amplitude
         Largest nodal displacement of the first step onto the branch, as a share of the pitch
-        or whatever length is the branch is given [-].
+        or whatever length the branch is given [-].
     growth
         Most by which the mode's amplitude may grow in one step along the branch [-].
     """
@@ -38,6 +38,13 @@ class PathOptions:
     critical_tolerance: float = 1e-7
     first_amplitude: float = 0.04
     growth: float = 2.0
+
+    def __post_init__(self) -> None:
+        steps = (self.first_step, self.largest_step, self.critical_tolerance, self.first_amplitude)
+        if not (all(step > 0 for step in steps) and self.growth > 1):
+            raise InputError(
+                f"path options: expected positive steps and tolerance and growth > 1, got {self}"
+            )
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         strains = self.strains
-        if not strains or strains[0] <= 0 or any(b <= a for a, b in pairwise(strains)):
+        if not strains or not strains[0] > 0 or any(not b > a for a, b in pairwise(strains)):
             raise InputError(
                 f"strains: expected ascending positive nominal strains such as 0.078, 0.128, got "
                 f"{list(strains)}"

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from modeharvest import __version__
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.continuation import Critical, State, Walker
 from modeharvest.fem.equilibrium import Loading, Structure
-from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.imperfection import perturb
 from modeharvest.fem.meshing import mesh_specimen
@@ -51,25 +52,42 @@ class _Run:
         strains = self.experiment.strains
         perfect = self.experiment.imperfection.is_none
         path = [self.walker.start()]
-        arrived = self.walker.primary(
-            path, strains, until_unstable=perfect, refuse_unstable=not perfect
-        )
+        self.walker.primary(path, strains, until_unstable=perfect, refuse_unstable=not perfect)
         critical, branches = None, {}
         if path[-1].negative_pivots > 0:
             critical = self.walker.locate_critical(path[-2], path[-1])
-            arrived = self.walker.primary(path, strains)
+            self.walker.primary(path, strains)
             if critical is not None:
                 branches = self._branches(self._oriented(critical))
-        snapshots = self._snapshots(path, critical, branches)
+        limit = _stable_until(path, critical)
+        snapshots = self._snapshots(path, limit, branches)
         info = self._info(path, critical, branches)
-        info["outcome"] = self._outcome(arrived, snapshots)
+        info["outcome"] = self._outcome(snapshots, limit, {"primary": path, **branches})
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _oriented(self, critical: Critical) -> Critical:
-        """The critical point with its mode turned to a positive overlap with the pattern."""
-        if self._pattern_overlap(critical.modes[0]) < 0:
-            critical.modes[0] = critical.modes[0].reversed()
+        """The critical point with its mode turned to a positive overlap with the pattern.
+
+        A mode of another symmetry has none; there a field without symmetries decides, so
+        that the sign isn't left to rounding.
+        """
+        mode = critical.modes[0]
+        overlap = self._pattern_overlap(mode)
+        if abs(overlap) < 1e-6:
+            overlap = mode.overlap(self._lopsided())
+        if overlap < 0:
+            critical.modes[0] = mode.reversed()
         return critical
+
+    def _lopsided(self) -> PETSc.Vec:
+        """A smooth field that no symmetry of a rectangle maps to plus or minus itself."""
+
+        def field(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            x, y = (points / self.experiment.specimen.half_size).T
+            along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
+            return np.stack([along, across], axis=1)
+
+        return self.walker.structure.from_function(field)
 
     def _pattern_overlap(self, mode: Mode) -> float:
         pattern = self.walker.structure.from_function(self.experiment.specimen.pattern)
@@ -100,9 +118,8 @@ class _Run:
         return {b: self.walker.branch(critical, targets, signs[b], pitch) for b in wanted}
 
     def _snapshots(
-        self, path: Sequence[State], critical: Critical | None, branches: dict[str, list[State]]
+        self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
     ) -> list[Snapshot]:
-        limit = np.inf if critical is None else critical.strain
         kept: list[tuple[State, str]] = [
             (state, "primary")
             for state in path
@@ -173,22 +190,36 @@ class _Run:
             "lowest_eigenvalues_N_per_mm4": [list(s.eigenvalues) for s in states],
         }
 
-    def _outcome(self, arrived: bool, snapshots: list[Snapshot]) -> str:
-        missing = [
-            e
-            for e in self.experiment.strains
-            if not _is_among(e, [s.nominal_strain for s in snapshots])
-        ]
-        if not missing:
-            return "complete"
-        listed = ", ".join(f"{100 * e:g} %" for e in missing)
-        reached = max((s.nominal_strain for s in snapshots), default=0.0)
-        why = (
-            "Newton's method did not converge"
-            if not arrived
-            else "the branch could not be followed"
-        )
-        return f"incomplete: no snapshot at {listed}; {why} beyond {100 * reached:g} % strain"
+    def _outcome(
+        self, snapshots: list[Snapshot], limit: float, paths: dict[str, list[State]]
+    ) -> str:
+        """Whether every strain was met, or which branch lacks which; primary up to ``limit``."""
+        reasons = []
+        for branch in BRANCHES:
+            have = [s.nominal_strain for s in snapshots if s.branch == branch]
+            missing = [
+                f"{100 * e:g} %"
+                for e in self.experiment.strains
+                if branch in (self.experiment.branches if e > limit else ("primary",))
+                and not _is_among(e, have)
+            ]
+            if missing:
+                states = paths.get(branch, [])
+                reached = states[-1].strain if states else limit
+                reasons.append(
+                    f"{branch} lacks {', '.join(missing)} "
+                    f"(Newton's method did not converge beyond {100 * reached:.4g} % strain)"
+                )
+        return "incomplete: " + "; ".join(reasons) if reasons else "complete"
+
+
+def _stable_until(path: list[State], critical: Critical | None) -> float:
+    """The strain up to which the primary path is known to be stable; infinity if all of it."""
+    if critical is not None:
+        return critical.strain
+    if path[-1].negative_pivots == 0:
+        return np.inf
+    return max(state.strain for state in path if state.negative_pivots == 0)
 
 
 def _cell_of(nodes: NDArray[np.float64], specimen: Specimen) -> NDArray[np.int64]:
