@@ -53,7 +53,9 @@ class Box:
     def normalised(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(xi, eta) in [-1, 1] of positions [mm] inside the box."""
         (xc, yc), (hx, hy) = self.centre, self.half
-        return (np.asarray(x, float) - xc) / hx, (np.asarray(y, float) - yc) / hy
+        xi: FloatArray = np.subtract(x, xc, dtype=np.float64) / hx
+        eta: FloatArray = np.subtract(y, yc, dtype=np.float64) / hy
+        return xi, eta
 
 
 def orders(degree: int) -> tuple[tuple[int, int], ...]:
@@ -110,7 +112,8 @@ class ChebyshevField:
         Fast on an open grid, x of shape (1, cols) and y of shape (rows, 1).
         """
         xi, eta = self.box.normalised(x, y)
-        along_x = np.tensordot(self.square(coefficients).T, chebyshev(xi, self.degree), axes=1)
+        table = self.square(coefficients).T
+        along_x = np.asarray(np.tensordot(table, chebyshev(xi, self.degree), axes=1), np.float64)
         return sum_of_products(along_x, chebyshev(eta, self.degree))
 
     def basis(self, x: FloatArray, y: FloatArray) -> FloatArray:

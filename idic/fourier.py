@@ -185,7 +185,7 @@ class FourierMode:
         unit = cls(family, half_wavelength, 1.0, taper)
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
         # with k near 1 to well under 1 %; the square one is hit exactly.
-        t: FloatArray = half_wavelength * np.arange(-192, 193, dtype=np.float64) / 16.0
+        t = np.asarray(half_wavelength * np.arange(-192, 193) / 16.0, dtype=np.float64)
         phi = unit.waves_sum(family.start, t[None, :], t[:, None])
         largest = float(np.sqrt((phi**2).sum(axis=-1).max()))
         if not largest > 0:

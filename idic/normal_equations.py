@@ -210,7 +210,7 @@ class Assembly:
 
 
 def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
-    """Form the sums of e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
+    """Sum e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
     i, j = np.array(orders(degree)).T[:, :, None]
     k, m = np.array(orders(other)).T[:, None, :]
     a, b, c, d = i + k, abs(i - k), j + m, abs(j - m)

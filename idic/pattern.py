@@ -119,7 +119,7 @@ def _described(waves: tuple[Wave, ...], largest: Peak, pitch: float) -> Pattern:
     start, amplitude = _square_start(waves, pitch)
     numbers = ", ".join(f"{value:.2f}" for value in np.round(start, 2) + 0.0)
     said.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
-    return Pattern(waves, largest, SQUARE, tuple(start.tolist()), amplitude, tuple(said))
+    return Pattern(waves, largest, SQUARE, tuple(float(v) for v in start), amplitude, tuple(said))
 
 
 def _directions(waves: tuple[Wave, ...]) -> tuple[bool, str]:

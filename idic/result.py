@@ -169,13 +169,13 @@ class Result:
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""
-        inverse = [[None if np.isinf(v) else v for v in row] for row in self.inverse.tolist()]
+        inverse = [[None if np.isinf(v) else float(v) for v in row] for row in self.inverse]
         condition = self.condition_number
         content = {
             "format": FORMAT,
             "outcome": self.outcome.value,
             "explanation": self.outcome.explanation,
-            "unknowns": dict(zip(self.names, self.unknowns.tolist(), strict=True)),
+            "unknowns": dict(zip(self.names, map(float, self.unknowns), strict=True)),
             "units": list(self.ansatz.units),
             "residual_rms": self.residual_rms,
             "pixels": self.pixels,

@@ -140,8 +140,7 @@ def _taper(spectrum: Spectrum) -> FloatArray:
         0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(c.size) + 0.5) / c.size)
         for c in (spectrum.x, spectrum.y)
     )
-    taper: FloatArray = np.outer(up, across)
-    return taper
+    return np.asarray(np.outer(up, across), dtype=np.float64)
 
 
 def _amplitudes(

@@ -80,9 +80,9 @@ class PixelGrid:
 
     def to_px(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Image position (row, col) [px] of physical positions (x, y) [mm]."""
-        col = (np.asarray(x, dtype=np.float64) - self.x0) / self.pixel_size
-        row = (self.y0 - np.asarray(y, dtype=np.float64)) / self.pixel_size
-        return row, col
+        col = np.subtract(x, self.x0, dtype=np.float64) / self.pixel_size
+        row = np.subtract(self.y0, y, dtype=np.float64) / self.pixel_size
+        return np.asarray(row), np.asarray(col)
 
     def binned(self, factor: int) -> PixelGrid:
         """Join blocks of ``factor`` x ``factor`` pixels; incomplete blocks are dropped."""

@@ -283,7 +283,8 @@ def bands(row_from: IntArray, row_to: IntArray, rows: int) -> tuple[IntArray, In
         if row_to[e] > row_from[e]:
             for b in range(row_from[e] // BAND, (row_to[e] - 1) // BAND + 1):
                 start[b + 1] += 1
-    start = np.cumsum(start)
+    for b in range(count):
+        start[b + 1] += start[b]
     visits = np.empty(start[-1], dtype=np.int64)
     cursor = start[:-1].copy()
     for e in range(row_from.size):

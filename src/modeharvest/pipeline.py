@@ -30,7 +30,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.study import validate
+from modeharvest.validation.study import Measured, validate
 
 STAGES = ("fem", "image", "correlate", "validate")
 _NO_DOLFINX = (
@@ -117,11 +117,11 @@ class Run:
         key = _digest([self._finished("correlate").get("key"), __version__])
 
         def work() -> None:
-            solution = self._solution()
+            case = self.case
+            specimen, how = case.experiment.specimen, case.correlation
+            measured = Measured(specimen, how, self._solution(), images, results)
             taken = {stage: self._finished(stage).get("seconds") for stage in STAGES[:-1]}
-            validate(
-                self.case.plain(), solution, images, results, taken, self.folder, self.progress
-            )
+            validate(measured, case.plain(), taken, self.folder, self.progress)
 
         self._stage("validate", key, work, path, self.folder / "report.html")
         summary: dict[str, Any] = read_json(path)

@@ -1,0 +1,211 @@
+"""All that is said of a run: ``summary.json`` and ``report.html``.
+
+Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation.metrics`):
+
+``title``, ``case``
+    What was run.
+``critical_strain``, ``critical``
+    Critical nominal strain [-] or null, and how it was found and proven.
+``energy_below_unstable``
+    For each buckled snapshot: stored energy of the branch and of the unstable path [N].
+``snapshots``
+    A list, one entry for each strain: ``nominal_strain`` [-], ``branch``, ``negative_pivots``,
+    ``pattern_amplitude_px``, ``pattern_inner_px``, ``pattern_corners_px`` (largest length of
+    v1 phi1), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
+    [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
+    ``mode_standard_error``, ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
+    the full image), ``iterations_all_levels``, ``outcome``, ``outcome_why``,
+    ``condition_number``, ``undetermined``, ``pixels``, ``details_px`` (more statistics of w,
+    best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
+``expected``
+    Rows of expected and obtained values.
+``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
+    How good the images are, and what it all took.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Specimen
+from modeharvest.files import write_json
+from modeharvest.idic.equivalents import mode_deviation, mode_equivalent
+from modeharvest.idic.pattern import Pattern, read_pattern
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import Identification
+from modeharvest.idic.spectrum import spectral_density
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.progress import Progress, silent
+from modeharvest.validation.metrics import describe
+from modeharvest.validation.published import expectations
+from modeharvest.validation.report import write_report
+from modeharvest.validation.truth import Comparison, compare, pattern_size
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What is to be judged.
+
+    Parameters
+    ----------
+    specimen
+        The geometry.
+    how
+        How the images were correlated.
+    solution, images
+        Where the truth comes from.
+    results
+        What IDIC found, by nominal strain.
+    """
+
+    specimen: Specimen
+    how: Identification
+    solution: Solution
+    images: ImageSet
+    results: Mapping[float, Result]
+
+
+def validate(
+    measured: Measured,
+    case: Mapping[str, Any],
+    timings_s: Mapping[str, float | None],
+    folder: Path,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Compare the results of an image set with its truth and write the summary and the report.
+
+    Parameters
+    ----------
+    measured
+        What is to be judged.
+    case
+        What was run, as plain values, for the record; its ``title`` heads the report.
+    timings_s
+        Seconds that the stages before took; this one's are added.
+    folder
+        Where ``summary.json`` and ``report.html`` go.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    begin = time.perf_counter()
+    specimen, solution, images = measured.specimen, measured.solution, measured.images
+    comparisons, spectra, snapshots = [], [], []
+    for k, strain in enumerate(sorted(measured.results)):
+        progress(k, len(measured.results), "compare with the truth")
+        comparison = _compare(measured, strain)
+        spectrum = spectral_density(
+            comparison.displacement, comparison.grid, comparison.mask, specimen.pitch
+        )
+        pattern = read_pattern(spectrum)
+        comparisons.append(comparison)
+        spectra.append((spectrum, pattern))
+        snapshots.append(_snapshot(comparison, pattern, specimen, solution))
+
+    critical = solution.info.get("critical")
+    summary: dict[str, Any] = {
+        "title": case.get("title", ""),
+        "case": dict(case),
+        "critical_strain": None if critical is None else critical["strain"],
+        "critical": critical,
+        "energy_below_unstable": _energies(solution),
+        "snapshots": snapshots,
+        "inverse_map_max_residual_px": images.max_residual_px,
+        "factorisations": solution.info.get("factorisations"),
+        "simulation_outcome": solution.info.get("outcome"),
+        "versions": {**solution.info.get("versions", {}), **images.info.get("versions", {})},
+    }
+    summary["expected"] = expectations(summary) if specimen == Specimen() else []
+    summary["timings_s"] = {**timings_s, "validate": time.perf_counter() - begin}
+    write_report(
+        folder / "report.html",
+        dict(case),
+        solution,
+        images,
+        comparisons,
+        spectra,
+        summary,
+        progress,
+    )
+    summary["timings_s"]["validate"] = time.perf_counter() - begin
+    write_json(folder / "summary.json", summary)
+    return summary
+
+
+def _compare(measured: Measured, strain: float) -> Comparison:
+    result, how = measured.results[strain], measured.how
+    start = how.start(result.ansatz, measured.specimen, strain)
+    return compare(measured.images, strain, result, start, how.camera)
+
+
+def _snapshot(
+    comparison: Comparison, pattern: Pattern, specimen: Specimen, solution: Solution
+) -> dict[str, Any]:
+    result, best, mask = comparison.result, comparison.best, comparison.mask
+    state = solution.at(comparison.strain)
+    size = pattern_size(comparison, specimen)
+    parts = {
+        "w": comparison.w,
+        "best_fit": comparison.best_error,
+        "idic_to_best_fit": comparison.idic_to_best,
+    }
+    px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
+    pitch = specimen.pitch
+    return {
+        "nominal_strain": comparison.strain,
+        "branch": state.branch,
+        "negative_pivots": state.negative_pivots,
+        "pattern_amplitude_px": size.anywhere,
+        "pattern_inner_px": size.inner,
+        "pattern_corners_px": size.corners,
+        "rms_w_px": px["w"]["rms_per_component"],
+        "rms_best_fit_px": px["best_fit"]["rms_per_component"],
+        "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
+        "rms_residual": result.residual_rms,
+        "mode": mode_equivalent(result.mode_parameters(), pitch)[0].tolist(),
+        "mode_standard_error": _plain(result.standard_errors()[result.ansatz.phi_slice(0)]),
+        "mode_deviation_percent": mode_deviation(result.mode_parameters(), pitch).tolist(),
+        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch)[0].tolist(),
+        "iterations": result.iterations,
+        "iterations_all_levels": len(result.history),
+        "outcome": result.outcome.name.lower(),
+        "outcome_why": result.outcome.explanation,
+        "condition_number": result.condition_number,
+        "undetermined": list(result.undetermined),
+        "pixels": result.pixels,
+        "details_px": px,
+        "pattern_reading": list(pattern.sentences),
+    }
+
+
+def _energies(solution: Solution) -> list[dict[str, float]]:
+    """Energies [N] of the buckled snapshots and of the primary path at the same strain."""
+    primary = solution.info.get("path", {}).get("primary", {})
+    at = dict(zip(primary.get("nominal_strain", []), primary.get("energy_N", []), strict=True))
+    return [
+        {
+            "nominal_strain": s.nominal_strain,
+            "branch_N": s.energy,
+            "unstable_N": at[s.nominal_strain],
+        }
+        for s in solution.snapshots
+        if s.branch != "primary" and s.nominal_strain in at
+    ]
+
+
+def _plain(values: FloatArray) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
