@@ -24,6 +24,7 @@ from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
 _MODES = 8  # followed near the critical point
+_SEARCHES = 20  # equilibria on the way to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,30 +171,55 @@ class Walker:
     # -- the critical point -------------------------------------------------------------
 
     def locate_critical(self, low: State, high: State) -> Critical | None:
-        """The critical point between a stable state and the unstable one reached last.
+        """The first critical point between a stable state and the unstable one reached last.
 
         Interpolates the critical eigenvalue between equilibria, within the bracket that the
-        inertia gives. None if an equilibrium in between can't be found.
+        inertia gives. Where the inertia below the point found is not zero, another mode
+        became critical earlier, and that one is looked for. None if an equilibrium in
+        between can't be found.
         """
-        estimate, critical = self._first_crossing(low, high, self.modes)
+        modes = self.modes
+        for _ in range(_MODES):
+            found = self._approach(low, high, modes)
+            if found is None:
+                return None
+            low, critical, below = found
+            if below is None or below.negative_pivots == 0:
+                return critical
+            high, modes = below, self.modes
+        return None
+
+    def _approach(
+        self, low: State, high: State, modes: list[Mode]
+    ) -> tuple[State, Critical, State | None] | None:
+        """A critical point between the states, the last stable state, the one just below it.
+
+        ``modes`` are those at ``high``; afterwards ``self.modes`` are those just below.
+        """
+        estimate, critical = self._first_crossing(low, high, modes)
         history = [(high.strain, critical.eigenvalue)]
-        tolerance, state = self.options.critical_tolerance, high
-        for k in range(20):
+        state = high
+        for k in range(_SEARCHES):
             self.progress(k, 6, "critical point")
+            if not low.strain < estimate < high.strain:  # it followed a mode that is later
+                estimate, critical = self._first_crossing(low, high, modes)
+                history = [(high.strain, critical.eigenvalue)]
             if not low.strain < estimate < high.strain:
                 estimate = 0.5 * (low.strain + high.strain)
             found = self.equilibrium(estimate, _interpolate(low, high, estimate))
             if found is None:
                 return None
-            state = found
-            modes = self.modes
-            critical = max(modes, key=lambda mode: abs(mode.overlap(critical.vector)))
+            state, nearby = found, self.modes
+            critical = max(nearby, key=lambda mode: abs(mode.overlap(critical.vector)))
             history.append((state.strain, critical.eigenvalue))
-            low, high = (low, state) if state.negative_pivots else (state, high)
+            if state.negative_pivots:
+                high, modes = state, nearby
+            else:
+                low = state
             previous, estimate = estimate, _root(history)
-            if abs(estimate - previous) < tolerance:
+            if abs(estimate - previous) < self.options.critical_tolerance:
                 break
-        return self._prove(estimate, state, modes, history)
+        return low, *self._prove(estimate, state, nearby, history)
 
     def _first_crossing(self, low: State, high: State, modes: list[Mode]) -> tuple[float, Mode]:
         """Of the modes negative at ``high``: where the first one crosses zero, and which.
@@ -210,15 +236,16 @@ class Walker:
 
     def _prove(
         self, strain: float, near: State, modes: list[Mode], history: list[tuple[float, float]]
-    ) -> Critical:
-        """The inertia a tolerance below and above the critical strain."""
-        pivots = []
-        for side in (-self.options.critical_tolerance, self.options.critical_tolerance):
-            guess = _along(near, strain + side)
-            state = self.equilibrium(strain + side, guess)
-            pivots.append(-1 if state is None else state.negative_pivots)
+    ) -> tuple[Critical, State | None]:
+        """The inertia a tolerance above and below the critical strain; the state below."""
+        tolerance = self.options.critical_tolerance
+        above, below = (
+            self.equilibrium(strain + side, _along(near, strain + side))
+            for side in (tolerance, -tolerance)
+        )
+        counts = (-1 if state is None else state.negative_pivots for state in (below, above))
         modes = sorted(modes, key=lambda mode: abs(mode.eigenvalue))
-        return Critical(strain, _along(near, strain), modes, history, pivots[0], pivots[1])
+        return Critical(strain, _along(near, strain), modes, history, *counts), below
 
     # -- the branch ---------------------------------------------------------------------
 

@@ -102,9 +102,14 @@ def join(blocks: list[Block], tolerance: float) -> Mesh:
     cells = np.vstack([b.cells + k for b, k in zip(blocks, offsets, strict=True)])
     pairs = cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes), len(nodes)))
-    _, label = connected_components(links, directed=False)
-    _, first = np.unique(label, return_index=True)
-    return Mesh(nodes[first], label[cells].astype(np.int64), "T6")
+    count, label = connected_components(links, directed=False)
+    merged = np.empty((count, 2))
+    for axis, values in enumerate(np.where(np.abs(nodes) < tolerance, 0.0, nodes).T):
+        # Of coordinates that differ by rounding take the smallest: mirror images do the same.
+        order = np.lexsort((np.abs(values), label))
+        _, first = np.unique(label[order], return_index=True)
+        merged[:, axis] = values[order][first]
+    return Mesh(merged, label[cells].astype(np.int64), "T6")
 
 
 def _divisions(length: float, size: float) -> int:

@@ -23,6 +23,7 @@ CASES = [
     (SMALL, 0.25),
     (Specimen(2, 2, bulk_x=0.0, bulk_y=0.0), 0.2),
     (Specimen(1, 3, diameter=0.5, pitch=2.0, bulk_x=0.7, bulk_y=0.0), 0.15),
+    (Specimen(5, 4, diameter=1.1, pitch=1.386, bulk_x=0.31), 0.2),
 ]
 cases = pytest.mark.parametrize(("specimen", "size"), CASES)
 
