@@ -12,8 +12,10 @@ corners, then (Q9) the centre; this is the order of VTK, gmsh and meshio.
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -123,6 +125,11 @@ class Solution:
                     f"snapshot at strain {s.nominal_strain}: expected displacements of shape "
                     f"{self.mesh.nodes.shape}, got {s.displacement.shape}"
                 )
+            if not np.isfinite(s.displacement).all():
+                raise InputError(
+                    f"snapshot at strain {s.nominal_strain}: expected finite displacements, "
+                    "got NaN or infinity"
+                )
 
     def at(self, nominal_strain: float) -> Snapshot:
         """The stable snapshot at a nominal strain (the first one listed, if several)."""
@@ -134,7 +141,13 @@ class Solution:
 
     def write(self, path: Path | str) -> None:
         """Write HDF5, atomically; displacements and nodes are stored losslessly."""
-        with atomic(path) as temporary, h5py.File(temporary, "w") as file:
+        with atomic(path) as temporary:
+            temporary.write_bytes(self._as_hdf5())
+
+    def _as_hdf5(self) -> bytes:
+        # In memory first: on a full disk HDF5 can't close its file and complains at exit.
+        memory = io.BytesIO()
+        with h5py.File(memory, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["element"] = self.mesh.element
             file.attrs["info"] = json.dumps(dict(self.info))
@@ -154,6 +167,7 @@ class Solution:
                 )
                 group.attrs["eigenvalues"] = np.asarray(s.eigenvalues, dtype=np.float64)
                 group.attrs["branch"] = s.branch
+        return memory.getvalue()
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:
@@ -175,7 +189,9 @@ class Solution:
                 groups = file.get("snapshots", {})
                 snapshots = tuple(_read_snapshot(groups[name]) for name in sorted(groups))
                 return cls(mesh, snapshots, json.loads(file.attrs["info"]))
-        except (OSError, KeyError) as error:
+        except InputError:
+            raise
+        except (OSError, KeyError, ValueError) as error:
             raise InputError(
                 f"expected a solution (HDF5) at {path}, got: {error}; "
                 "make it again with 'modeharvest fem'"
@@ -224,23 +240,34 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     Raises
     ------
     InputError
-        If the file can't be read, has no such cells or no such field.
+        If the file can't be read, has no such cells or several types of them, or no such field.
     """
+    said = io.StringIO()
     try:
-        source = meshio.read(path)
-    except Exception as error:  # meshio raises a different type for every format
-        raise InputError(f"expected a mesh that meshio reads at {path}, got: {error}") from error
-    types = {block.type for block in source.cells}
-    element = next((e for e, name in _MESHIO_NAME.items() if name in types), None)
-    if element is None:
+        with redirect_stdout(said), redirect_stderr(said):
+            source = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
+        reason = " ".join((said.getvalue() or str(error)).split())
+        raise InputError(f"expected a mesh that meshio reads at {path}, got: {reason}") from error
+    types = sorted({block.type for block in source.cells})
+    found = [e for e, name in _MESHIO_NAME.items() if name in types]
+    if not found:
         raise InputError(
-            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {sorted(types)}"
+            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {types}"
         )
+    if len(found) > 1:
+        raise InputError(f"expected one type of cells in {path}, got {types}")
     if displacement not in source.point_data:
         raise InputError(
             f"expected a nodal field {displacement!r} in {path}, got {list(source.point_data)}"
         )
-    cells = np.vstack([b.data for b in source.cells if b.type == _MESHIO_NAME[element]])
-    mesh = Mesh(source.points[:, :2], cells, element)
-    u = np.ascontiguousarray(source.point_data[displacement][:, :2], dtype=np.float64)
+    u = np.asarray(source.point_data[displacement], dtype=np.float64)
+    if u.ndim != 2 or u.shape[1] not in (2, 3):
+        raise InputError(
+            f"expected {displacement!r} in {path} to have 2 or 3 components, got shape {u.shape}"
+        )
+    name = _MESHIO_NAME[found[0]]
+    cells = np.vstack([block.data for block in source.cells if block.type == name])
+    mesh = Mesh(source.points[:, :2], cells, found[0])
+    u = np.ascontiguousarray(u[:, :2])
     return Solution(mesh, (Snapshot(nominal_strain, u),), {"source": str(path)})
