@@ -20,6 +20,7 @@ from petsc4py import PETSc
 
 from modeharvest.errors import InputError
 from modeharvest.fem import dolfinx_api
+from modeharvest.fem.experiment import EDGES
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
 
@@ -48,8 +49,8 @@ class Loading:
     edges: str = "clamped"
 
     def __post_init__(self) -> None:
-        if self.edges not in ("clamped", "sliding"):
-            raise InputError(f"loaded edges: expected 'clamped' or 'sliding', got {self.edges!r}")
+        if self.edges not in EDGES:
+            raise InputError(f"loaded edges: expected one of {EDGES}, got {self.edges!r}")
 
 
 class Factor:

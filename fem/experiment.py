@@ -13,6 +13,7 @@ from modeharvest.fem.imperfection import Imperfection
 from modeharvest.fem.materials import Material, Ogden
 from modeharvest.fem.specimen import Specimen
 
+EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")
 
 
@@ -93,5 +94,9 @@ class Experiment:
             raise InputError(
                 f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"
             )
+        if not 0.0 < self.mesh_size < float("inf"):
+            raise InputError(f"mesh_size: expected a positive length in mm, got {self.mesh_size}")
+        if self.edges not in EDGES:
+            raise InputError(f"edges: expected one of {EDGES}, got {self.edges!r}")
         if not self.branches or not set(self.branches) <= set(BRANCHES):
             raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")

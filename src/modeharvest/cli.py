@@ -158,11 +158,15 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
         "outcome": "outcome",
     }
     for label, key in rows.items():
-        table.add_row(label, *(_cell(s.get(key)) for s in summary["snapshots"]))
+        table.add_row(escape(label), *(_cell(s.get(key)) for s in summary["snapshots"]))
     console = Console()
     console.print(table)
+    console.print("rms: per component, over all material pixels")
     if summary.get("critical_strain") is not None:
         console.print(f"critical strain {100 * summary['critical_strain']:.4f} %")
+    missed = [row["quantity"] for row in summary["expected"] if not row["ok"]]
+    if summary["expected"]:
+        console.print(f"expected values missed: {', '.join(missed) or 'none'}")
     console.print(f"report: {out / 'report.html'}")
 
 

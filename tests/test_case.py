@@ -1,0 +1,88 @@
+"""Case files: defaults are the paper's, and a wrong one is told in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from modeharvest.case import Case, case_text, read_case, shipped_cases
+from modeharvest.errors import InputError
+from modeharvest.fem.materials import Ogden, TwoTermI1
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "case.toml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_shipped_paper_case_spells_out_the_defaults() -> None:
+    """So the file is a complete list of options, and 'defaults are the paper's' stays true."""
+    case = read_case("paper-virtual")
+    assert case == Case(title=case.title)
+    assert case.title == shipped_cases()["paper-virtual"]
+
+
+def test_every_option_of_the_paper_case_is_in_its_text() -> None:
+    text = case_text("paper-virtual")
+    plain = Case().plain()
+    tables = [plain["experiment"], plain["imaging"], plain["correlation"]]
+    tables += [table[key] for table in tables for key in table if isinstance(table[key], dict)]
+    names = {name for table in tables for name in table}
+    left_out = {"path", *plain["experiment"]["path"], "shape"}  # for those who read the docstring
+    assert {name for name in names - left_out if name not in text} == set()
+
+
+def test_materials_by_kind(tmp_path: Path) -> None:
+    two = read_case(written(tmp_path, '[experiment.material]\nkind = "two-term-I1"\nbulk = 40.0'))
+    assert two.experiment.material == TwoTermI1(bulk=40.0)
+    ogden = read_case(
+        written(tmp_path, "[experiment.material]\nmoduli = [1.0, 0.2]\nexponents = [2.0, -2.0]")
+    )
+    assert ogden.experiment.material == Ogden((1.0, 0.2), (2.0, -2.0))
+
+
+def test_plain_values_make_the_same_case_again() -> None:
+    case = Case()
+    assert Case.model_validate(case.plain()) == case
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[experiment.specimen]\ndiametre = 1.0", "did you mean 'diameter'?"),
+        ("[experiment]\nmesh_sise = 0.1", "did you mean 'mesh_size'?"),
+        ("[imagin]\nbits = 8", "did you mean 'imaging'?"),
+        ("[imaging.speckle]\nblur = 3.0", "did you mean 'blur_px'?"),
+        ('[experiment.material]\nkind = "ogdn"', "kind among"),
+        ("[experiment.material]\nmodul = [1.0]", "did you mean 'moduli'?"),
+        ("[experiment.specimen]\ndiameter = 2.5", "0 < diameter < pitch"),
+        ("[experiment.specimen]\nholes_x = 0", "at least 1 x 1 holes"),
+        ('[experiment.specimen]\nholes_x = "six"', "'six'"),
+        ("[experiment.specimen]\nbulk_x = -1.0", "bulk edges of 0 mm or more"),
+        ("[experiment]\nstrains = [0.1, 0.05]", "ascending"),
+        ("[experiment]\nstrains = [12.8]", "below 0.5"),
+        ('[experiment]\nedges = "glued"', "'glued'"),
+        ("[correlation]\norder = 4", "order 3 or 5"),
+        ("[imaging]\npixel_size = 0", "pixel size above 0"),
+        ("[experiment", "not valid TOML"),
+    ],
+)
+def test_a_wrong_case_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read_case(written(tmp_path, text))
+    message = str(caught.value)
+    assert said in message
+    assert "\n" not in message
+    assert "case.toml" in message
+
+
+def test_a_misspelt_case_name_is_met_with_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean 'paper-virtual'"):
+        read_case("paper-virtal")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nothing\.toml"):
+        read_case(tmp_path / "nothing.toml")

@@ -1,0 +1,113 @@
+"""The command line: what it teaches, its exit codes, its one-line errors."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from modeharvest import __version__, cli
+
+COMMANDS = ("run", "fem", "image", "correlate", "validate", "cases")
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """Exit code of the ``modeharvest`` command."""
+    monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def error_line(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr that begins with 'error:'; no traceback around it."""
+    text = capsys.readouterr().err
+    assert "Traceback" not in text
+    (line,) = [row for row in text.splitlines() if row.startswith("error:")]
+    return line
+
+
+def test_help_lists_every_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(monkeypatch, "--help") == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in COMMANDS)
+    assert "paper-virtual" in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    assert called(monkeypatch, command, "--help") == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out.strip() == __version__
+
+
+def test_cases_prints_a_case_that_can_be_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert called(monkeypatch, "cases", "paper-virtual") == 0
+    mine = tmp_path / "mine.toml"
+    mine.write_text(capsys.readouterr().out, "utf-8")
+    assert cli.read_case(mine) == cli.read_case("paper-virtual")
+
+
+@pytest.mark.parametrize("arguments", [("bogus",), ("run",), ("run", "paper-virtual")])
+def test_wrong_usage_is_exit_code_2(
+    monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
+    assert called(monkeypatch, *arguments) == 2
+
+
+def test_unknown_case(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert called(monkeypatch, "run", "paper-virtul", "--out", out) == 2
+    assert "did you mean 'paper-virtual'" in error_line(capsys)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "missing"), [("image", "solution"), ("correlate", "image"), ("validate", "image")]
+)
+def test_a_stage_before_its_time_says_what_comes_first(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    command: str,
+    missing: str,
+) -> None:
+    assert called(monkeypatch, command, "paper-virtual", "--out", tmp_path / "out") == 2
+    line = error_line(capsys)
+    assert f"expected a {missing}" in line or f"expected a finished {missing}" in line
+    assert "modeharvest" in line  # names the command that makes it
+
+
+def test_without_dolfinx_fem_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "modeharvest.fem.simulate", None)  # makes its import fail
+    case = tmp_path / "mine.toml"
+    case.write_text("[experiment]\nmesh_size = 0.15", "utf-8")
+    assert called(monkeypatch, "fem", case, "--out", tmp_path / "out") == 2
+    assert "dolfinx" in (line := error_line(capsys))
+    assert "conda" in line
+    assert "apt" in line
+    assert not (tmp_path / "out" / "solution.h5").exists()
+
+
+def test_without_dolfinx_the_paper_case_takes_the_shipped_solution(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "modeharvest.fem.simulate", None)
+    assert called(monkeypatch, "fem", "paper-virtual", "--out", tmp_path) == 0
+    assert "critical strain 9.6" in capsys.readouterr().out
+    assert (tmp_path / "solution.h5").is_file()

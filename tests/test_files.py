@@ -1,0 +1,48 @@
+"""Files are whole or absent, whatever ends the writing early."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from modeharvest.errors import InputError
+from modeharvest.files import atomic, read_json, write_json
+
+
+def test_a_finished_write_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    for text in ("one", "two"):
+        with atomic(path) as temporary:
+            temporary.write_text(text)
+    assert path.read_text() == "two"
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, ValueError])
+def test_an_interrupted_write_keeps_the_old_file(tmp_path: Path, end: type[BaseException]) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(end), atomic(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise end
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(InputError, match=r"could not write .*a\.txt: No space left"), atomic(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_round_trip_and_a_cut_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    content = {"ξ": [1.5, None], "name": "φ₁"}
+    write_json(path, content)
+    assert read_json(path) == content
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match="expected a JSON file"):
+        read_json(path)
