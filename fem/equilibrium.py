@@ -50,7 +50,9 @@ class Loading:
 
     def __post_init__(self) -> None:
         if self.edges not in EDGES:
-            raise InputError(f"loaded edges: expected one of {EDGES}, got {self.edges!r}")
+            raise InputError(
+                f"loaded edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}"
+            )
 
 
 class Factor:

@@ -97,6 +97,6 @@ class Experiment:
         if not 0.0 < self.mesh_size < float("inf"):
             raise InputError(f"mesh_size: expected a positive length in mm, got {self.mesh_size}")
         if self.edges not in EDGES:
-            raise InputError(f"edges: expected one of {EDGES}, got {self.edges!r}")
+            raise InputError(f"edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}")
         if not self.branches or not set(self.branches) <= set(BRANCHES):
             raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
