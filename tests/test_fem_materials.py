@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import basix.ufl
@@ -22,7 +23,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.fem.simulate import simulate
+from modeharvest.fem.specimen import Specimen
 
 mpmath.mp.dps = 60
 
@@ -203,6 +207,22 @@ def test_undeformed_state_is_stress_free_with_the_stated_moduli(
     assert energy == pytest.approx(0.0, abs=1e-14)
     np.testing.assert_allclose(stress, 0.0, atol=1e-14)
     np.testing.assert_allclose(tangent, hooke, rtol=1e-13, atol=1e-13)
+
+
+def test_recipe_of_the_documentation_works() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "fem.md").read_text("utf-8")
+    recipe = page.partition("## Add a material")[2].partition("```python")[2].partition("```")[0]
+    namespace: dict[str, Any] = {"__name__": "recipe"}
+    exec(compile(recipe, "docs/fem.md", "exec", dont_inherit=True), namespace)
+    material = namespace["NeoHooke"]()
+    energy, stress, tangent = evaluate(material, EYE)
+    assert energy == pytest.approx(0.0, abs=1e-14)
+    np.testing.assert_allclose(stress, 0.0, atol=1e-14)
+    assert tangent[0, 1, 0, 1] == pytest.approx(material.mu)
+    assert tangent[0, 0, 1, 1] == pytest.approx(material.lam)
+    solution = simulate(Experiment(Specimen(1, 1), material, strains=(0.05,), mesh_size=0.5))
+    assert solution.info["outcome"] == "complete"
+    assert solution.info["material"] == {"kind": "NeoHooke", "mu": 0.6, "lam": 5.4}
 
 
 @pytest.mark.parametrize(

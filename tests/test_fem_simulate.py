@@ -138,13 +138,25 @@ def test_sliding_edges_are_softer() -> None:
     assert np.ptp(before.displacement[right, 0]) < 1e-14
 
 
-def test_first_of_two_modes_that_lie_close_is_found() -> None:
-    """Without bulk strips two modes become critical within 0.03 % of strain."""
-    solution = simulate(small(specimen=Specimen(4, 4, bulk_y=0.0), strains=(0.14,)))
-    critical = solution.info["critical"]
-    assert (critical["negative_pivots_below"], critical["negative_pivots_above"]) == (0, 1)
-    second = min(v for v in critical["nearest_eigenvalues_N_per_mm4"] if abs(v) > 1e-9)
-    assert 0 < second < 1e-3
+@pytest.mark.parametrize("bulk_y", [0.0, 0.3])
+@pytest.mark.parametrize("step", [0.03, 0.15])
+def test_first_of_modes_that_lie_close_is_found(bulk_y: float, step: float) -> None:
+    """Narrow bulk strips: several modes become critical within 0.1 % of strain."""
+    specimen = Specimen(4, 4, bulk_y=bulk_y)
+    found = [
+        simulate(
+            small(
+                specimen=specimen,
+                strains=(0.15,),
+                branches=("primary",),
+                path=PathOptions(first, first),
+            )
+        ).info["critical"]
+        for first in (0.02, step)
+    ]
+    for critical in found:
+        assert (critical["negative_pivots_below"], critical["negative_pivots_above"]) == (0, 1)
+    assert found[0]["strain"] == pytest.approx(found[1]["strain"], abs=1e-8)
 
 
 def test_specimen_that_stays_stable_has_no_critical_strain() -> None:
