@@ -11,8 +11,9 @@ import pytest
 import scipy.linalg
 from fem_bodies import FloatArray, column, vector_of
 
-from modeharvest.fem.continuation import Critical, PathOptions, State, Walker, _hermite
+from modeharvest.fem.continuation import Critical, State, Walker, _hermite
 from modeharvest.fem.equilibrium import Loading, Structure
+from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.materials import Material, Ogden
 from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.specimen import Specimen
@@ -88,7 +89,7 @@ class Buckled:
 
 
 @cache
-def buckled_column(slenderness: float, material: Material = NO_POISSON) -> Buckled:  # type: ignore[misc]
+def buckled_column(slenderness: float, material: Material = NO_POISSON) -> Buckled:
     """A clamped column of height 1 mm; Euler: e = 4 pi^2 I/(A L^2) = pi^2 h^2/(3 L^2)."""
     euler = np.pi**2 / (3 * slenderness**2)
     mesh = column(slenderness, 1.0, round(2 * slenderness), 2)
