@@ -119,6 +119,12 @@ class Sheet:
         total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
+    def sample(self, field: FloatArray) -> FloatArray:
+        """Take the middle pixel of each cell from a field (rows, cols) of the images."""
+        rows, cols = self.grid.shape
+        n, middle = self.factor, self.factor // 2
+        return field[middle : rows * n : n, middle : cols * n : n]
+
     def moved_nodes(self, motion: Motion | None) -> FloatArray | None:
         """(n, 2) displacement of the mesh's nodes [mm]."""
         if motion is None:
@@ -160,10 +166,10 @@ def draw_field(
         edge = _edge(sheet, motion)
         axes.add_patch(edge)
         X, Y = sheet.moved_corners(motion)
-        quads = axes.pcolormesh(X, Y, np.ma.masked_invalid(values), cmap=scale.colours,
+        quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
                                 norm=scale.normalise, rasterized=True)  # fmt: skip
         quads.set_clip_path(edge)
-        _colour_bar(drawn, axes, scale)
+        colour_bar(drawn, axes, scale)
     return drawn
 
 
@@ -188,7 +194,7 @@ def draw_image(sheet: Sheet, image: NDArray[np.float32], material: BoolArray, gr
         axes.imshow(rgba, extent=coarse.extent, interpolation="antialiased", rasterized=True,
                     aspect="auto")  # fmt: skip
         axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
-        _colour_bar(drawn, axes, Scale(GREY, 0.0, 1.0, "–"))
+        colour_bar(drawn, axes, Scale(GREY, 0.0, 1.0, "–"))
     return drawn
 
 
@@ -225,12 +231,12 @@ def draw_blend(
         along = np.linspace(0.0, 1.0, values.shape[1])[None, :]
         up = np.linspace(0.0, 1.0, values.shape[0])[:, None]
         opacity = np.clip((along + 0.25 * up - 0.48) / 0.28, 0.0, 1.0)
-        quads = axes.pcolormesh(X, Y, np.ma.masked_invalid(values), cmap=scale.colours,
+        quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
                                 norm=scale.normalise, alpha=opacity**2 * (3 - 2 * opacity),
                                 rasterized=True, linewidth=0, antialiased=False)  # fmt: skip
         quads.set_clip_path(edge)
         axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
-        _colour_bar(drawn, axes, scale)
+        colour_bar(drawn, axes, scale)
     return drawn
 
 
@@ -250,10 +256,10 @@ def _map(sheet: Sheet, width: float = WIDTH) -> tuple[Figure, Axes]:
 
 def _edge(sheet: Sheet, motion: Motion | None) -> PathPatch:
     path = sheet.outline.path(sheet.moved_nodes(motion))
-    return PathPatch(path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False, zorder=3)
+    return PathPatch(path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False, zorder=1.5)
 
 
-def _colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
+def colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
     """A bar beside the map, its unit above it."""
     box = axes.get_position()
     place = drawn.add_axes((_BAR_LEFT, box.y0, _BAR, box.height), label="colour bar")
@@ -262,7 +268,8 @@ def _colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
     bar.outline.set_visible(False)
     bar.ax.tick_params(length=2, pad=2, labelsize=7.5, color=MUTED)
     bar.ax.set_title(scale.unit, fontsize=8, pad=6, loc="left", color=INK)
-    bar.solids.set_rasterized(True)
+    if bar.solids is not None:
+        bar.solids.set_rasterized(True)
     bar.ax.set_label("colour bar")
 
 

@@ -11,6 +11,8 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -35,7 +37,7 @@ DPI = 200
 QUALITY = 90
 """Of the pixel parts, out of 100."""
 
-_RC = {
+_RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each version
     "svg.fonttype": "none",
     "svg.hashsalt": "modeharvest",
     "font.size": 8.0,
@@ -110,6 +112,7 @@ def _diverging() -> Colormap:
 SIGNED = _diverging()
 SIZE = mpl.colormaps["viridis"]
 DENSITY = mpl.colormaps["magma"]
+GLOW = mpl.colormaps["inferno"]
 GREY = mpl.colormaps["gray"]
 
 
@@ -147,21 +150,16 @@ def to_svg(drawn: Figure, name: str, title: str) -> str:
     svg = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', svg)
     svg = svg.replace("url(#", f"url(#{name}-")
     svg = re.sub(r'xlink:href="#', f'href="#{name}-', svg).replace("xlink:href=", "href=")
-    svg = re.sub(r"font: ((?:[\w.]+ )*[\d.]+px) [^;\"]*", _font, svg)
+    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # it would be the page's, too
+    svg = re.sub(r"font: [^;\"]*?([\d.]+px)[^;\"]*", r"font-size: \1", svg)
+    svg = re.sub(r" ?font-family: [^;\"]*;?", "", svg)
     svg = re.sub(r' d="([^"]*)"', _rounded, svg)
     svg = re.sub(r'href="data:image/png;base64,([^"]*)"', _smaller, svg)
     svg = svg.replace(INK, "currentColor").replace(MUTED, "var(--muted)")
-    svg = re.sub(r"<svg [^>]*?(viewBox=\"[^\"]*\")[^>]*>", rf'<svg \1 role="img" aria-label="{title}">',
-                 svg, count=1, flags=re.DOTALL)  # fmt: skip
-    return svg
-
-
-def _font(found: re.Match[str]) -> str:
-    """The size alone; the family is the page's."""
-    *manner, size = found.group(1).split()
-    weight = [f"font-weight: {word}" for word in manner if word.isdigit() or word == "bold"]
-    slant = ["font-style: italic"] if "italic" in manner else []
-    return "; ".join([f"font-size: {size}", *weight, *slant])
+    box = re.search(r'viewBox="[^"]*"', svg)
+    assert box is not None, "matplotlib's SVG has a viewBox"
+    head = f'<svg {box.group()} role="img" aria-label="{escape(title)}">'
+    return head + svg[svg.index(">") + 1 :]
 
 
 def _rounded(found: re.Match[str]) -> str:

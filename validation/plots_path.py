@@ -1,0 +1,229 @@
+"""Curves: the load path, the eigenvalues, the spectral densities and the convergence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from modeharvest.idic.pattern import Pattern
+from modeharvest.idic.result import Result
+from modeharvest.idic.spectrum import Spectrum
+from modeharvest.validation.plots_fields import WIDTH, Scale, colour_bar
+from modeharvest.validation.style import BLUE, DENSITY, GOLD, GREEN, INK, MUTED, RED, figure, style
+
+FloatArray = NDArray[np.float64]
+
+CURVE = (4.6, 3.1)  # of a curve's picture [in]
+EIGENVALUES = 4  # curves of them
+_LOAD, _LOWEST = "reaction_N_per_mm", "lowest_eigenvalues_N_per_mm4"
+_LEVELS = (GOLD, GREEN, RED, BLUE)
+
+
+def draw_load(path: Mapping[str, Any], critical: float | None) -> Figure:
+    """Draw compressive force over nominal strain, unstable states dashed.
+
+    Parameters
+    ----------
+    path
+        ``Solution.info["path"]``: for each branch, lists over its states.
+    critical
+        Critical strain [-], None if there is none.
+    """
+    with style():
+        drawn, axes = _curve("nominal strain [%]", "force per thickness [N/mm]")
+        primary = path.get("primary", {})
+        strain, load = _column(primary, "nominal_strain"), _column(primary, _LOAD)
+        branching = np.nan
+        if strain.size:
+            stable = _stable_end(primary, critical)
+            if critical is not None:
+                branching = float(np.interp(critical, strain, load))
+                at = int(np.searchsorted(strain, critical))
+                strain, load = np.insert(strain, at, critical), np.insert(load, at, branching)
+            below, above = strain <= stable, strain >= stable
+            axes.plot(100 * strain[below], load[below], color=BLUE, marker="o", ms=3)
+            if above.sum() > 1:
+                axes.plot(100 * strain[above], load[above], color=BLUE, ls=(0, (3, 2)), marker="o",
+                          ms=3, mfc="none")  # fmt: skip
+                _say(axes, 100 * strain[-1], load[-1], "primary, unstable", BLUE, (-4, 6), "right")
+        for name, branch in path.items():
+            if name != "primary":
+                _branch(axes, name, branch, critical, branching)
+        if critical is not None and np.isfinite(branching):
+            axes.plot([100 * critical], [branching], "o", ms=8, mfc="none", mec=INK, mew=1.2)
+            _say(axes, 100 * critical, branching, f"critical, {100 * critical:.3f} %", INK,
+                 (-9, 3), "right")  # fmt: skip
+        axes.set(xlim=(0, None), ylim=(0, None))
+    return drawn
+
+
+def draw_eigenvalues(path: Mapping[str, Any], critical: Mapping[str, Any] | None) -> Figure:
+    """Draw the lowest eigenvalues of the tangent stiffness over nominal strain.
+
+    Parameters
+    ----------
+    path
+        ``Solution.info["path"]``.
+    critical
+        ``Solution.info["critical"]``, with the lowest eigenvalue at the states visited while
+        the critical strain was located.
+    """
+    with style():
+        drawn, axes = _curve("nominal strain [%]", "lowest eigenvalues [10⁻³ N/mm⁴]")
+        primary = path.get("primary", {})
+        strain = _column(primary, "nominal_strain")
+        ladder = _ladder(primary.get(_LOWEST, []))
+        axes.axhline(0.0, color=MUTED, lw=0.7)
+        for k in range(1, ladder.shape[1]):
+            axes.plot(100 * strain, 1e3 * ladder[:, k], color=BLUE, lw=1, alpha=0.75 - 0.15 * k)
+        extra = np.array((critical or {}).get("eigenvalues_N_per_mm4", [])).reshape(-1, 2)
+        first = np.concatenate([np.stack([strain, ladder[:, 0]], 1), extra])
+        first = np.unique(first[np.isfinite(first).all(axis=1)].round(12), axis=0)
+        axes.plot(100 * first[:, 0], 1e3 * first[:, 1], color=BLUE, lw=2, marker="o", ms=3)
+        if critical is not None:
+            at = 100 * critical["strain"]
+            axes.plot([at], [0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
+            _say(axes, at, 0.0, f"critical, {at:.3f} %", INK, (-6, -12), "right")
+        for name, branch in path.items():
+            if name == "primary":
+                continue
+            lowest = _ladder(branch.get(_LOWEST, []))[:, 0]
+            at_strain = _column(branch, "nominal_strain")
+            axes.plot(100 * at_strain, 1e3 * lowest, "s-", color=RED, ms=4.5)
+            if lowest.size and np.isfinite(lowest[-1]):
+                _say(axes, 100 * at_strain[-1], 1e3 * lowest[-1], f"{_words(name)}", RED, (2, -18),
+                     "right")  # fmt: skip
+        if first.size:
+            axes.set(xlim=(0, None))
+    return drawn
+
+
+def pattern_density(spectrum: Spectrum, pattern: Pattern) -> float:
+    """The larger of S_xx and S_yy at the pattern's wave vectors [mm⁶]; 0 without a pattern."""
+    peaks = [np.abs(spectrum.at(wave.xi)) ** 2 for wave in pattern.waves]
+    return float(np.max(peaks, initial=0.0))
+
+
+def draw_density(spectrum: Spectrum, pattern: Pattern, component: int, end: float) -> Figure:
+    """Draw S_xx (component 0) or S_yy (1) with the pattern's wave vectors ringed.
+
+    The colours end at ``end`` [mm⁶]; meant is the pattern's own density, so that it is seen
+    beside the lines that the specimen's edges leave on the axes. If 0, the largest peak's.
+    """
+    with style():
+        drawn = figure(WIDTH, WIDTH * 0.93)
+        axes = drawn.add_axes((0.15, 0.15, 0.66, 0.71))
+        xi1, xi2, *both = spectrum.window(1.0)
+        if not end > 0 and pattern.largest is not None:
+            end = pattern.largest.density
+        scale = Scale(DENSITY, 0.0, end if end > 0 else 1.0, "mm⁶", "max")
+        step = (xi1[1] - xi1[0], xi2[1] - xi2[0])
+        extent = (xi1[0] - step[0] / 2, xi1[-1] + step[0] / 2, xi2[0] - step[1] / 2,
+                  xi2[-1] + step[1] / 2)  # fmt: skip
+        axes.imshow(both[component], extent=extent, origin="lower", cmap=scale.colours,
+                    norm=scale.normalise, interpolation="bilinear", aspect="auto",
+                    rasterized=True)  # fmt: skip
+        for xi, how in _ringed(pattern):
+            for sign in (1, -1):
+                axes.plot([sign * xi[0]], [sign * xi[1]], "o", ms=13, mfc="none", mec="#7fd4ff",
+                          mew=1.1, ls="none", alpha=how)  # fmt: skip
+        ticks = [-1, -0.5, 0, 0.5, 1]
+        axes.set(xlim=(-1, 1), ylim=(-1, 1), xticks=ticks, yticks=ticks, xlabel="ξ₁ [1/l]")
+        axes.set_ylabel("ξ₂ [1/l]", labelpad=0)
+        colour_bar(drawn, axes, scale)
+    return drawn
+
+
+def draw_convergence(result: Result) -> Figure:
+    """Draw the size of each Gauss-Newton step; each level of the pyramid in its colour."""
+    with style():
+        drawn, axes = _curve("iteration", "step, rms [px]")
+        levels: list[list[tuple[int, float]]] = []
+        factors: list[int] = []
+        for k, step in enumerate(result.history, start=1):
+            if step.number == 1 or not levels:
+                levels.append([])
+                factors.append(step.factor)
+            levels[-1].append((k, step.step_px if step.step_px > 0 else np.nan))
+        for n, (factor, level) in enumerate(zip(factors, levels, strict=True)):
+            colour = _LEVELS[(n - len(levels)) % len(_LEVELS)]
+            k, size = np.array(level, dtype=float).T
+            axes.plot(k, size, "o-", color=colour, ms=3.5)
+            name = "full image" if factor == 1 else f"1/{factor}"
+            axes.axvspan(k[0] - 0.5, k[-1] + 0.5, color=colour, alpha=0.08, lw=0)
+            axes.annotate(name, (k.mean(), 1.0), (0, 3), xycoords=("data", "axes fraction"),
+                          textcoords="offset points", ha="center", fontsize=7, color=colour,
+                          annotation_clip=False)  # fmt: skip
+        if any(np.isfinite([s for level in levels for _, s in level])):
+            axes.set_yscale("log")
+        axes.set_xlim(0.5, len(result.history) + 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return drawn
+
+
+def _curve(x: str, y: str) -> tuple[Figure, Axes]:
+    width, height = CURVE
+    drawn = figure(width, height)
+    axes = drawn.add_axes((0.125, 0.15, 0.85, 0.77))
+    axes.set(xlabel=x, ylabel=y)
+    axes.grid(color=MUTED, alpha=0.18, lw=0.6)
+    axes.set_axisbelow(True)
+    return drawn, axes
+
+
+def _branch(
+    axes: Axes, name: str, branch: Mapping[str, Any], critical: float | None, branching: float
+) -> None:
+    """A buckled branch, from the critical point on."""
+    strain, load = _column(branch, "nominal_strain"), _column(branch, _LOAD)
+    if not strain.size:
+        return
+    axes.plot(100 * strain, load, "s", color=RED, ms=4.5)
+    if critical is not None:
+        strain, load = np.insert(strain, 0, critical), np.insert(load, 0, branching)
+    axes.plot(100 * strain, load, color=RED, lw=1.8)
+    _say(axes, 100 * strain[-1], load[-1], _words(name), RED, (2, -24), "right")
+
+
+def _words(name: str) -> str:
+    return f"{name.replace('+', ' (+)').replace('-', ' (−)')}, stable"
+
+
+def _say(axes: Axes, x: float, y: float, text: str, colour: str, shift: tuple[float, float],
+         side: str) -> None:  # fmt: skip
+    axes.annotate(text, (x, y), shift, textcoords="offset points", ha=side, color=colour,
+                  fontsize=7.5)  # fmt: skip
+
+
+def _column(branch: Mapping[str, Any], name: str) -> FloatArray:
+    return np.array(branch.get(name, []), dtype=np.float64)
+
+
+def _stable_end(primary: Mapping[str, Any], critical: float | None) -> float:
+    """The strain where the solid line ends."""
+    if critical is not None:
+        return critical
+    strain, pivots = _column(primary, "nominal_strain"), _column(primary, "negative_pivots")
+    return float(np.max(strain[pivots == 0], initial=0.0))
+
+
+def _ladder(lists: Sequence[Sequence[float]]) -> FloatArray:
+    """(states, EIGENVALUES) with NaN where fewer were computed."""
+    ladder = np.full((len(lists), EIGENVALUES), np.nan)
+    for row, values in zip(ladder, lists, strict=True):
+        n = min(EIGENVALUES, len(values))
+        row[:n] = values[:n]
+    return ladder
+
+
+def _ringed(pattern: Pattern) -> list[tuple[tuple[float, float], float]]:
+    """Wave vectors [1/l] and the opacity of their rings: faint where no pattern was found."""
+    if pattern.waves:
+        return [(wave.xi, 1.0) for wave in pattern.waves]
+    return [] if pattern.largest is None else [(pattern.largest.xi, 0.45)]

@@ -1,0 +1,175 @@
+"""What the report says in words and tables, taken from the summary alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from modeharvest.idic.equivalents import REFERENCE_MODE
+
+Snapshot = Mapping[str, Any]
+
+_NUMBERS = (
+    ("negative pivots of the tangent stiffness", "–", "negative_pivots"),
+    ("pattern v₁φ₁, largest length", "px", "pattern_amplitude_px"),
+    ("… without the outermost ring of cells", "px", "pattern_inner_px"),
+    ("… in the four corner cells", "px", "pattern_corners_px"),
+    ("w = truth − IDIC, rms", "px", "rms_w_px"),
+    ("truth − best fit, rms: what the model can't say", "px", "rms_best_fit_px"),
+    ("IDIC − best fit, rms: what the measurement loses", "px", "rms_idic_to_best_fit_px"),
+    ("residual, rms", "of full scale", "rms_residual"),
+    ("pixels compared", "–", "pixels"),
+    ("iterations on the full image", "–", "iterations"),
+    ("iterations on all levels", "–", "iterations_all_levels"),
+    ("condition number", "–", "condition_number"),
+    ("outcome", "", "outcome"),
+)
+_MODE = (("a₁", "–"), ("a₂", "–"), ("a₃", "–"), ("a₄", "–"), ("a₅", "–"), ("a₆", "mm"),
+         ("a₇", "mm"))  # fmt: skip
+_DETAILS = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}
+
+
+def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The few numbers at the top: what they are called, the number, its unit, a remark."""
+    last = summary["snapshots"][-1]
+    at = f"at {100 * last['nominal_strain']:.4g} %"
+    critical = summary.get("critical_strain")
+    expected = summary.get("expected", [])
+    met = sum(bool(row["ok"]) for row in expected)
+    return [
+        _key("critical strain", None if critical is None else 100 * critical, "%",
+             "none found" if critical is None else "where the pattern sets in", 4),
+        _key("pattern", last["pattern_amplitude_px"], "px", f"largest v₁φ₁ {at}", 3),
+        _key("mode off the ideal", _worst(last), "%", f"the worst of a₁ … a₇ {at}", 2),
+        _key("best possible fit", last["rms_best_fit_px"], "px", "rms, what the model can't say",
+             3),
+        _key("IDIC − best fit", last["rms_idic_to_best_fit_px"], "px",
+             "rms, what the measurement loses", 2),
+        {"name": "expected values met", "value": f"{met} of {len(expected)}" if expected else "–",
+         "unit": "", "remark": "table below" if expected else "none known for this specimen"},
+    ]  # fmt: skip
+
+
+def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the table of numbers: label, unit, a value for each snapshot."""
+    snapshots = summary["snapshots"]
+    return [
+        {"label": label, "unit": unit, "values": [s.get(key) for s in snapshots]}
+        for label, unit, key in _NUMBERS
+        if any(key in s for s in snapshots)
+    ]
+
+
+def mode_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the mode's parameters: for each snapshot value, standard error and best fit."""
+    snapshots = [s for s in summary["snapshots"] if len(s.get("mode", ())) == len(_MODE)]
+    return [
+        {"name": name, "unit": unit, "ideal": REFERENCE_MODE[k],
+         "cells": [{"value": s["mode"][k], "error": _item(s.get("mode_standard_error"), k),
+                    "best": _item(s.get("mode_best_fit"), k)} for s in snapshots]}
+        for k, (name, unit) in enumerate(_MODE) if snapshots
+    ]  # fmt: skip
+
+
+def fact(key: str, snapshot: Snapshot) -> str:
+    """One line of numbers under the picture of a panel; empty if there is nothing to add."""
+    if key in _DETAILS:
+        details = snapshot.get("details_px", {}).get(_DETAILS[key])
+        if details is None:
+            return ""
+        return (
+            f"rms {details['rms_per_component']:.3g} px per component; lengths: median "
+            f"{details['median_length']:.3g} px, largest {details['max_length']:.3g} px"
+        )
+    if key == "residual":
+        return f"rms {snapshot['rms_residual']:.3g} of full scale"
+    if key == "v1" and "pattern_inner_px" in snapshot:
+        return (
+            f"v₁φ₁: at most {snapshot['pattern_inner_px']:.3g} px inside, "
+            f"{snapshot['pattern_corners_px']:.3g} px in the corner cells"
+        )
+    return ""
+
+
+def notes(summary: Mapping[str, Any]) -> list[str]:
+    """What a reader should know before trusting the numbers, drawn from the data."""
+    said = [_expected(summary.get("expected", []))]
+    if str(summary.get("simulation_outcome") or "complete") != "complete":
+        said.append(f"The simulation is {summary['simulation_outcome']}.")
+    for snapshot in summary["snapshots"]:
+        said += _about(snapshot)
+    said += [
+        "Standard errors take the whole residual for white noise in both images. There is no "
+        "noise in these images: the residual is what the ansatz can't say, so a standard error "
+        "tells how firmly the images hold a parameter, not how far it is from the truth. The best "
+        "fit beside it does.",
+        "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
+        "gradient and leaves out the rims of the holes: even without any noise the two differ.",
+        "rms is per component: the root of the mean square over both components of all material "
+        "pixels. The rms length of the vectors is √2 times that.",
+    ]
+    if summary.get("expected"):
+        said.append(
+            "The paper does not give its material constants and prints fields, not numbers. The "
+            "expected values come from an independent calculation with this project's choice of "
+            "material."
+        )
+    return said
+
+
+def _expected(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return "No expected values are known for this specimen: nothing to compare with."
+    missed = [
+        f"{row['quantity']}: expected {row['expected']}, obtained {row['obtained']:.4g} "
+        f"{row['unit']}"
+        for row in rows
+        if not row["ok"]
+    ]
+    if missed:
+        return f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."
+    return f"All {len(rows)} expected values are met."
+
+
+def _about(snapshot: Snapshot) -> list[str]:
+    """Warnings about one snapshot."""
+    at = f"At {100 * snapshot['nominal_strain']:.4g} %"
+    said = []
+    if snapshot.get("negative_pivots"):
+        said.append(
+            f"{at} the state is unstable ({snapshot['negative_pivots']} negative pivots): a real "
+            "specimen would not be found in it."
+        )
+    if snapshot["outcome"] != "converged":
+        said.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
+                    f"{snapshot['outcome_why']}")  # fmt: skip
+    if snapshot.get("undetermined"):
+        said.append(f"{at} the images say nothing about {', '.join(snapshot['undetermined'])}.")
+    inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
+    if inner is not None and corners is not None and inner < corners:
+        said.append(
+            f"{at} there is no pattern to be observed: v₁φ₁ is at most {inner:.2g} px inside. The "
+            f"mode's parameters (up to {_worst(snapshot):.0f} % off the ideal) describe the edge "
+            f"effect in the corner cells ({corners:.2g} px) that the mode takes up, as in the "
+            "paper; the best fit to the truth does the same."
+        )
+    return said
+
+
+def _worst(snapshot: Snapshot) -> float:
+    """Largest deviation of a mode parameter from the ideal [%]; NaN without a mode."""
+    return max((abs(v) for v in snapshot.get("mode_deviation_percent", ())), default=float("nan"))
+
+
+def _item(values: Sequence[float | None] | None, k: int) -> float | None:
+    return None if values is None else values[k]
+
+
+def _key(name: str, value: float | None, unit: str, remark: str, digits: int) -> dict[str, str]:
+    known = value is not None and value == value
+    return {
+        "name": name,
+        "value": f"{value:.{digits}g}" if known else "–",
+        "unit": unit if known else "",
+        "remark": remark,
+    }
