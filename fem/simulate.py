@@ -14,7 +14,9 @@ from petsc4py import PETSc
 
 from modeharvest import __version__
 from modeharvest.fem import dolfinx_api
-from modeharvest.fem.continuation import Critical, State, Walker
+from modeharvest.fem.branching import follow_branch
+from modeharvest.fem.continuation import State, Walker
+from modeharvest.fem.critical import Critical, locate_critical
 from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
@@ -55,7 +57,7 @@ class _Run:
         self.walker.primary(path, strains, until_unstable=perfect, refuse_unstable=not perfect)
         critical, branches = None, {}
         if path[-1].negative_pivots > 0:
-            critical = self.walker.locate_critical(path[-2], path[-1])
+            critical = locate_critical(self.walker, path[-2], path[-1])
             self.walker.primary(path, strains)
             if critical is not None:
                 branches = self._branches(self._oriented(critical))
@@ -115,7 +117,7 @@ class _Run:
         pitch = self.experiment.specimen.pitch
         signs = {"buckled+": 1, "buckled-": -1}
         wanted = [b for b in self.experiment.branches if b in signs]
-        return {b: self.walker.branch(critical, targets, signs[b], pitch) for b in wanted}
+        return {b: follow_branch(self.walker, critical, targets, signs[b], pitch) for b in wanted}
 
     def _snapshots(
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]

@@ -11,7 +11,9 @@ import pytest
 import scipy.linalg
 from fem_bodies import FloatArray, column, vector_of
 
-from modeharvest.fem.continuation import Critical, State, Walker, _hermite
+from modeharvest.fem.branching import follow_branch
+from modeharvest.fem.continuation import State, Walker, hermite_weights
+from modeharvest.fem.critical import Critical, locate_critical
 from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.materials import Material, Ogden
@@ -97,7 +99,7 @@ def buckled_column(slenderness: float, material: Material = NO_POISSON) -> Buckl
     walker = Walker(structure, PathOptions(0.4 * euler, 0.4 * euler))
     path = [walker.start()]
     assert walker.primary(path, [1.5 * euler], until_unstable=True)
-    critical = walker.locate_critical(path[-2], path[-1])
+    critical = locate_critical(walker, path[-2], path[-1])
     assert critical is not None
     return Buckled(walker, path, critical, euler)
 
@@ -139,8 +141,8 @@ def test_buckled_column_is_stable_lower_and_as_deep_as_the_elastica() -> None:
     c = buckled_column(length)
     walker, structure = c.walker, c.walker.structure
     targets = [1.2 * c.euler, 1.8 * c.euler]  # the next mode comes at 2.05
-    up = walker.branch(c.critical, targets, 1, 1.0)
-    down = walker.branch(c.critical, targets, -1, 1.0)
+    up = follow_branch(walker, c.critical, targets, 1, 1.0)
+    down = follow_branch(walker, c.critical, targets, -1, 1.0)
     straight = [walker.start()]
     assert walker.primary(straight, targets)
     middle = np.argmin(np.linalg.norm(structure.mesh.nodes, axis=1))
@@ -163,7 +165,7 @@ def test_critical_strain_does_not_depend_on_the_steps() -> None:
     walker = Walker(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
     path = [walker.start()]
     walker.primary(path, [1.5 * reference.euler], until_unstable=True)
-    critical = walker.locate_critical(path[-2], path[-1])
+    critical = locate_critical(walker, path[-2], path[-1])
     assert critical is not None
     assert critical.strain == pytest.approx(reference.critical.strain, abs=2e-7)
 
@@ -181,7 +183,7 @@ def test_tangent_is_the_derivative_of_the_path_and_predicts_with_order_four() ->
     for h in steps:
         low, high = at[round(centre - h, 9)], at[round(centre + h, 9)]
         slopes.append(((high.u - low.u) * (0.5 / h) - middle.tangent).norm())
-        w = _hermite(low.strain, high.strain, centre)
+        w = hermite_weights(low.strain, high.strain, centre)
         guess = low.u * w[0] + low.tangent * w[1] + high.u * w[2] + high.tangent * w[3]
         predictions.append((guess - middle.u).norm())
     np.testing.assert_allclose(np.log2(np.divide(slopes[:-1], slopes[1:])), 2.0, atol=0.2)
@@ -193,6 +195,6 @@ def test_hermite_weights_reproduce_cubics() -> None:
     slope = value.deriv()
     a, b = 0.4, 1.1
     for at in (0.4, 0.7, 1.1, 1.6):
-        w = _hermite(a, b, at)
+        w = hermite_weights(a, b, at)
         got = w[0] * value(a) + w[1] * slope(a) + w[2] * value(b) + w[3] * slope(b)
         assert got == pytest.approx(value(at), rel=1e-12)
