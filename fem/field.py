@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.files import atomic
+from modeharvest.files import atomic, atomic_hdf5
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -141,13 +141,7 @@ class Solution:
 
     def write(self, path: Path | str) -> None:
         """Write HDF5, atomically; displacements and nodes are stored losslessly."""
-        with atomic(path) as temporary:
-            temporary.write_bytes(self._as_hdf5())
-
-    def _as_hdf5(self) -> bytes:
-        # In memory first: on a full disk HDF5 can't close its file and complains at exit.
-        memory = io.BytesIO()
-        with h5py.File(memory, "w") as file:
+        with atomic_hdf5(path) as file:
             file.attrs["format"] = FORMAT
             file.attrs["element"] = self.mesh.element
             file.attrs["info"] = json.dumps(dict(self.info))
@@ -167,7 +161,6 @@ class Solution:
                 )
                 group.attrs["eigenvalues"] = np.asarray(s.eigenvalues, dtype=np.float64)
                 group.attrs["branch"] = s.branch
-        return memory.getvalue()
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from modeharvest.errors import InputError
-from modeharvest.files import atomic
+from modeharvest.files import atomic_hdf5
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.render import Truth
 
@@ -40,7 +40,7 @@ _CHUNK_ROWS = 64
 
 def write_truth(path: Path | str, truth: Truth, nominal_strain: float, grid: PixelGrid) -> None:
     """Write a truth file, whole or not at all."""
-    with atomic(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_hdf5(path) as file:
         file.attrs["format"] = FORMAT
         file.attrs["nominal_strain"] = nominal_strain
         for name, value in asdict(grid).items():

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import h5py
 
 from modeharvest.errors import InputError
 
@@ -35,6 +38,20 @@ def atomic(path: Path | str) -> Iterator[Path]:
         raise InputError(f"could not write {path}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file that appears at ``path`` when the block has succeeded.
+
+    It is made in memory first: on a full disk HDF5 can't close a file of its own and complains
+    about it until the program ends.
+    """
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as file:
+        yield file
+    with atomic(path) as temporary:
+        temporary.write_bytes(memory.getvalue())
 
 
 def write_json(path: Path | str, content: Any) -> None:
