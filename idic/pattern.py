@@ -19,7 +19,7 @@ MOST_WAVES = 4
 """No more peaks than this are fitted as waves."""
 SMALLEST_AMPLITUDE = 0.005
 """Mean amplitude of the strongest wave [l] below which there is no pattern."""
-SMALLEST_CONTRAST = 50.0
+SMALLEST_CONTRAST = 100.0
 """Least ratio of a pattern's peak to the median density of the wave vectors searched."""
 SAME_AMPLITUDE = 1.25
 """Largest ratio of two amplitudes that are called equal."""
