@@ -112,15 +112,16 @@ def correlate(
     f_mask, g_mask = _mask(mask, "mask", grid), _mask(deformed_mask, "deformed mask", grid)
     _check_grey_levels(f, f_mask, "reference")
     _check_grey_levels(g, g_mask, "deformed")
-    a = ansatz.checked(start)
+    a = before = ansatz.checked(start)
     levels = _useful(options.levels, ansatz, grid)
     history: tuple[Iteration, ...] = ()
     for k, level in enumerate(levels):
         pair = prepare(f, g, grid, f_mask, g_mask, level, options.edge_px, options.order)
         clock.lap(f"prepare level {level.factor}")
         finest = k == len(levels) - 1
+        before = _better(pair, ansatz, a, before)
         found = _minimise_pair(
-            pair, ansatz, a, level.factor, finest, options.gauss_newton,
+            pair, ansatz, before, level.factor, finest, options.gauss_newton,
             _reporter(progress, k, len(levels), options.gauss_newton),
         )  # fmt: skip
         clock.lap(f"iterate level {level.factor}")
@@ -224,6 +225,19 @@ def _minimise_pair(
             break
         start = found.unknowns
     return replace(found, history=history)
+
+
+def _better(pair: Pair, ansatz: Ansatz, a: FloatArray, before: FloatArray) -> FloatArray:
+    """Choose what fits this level better: the last level's unknowns, or those it began with.
+
+    A speckle that is too fine for a coarse blur leaves no information there, and the level
+    leads astray; this takes its steps back.
+    """
+    if a is before:
+        return a
+    assembly = Assembly(ansatz, pair.grid, pair.mask)
+    fit = partial(assembly.images, reference=pair.reference, deformed=pair.deformed)
+    return a if fit(a).mean_square <= fit(before).mean_square else before
 
 
 def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
