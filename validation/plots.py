@@ -7,7 +7,7 @@ itself is in :mod:`modeharvest.validation.plots_fields` and ``plots_path``.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,8 +19,9 @@ from modeharvest.idic.pattern import Pattern
 from modeharvest.idic.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.validation import plots_fields as fields
-from modeharvest.validation.plots_fields import Motion, Scale, Sheet
+from modeharvest.validation.plots_fields import Scale
 from modeharvest.validation.plots_path import draw_density, pattern_density
+from modeharvest.validation.sheet import Motion, Sheet
 from modeharvest.validation.style import GLOW
 from modeharvest.validation.truth import Comparison
 
@@ -123,7 +124,7 @@ def _image(atlas: Atlas, k: int) -> Figure:
     images, strain = atlas.images, atlas.comparisons[k].strain
     return fields.draw_image(
         atlas.sheet, images.deformed(strain), images.deformed_mask(strain), images.grid,
-        max(1, atlas.sheet.factor // 2),
+        atlas.solution.at(strain).displacement,
     )  # fmt: skip
 
 
@@ -140,8 +141,12 @@ def _v0(component: int) -> Callable[[Atlas, int], Figure]:
 
 
 def _v1(atlas: Atlas, k: int) -> Figure:
-    v1 = UM * atlas.comparisons[k].result.v(grid=atlas.sheet.grid)
-    return fields.draw_field(atlas.sheet, v1, Scale.signed(_seen(atlas, v1), "µm"))
+    result, grid = atlas.comparisons[k].result, atlas.sheet.grid
+    taper = result.ansatz.modes[0].taper
+    support = taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :]
+    v1 = np.where(support > 0.0, UM * result.v(grid=grid), np.nan)
+    inside = _seen(atlas, np.where(support == 1.0, v1, np.nan))
+    return fields.draw_field(atlas.sheet, v1, replace(Scale.signed(inside, "µm"), extend="both"))
 
 
 def _phi1(atlas: Atlas, k: int) -> Figure:
@@ -229,14 +234,15 @@ PANELS = (
     ),
     Panel(
         "v0y", "v<sub>0</sub> · e<sub>y</sub>", "Smooth field along y", "virt (b) and (j)",
-        "Lateral expansion before buckling; after it, the auxetic effect draws the sides in "
-        "towards the middle.",
+        "Lateral expansion before buckling. The pattern, once it is there, undoes it near the "
+        "specimen's centre: the auxetic effect. The far edges still expand.",
         _v0(1),
     ),
     Panel(
         "v1", "v<sub>1</sub>", "Amplitude of the mode", "virt (c) and (k)",
-        "Where the pattern lives. The values are large because φ<sub>1</sub> is scaled to 0.04. "
-        "Near the corners it also takes up part of the edge effect.",
+        "Where the pattern lives; blank where φ<sub>1</sub> is zero and v<sub>1</sub> means "
+        "nothing. The values are large because φ<sub>1</sub> is scaled to 0.04. Near the corners "
+        "it also takes up part of the edge effect.",
         _v1, True,
     ),
     Panel(
@@ -269,7 +275,7 @@ PANELS = (
     ),
     Panel(
         "best", "‖u − u<sub>best</sub>‖", "What the model can't say", "",
-        "Truth − best fit of the same 77 unknowns to the true displacement: no measurement with "
+        "Truth − best fit of the same unknowns to the true displacement: no measurement with "
         "this ansatz can do better.",
         _length_of("best_error"),
     ),

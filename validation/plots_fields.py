@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,11 +11,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.outline import Outline
+from modeharvest.validation.sheet import Motion, Sheet
 from modeharvest.validation.style import (
     BLUE,
     EDGE,
@@ -31,11 +31,9 @@ from modeharvest.validation.style import (
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-Motion = Callable[[FloatArray, FloatArray], FloatArray]
-"""(..., 2) displacement [mm] at positions x, y [mm] that broadcast together."""
 
-WIDTH = 3.0  # of a map with its colour bar [in]
-_MAP, _BAR_LEFT, _BAR = 0.80, 0.855, 0.03  # shares of the width
+WIDTH = 2.35  # of a map with its colour bar [in]
+_MAP, _BAR_LEFT, _BAR = 0.76, 0.79, 0.03  # shares of the width
 _BELOW, _ABOVE = 0.24, 0.22  # for the scale bar and the unit [in]
 
 
@@ -79,72 +77,6 @@ class Scale:
         return Normalize(self.low, self.high)
 
 
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """What all maps of a specimen share, so that they can be laid over each other.
-
-    Parameters
-    ----------
-    outline
-        Of the specimen.
-    grid
-        The images' pixels joined to the cells that are drawn.
-    factor
-        Pixels joined, in each direction.
-    limits
-        (left, right, bottom, top) of every map [mm].
-    """
-
-    outline: Outline
-    grid: PixelGrid
-    factor: int
-    limits: tuple[float, float, float, float]
-
-    @classmethod
-    def of(cls, mesh: Mesh, grid: PixelGrid, cells: int = 360) -> Sheet:
-        """Make a sheet for a mesh, with about that many cells along the longer side."""
-        factor = max(1, round(max(grid.shape) / cells))
-        (left, bottom), (right, top) = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-        margin = 0.012 * max(right - left, top - bottom)
-        limits = (left - margin, right + margin, bottom - margin, top + margin)
-        return cls(Outline.of(mesh), grid.binned(factor), factor, limits)
-
-    def average(self, field: FloatArray) -> FloatArray:
-        """Average a field (rows, cols) of the images over the cells, NaN left out."""
-        rows, cols = self.grid.shape
-        n = self.factor
-        blocks = field[: rows * n, : cols * n].reshape(rows, n, cols, n)
-        known = np.isfinite(blocks)
-        count = known.sum(axis=(1, 3))
-        total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-    def sample(self, field: FloatArray) -> FloatArray:
-        """Take the middle pixel of each cell from a field (rows, cols) of the images."""
-        rows, cols = self.grid.shape
-        n, middle = self.factor, self.factor // 2
-        return field[middle : rows * n : n, middle : cols * n : n]
-
-    def moved_nodes(self, motion: Motion | None) -> FloatArray | None:
-        """(n, 2) displacement of the mesh's nodes [mm]."""
-        if motion is None:
-            return None
-        x, y = self.outline.nodes.T
-        return motion(x[:, None], y[:, None])[:, 0]
-
-    def moved_corners(self, motion: Motion | None) -> tuple[FloatArray, FloatArray]:
-        """(rows + 1, cols + 1) positions of the cells' corners [mm], none off the specimen."""
-        h = 0.5 * self.grid.pixel_size
-        low, high = self.outline.nodes.min(axis=0), self.outline.nodes.max(axis=0)
-        x = np.clip(np.append(self.grid.x - h, self.grid.x[-1] + h), low[0], high[0])
-        y = np.clip(np.append(self.grid.y + h, self.grid.y[-1] - h), low[1], high[1])
-        X, Y = np.meshgrid(x, y)
-        if motion is None:
-            return X, Y
-        u = motion(x[None, :], y[:, None])
-        return X + u[..., 0], Y + u[..., 1]
-
-
 def draw_field(
     sheet: Sheet, values: FloatArray, scale: Scale, motion: Motion | None = None
 ) -> Figure:
@@ -173,27 +105,30 @@ def draw_field(
     return drawn
 
 
-def draw_image(sheet: Sheet, image: NDArray[np.float32], material: BoolArray, grid: PixelGrid,
-               joined: int) -> Figure:  # fmt: skip
+def draw_image(
+    sheet: Sheet,
+    image: NDArray[np.float32],
+    material: BoolArray,
+    grid: PixelGrid,
+    displacement: FloatArray,
+) -> Figure:
     """Draw an image, its background left to the page.
 
     Parameters
     ----------
     sheet
-        Frame.
+        Frame and outline.
     image, material
         (rows, cols) grey levels [fraction of full scale] and where they show material.
     grid
         Their pixels.
-    joined
-        Pixels averaged in each direction.
+    displacement
+        (n, 2) true displacement at the mesh's nodes [mm], for the outline.
     """
     with style():
         drawn, axes = _map(sheet)
-        rgba, coarse = _grey(image, material, grid, joined)
-        axes.imshow(rgba, extent=coarse.extent, interpolation="antialiased", rasterized=True,
-                    aspect="auto")  # fmt: skip
-        axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
+        _show_grey(axes, sheet, image, material, grid)
+        axes.add_patch(_outlined(sheet.outline.path(displacement)))
         colour_bar(drawn, axes, Scale(GREY, 0.0, 1.0, "–"))
     return drawn
 
@@ -221,10 +156,8 @@ def draw_blend(
 ) -> Figure:
     """Let the deformed image dissolve, from left to right, into what was measured in it."""
     with style():
-        drawn, axes = _map(sheet, width=4.2)
-        rgba, coarse = _grey(image, material, grid, max(1, sheet.factor // 2))
-        axes.imshow(rgba, extent=coarse.extent, interpolation="antialiased", rasterized=True,
-                    aspect="auto")  # fmt: skip
+        drawn, axes = _map(sheet, width=3.2)
+        _show_grey(axes, sheet, image, material, grid)
         edge = _edge(sheet, motion)
         axes.add_patch(edge)
         X, Y = sheet.moved_corners(motion)
@@ -235,7 +168,6 @@ def draw_blend(
                                 norm=scale.normalise, alpha=opacity**2 * (3 - 2 * opacity),
                                 rasterized=True, linewidth=0, antialiased=False)  # fmt: skip
         quads.set_clip_path(edge)
-        axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
         colour_bar(drawn, axes, scale)
     return drawn
 
@@ -255,7 +187,10 @@ def _map(sheet: Sheet, width: float = WIDTH) -> tuple[Figure, Axes]:
 
 
 def _edge(sheet: Sheet, motion: Motion | None) -> PathPatch:
-    path = sheet.outline.path(sheet.moved_nodes(motion))
+    return _outlined(sheet.outline.path(sheet.moved_nodes(motion)))
+
+
+def _outlined(path: Path) -> PathPatch:
     return PathPatch(path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False, zorder=1.5)
 
 
@@ -273,22 +208,25 @@ def colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
     bar.ax.set_label("colour bar")
 
 
-def _grey(
-    image: NDArray[np.float32], material: BoolArray, grid: PixelGrid, joined: int
-) -> tuple[FloatArray, PixelGrid]:
-    """(rows, cols, 4) averages over blocks of pixels; background transparent."""
+def _show_grey(
+    axes: Axes, sheet: Sheet, image: NDArray[np.float32], material: BoolArray, grid: PixelGrid
+) -> None:
+    """Show an image averaged over blocks of pixels, its background transparent."""
+    joined = max(1, sheet.factor // 2)
     coarse = grid.binned(joined)
     rows, cols = coarse.shape
 
-    def blocks(a: NDArray[np.float64]) -> FloatArray:
+    def blocks(a: NDArray[Any]) -> FloatArray:
         part = a[: rows * joined, : cols * joined].reshape(rows, joined, cols, joined)
-        return np.asarray(part.mean(axis=(1, 3)))
+        return np.asarray(part.mean(axis=(1, 3), dtype=np.float64))
 
-    cover = blocks(material.astype(np.float64))
+    cover = blocks(material)
     level = blocks(np.where(material, image, 0.0)) / np.maximum(cover, 1e-9)
     rgba = np.repeat(np.clip(level, 0.0, 1.0)[..., None], 4, axis=2)
     rgba[..., 3] = cover
-    return np.nan_to_num(rgba), coarse
+    axes.imshow(np.nan_to_num(rgba), extent=coarse.extent, interpolation="antialiased",
+                rasterized=True, aspect="auto")  # fmt: skip
+    axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
 
 
 def _quantile(values: FloatArray, share: float) -> float:

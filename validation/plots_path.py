@@ -19,7 +19,7 @@ from modeharvest.validation.style import BLUE, DENSITY, GOLD, GREEN, INK, MUTED,
 
 FloatArray = NDArray[np.float64]
 
-CURVE = (4.6, 3.1)  # of a curve's picture [in]
+CURVE = (5.2, 3.3)  # of a curve's picture [in]
 EIGENVALUES = 4  # curves of them
 _LOAD, _LOWEST = "reaction_N_per_mm", "lowest_eigenvalues_N_per_mm4"
 _LEVELS = (GOLD, GREEN, RED, BLUE)
@@ -89,16 +89,13 @@ def draw_eigenvalues(path: Mapping[str, Any], critical: Mapping[str, Any] | None
         if critical is not None:
             at = 100 * critical["strain"]
             axes.plot([at], [0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
-            _say(axes, at, 0.0, f"critical, {at:.3f} %", INK, (-6, -12), "right")
+            _say(axes, at, 0.0, f"critical, {at:.3f} %", INK, (-8, -13), "right")
         for name, branch in path.items():
             if name == "primary":
                 continue
             lowest = _ladder(branch.get(_LOWEST, []))[:, 0]
             at_strain = _column(branch, "nominal_strain")
             axes.plot(100 * at_strain, 1e3 * lowest, "s-", color=RED, ms=4.5)
-            if lowest.size and np.isfinite(lowest[-1]):
-                _say(axes, 100 * at_strain[-1], 1e3 * lowest[-1], f"{_words(name)}", RED, (2, -18),
-                     "right")  # fmt: skip
         if first.size:
             axes.set(xlim=(0, None))
     return drawn
@@ -117,8 +114,8 @@ def draw_density(spectrum: Spectrum, pattern: Pattern, component: int, end: floa
     beside the lines that the specimen's edges leave on the axes. If 0, the largest peak's.
     """
     with style():
-        drawn = figure(WIDTH, WIDTH * 0.93)
-        axes = drawn.add_axes((0.15, 0.15, 0.66, 0.71))
+        drawn = figure(WIDTH, WIDTH * 0.84)
+        axes = drawn.add_axes((0.17, 0.165, 0.59, 0.70))
         xi1, xi2, *both = spectrum.window(1.0)
         if not end > 0 and pattern.largest is not None:
             end = pattern.largest.density
@@ -131,10 +128,11 @@ def draw_density(spectrum: Spectrum, pattern: Pattern, component: int, end: floa
                     rasterized=True)  # fmt: skip
         for xi, how in _ringed(pattern):
             for sign in (1, -1):
-                axes.plot([sign * xi[0]], [sign * xi[1]], "o", ms=13, mfc="none", mec="#7fd4ff",
+                axes.plot([sign * xi[0]], [sign * xi[1]], "o", ms=11, mfc="none", mec="#7fd4ff",
                           mew=1.1, ls="none", alpha=how)  # fmt: skip
-        ticks = [-1, -0.5, 0, 0.5, 1]
+        ticks = [-1.0, -0.5, 0.0, 0.5, 1.0]
         axes.set(xlim=(-1, 1), ylim=(-1, 1), xticks=ticks, yticks=ticks, xlabel="ξ₁ [1/l]")
+        axes.tick_params(labelsize=7)
         axes.set_ylabel("ξ₂ [1/l]", labelpad=0)
         colour_bar(drawn, axes, scale)
     return drawn
@@ -170,7 +168,7 @@ def draw_convergence(result: Result) -> Figure:
 def _curve(x: str, y: str) -> tuple[Figure, Axes]:
     width, height = CURVE
     drawn = figure(width, height)
-    axes = drawn.add_axes((0.125, 0.15, 0.85, 0.77))
+    axes = drawn.add_axes((0.11, 0.14, 0.87, 0.80))
     axes.set(xlabel=x, ylabel=y)
     axes.grid(color=MUTED, alpha=0.18, lw=0.6)
     axes.set_axisbelow(True)
@@ -188,7 +186,7 @@ def _branch(
     if critical is not None:
         strain, load = np.insert(strain, 0, critical), np.insert(load, 0, branching)
     axes.plot(100 * strain, load, color=RED, lw=1.8)
-    _say(axes, 100 * strain[-1], load[-1], _words(name), RED, (2, -24), "right")
+    _say(axes, 100 * strain[-1], load[-1], _words(name), RED, (4, -32), "right")
 
 
 def _words(name: str) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
@@ -164,7 +164,9 @@ def _heading(snapshot: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
             "branch": snapshot["branch"]}  # fmt: skip
 
 
-def _picture(key: str, title: str, heading: Mapping[str, str], drawn: Figure, fact: str = "") -> Picture:
+def _picture(
+    key: str, title: str, heading: Mapping[str, str], drawn: Figure, fact: str = ""
+) -> Picture:
     name = f"{key}-{heading['id']}"
     label = f"{heading['state']} · {heading['strain']}"
     return Picture(name, label, to_svg(drawn, name, f"{title}, {label}"), fact)
@@ -176,7 +178,7 @@ def _environment() -> jinja2.Environment:
         loader=jinja2.FileSystemLoader(folder), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters["short"] = short
+    environment.filters |= {"short": short, "fixed": fixed}
     return environment
 
 
@@ -184,14 +186,19 @@ def short(value: Any) -> str:
     """A number as a reader wants it: three or four digits, a true minus, powers of ten raised."""
     if value is None:
         return "–"
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
         return str(value)
-    if not np.isfinite(value):
+    if not isfinite(value):
         return "∞" if value > 0 else "–"
-    if isinstance(value, (int, np.integer)) or float(value).is_integer() and abs(value) < 1e6:
-        return f"{int(value):,}".replace(",", " ").replace("-", "−")
+    if value == int(value) and abs(value) < 1e9:
+        return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
     if 1e-3 <= abs(value) < 1e5:
         return f"{value:.4g}".replace("-", "−")
     digits, power = f"{value:.1e}".split("e")
     raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{digits} · 10{raised}".replace("-", "−")
+
+
+def fixed(value: float) -> str:
+    """Five decimals with a true minus, and no minus before a zero."""
+    return f"{round(value, 5) + 0.0:.5f}".replace("-", "−")

@@ -31,8 +31,8 @@ BLUE, RED, GREEN, GOLD = "#3987e5", "#e0603f", "#2a9d74", "#d99a1f"
 """For curves; of a middle lightness, to be read on light and on dark."""
 EDGE = "#70757d"
 """For outlines."""
-DPI = 200
-"""Of the pixel parts; a picture of 3 in is 600 px wide."""
+DPI = 260
+"""Of the pixel parts; a picture of 2.35 in is 611 px wide."""
 
 QUALITY = 90
 """Of the pixel parts, out of 100."""

@@ -17,7 +17,7 @@ _NUMBERS = (
     ("w = truth − IDIC, rms", "px", "rms_w_px"),
     ("truth − best fit, rms: what the model can't say", "px", "rms_best_fit_px"),
     ("IDIC − best fit, rms: what the measurement loses", "px", "rms_idic_to_best_fit_px"),
-    ("residual, rms", "of full scale", "rms_residual"),
+    ("residual, rms, as a fraction of full scale", "–", "rms_residual"),
     ("pixels compared", "–", "pixels"),
     ("iterations on the full image", "–", "iterations"),
     ("iterations on all levels", "–", "iterations_all_levels"),
