@@ -84,7 +84,7 @@ class CosinePattern:
         total = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for (kx, ky), phase in zip(self.wave_vectors, self.phases, strict=True):
             total += np.cos(kx * x + ky * y + phase)
-        return total / np.sqrt(len(self.phases))
+        return np.asarray(total) / np.sqrt(len(self.phases))
 
 
 def image_pair(
