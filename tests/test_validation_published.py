@@ -1,0 +1,70 @@
+"""Verdicts against the expected values: each is computed, and each can fail."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from modeharvest.validation.published import expectations
+
+
+def snapshot(strain: float, **changes: Any) -> dict[str, Any]:
+    sound = {
+        "nominal_strain": strain,
+        "negative_pivots": 0,
+        "pattern_amplitude_px": 28.0,
+        "pattern_inner_px": 0.5,
+        "pattern_corners_px": 2.0,
+        "rms_best_fit_px": 1.9,
+        "rms_idic_to_best_fit_px": 0.3,
+        "mode_deviation_percent": [0.1, -1.5, 0, 0, 0, 0.3, 0],
+    }
+    return sound | changes
+
+
+def summary(before: dict[str, Any], after: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    whole = {
+        "critical_strain": 0.0963,
+        "inverse_map_max_residual_px": 1e-12,
+        "snapshots": [before, after],
+    }
+    return whole | changes
+
+
+SOUND = summary(snapshot(0.078), snapshot(0.128))
+
+
+def test_sound_run_meets_everything() -> None:
+    rows = expectations(SOUND)
+    assert all(row["ok"] for row in rows)
+    assert all(row["source"] and row["expected"] for row in rows)
+    # Critical strain, residual; two before and five after buckling.
+    assert len(rows) == 9
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (summary(snapshot(0.078), snapshot(0.128), critical_strain=0.0995), "critical strain"),
+        (summary(snapshot(0.078), snapshot(0.128), inverse_map_max_residual_px=2e-10), "inverse"),
+        (summary(snapshot(0.078, negative_pivots=1), snapshot(0.128)), "pivots at 7.8"),
+        (summary(snapshot(0.078, pattern_inner_px=3.0), snapshot(0.128)), "corners at 7.8"),
+        (summary(snapshot(0.078), snapshot(0.128, pattern_amplitude_px=20.0)), "amplitude at 12.8"),
+        (summary(snapshot(0.078), snapshot(0.128, rms_best_fit_px=2.4)), "best possible fit"),
+        (summary(snapshot(0.078), snapshot(0.128, rms_idic_to_best_fit_px=0.4)), "IDIC"),
+        (
+            summary(snapshot(0.078), snapshot(0.128, mode_deviation_percent=[0, -2.5, 0])),
+            "deviation",
+        ),
+    ],
+)
+def test_one_wrong_number_fails_one_verdict(bad: dict[str, Any], words: str) -> None:
+    failed = [row["quantity"] for row in expectations(bad) if not row["ok"]]
+    assert len(failed) == 1
+    assert words in failed[0]
+
+
+def test_run_without_a_critical_point_claims_nothing_about_it() -> None:
+    rows = expectations(SOUND | {"critical_strain": None})
+    assert not any("critical" in row["quantity"] for row in rows)
