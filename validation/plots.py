@@ -103,6 +103,8 @@ class Panel:
         Makes the picture of snapshot k.
     needs_mode
         Whether there must be a mode.
+    exact
+        Whether the picture's pixels are to be kept exactly.
     """
 
     key: str
@@ -112,6 +114,7 @@ class Panel:
     caption: str
     draw: Callable[[Atlas, int], Figure]
     needs_mode: bool = False
+    exact: bool = False
 
 
 def total(atlas: Atlas, k: int) -> Motion:
@@ -265,7 +268,7 @@ PANELS = (
         "residual", "f − g∘φ", "Residual", "virt (g) and (o)",
         "Grey levels as a fraction of full scale, in the deformed configuration; single pixels, "
         "not averages. The colours end at the 99th percentile.",
-        _residual,
+        _residual, exact=True,
     ),
     Panel(
         "w", "‖w‖", "Microfluctuation field", "virt (h) and (p)",

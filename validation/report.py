@@ -122,7 +122,7 @@ def _sections(
         progress(n, len(panels), "report")
         cards[panel.key] = [
             _picture(panel.key, panel.title, heading, panel.draw(atlas, k),
-                     _fact(panel, atlas, k, summary))
+                     _fact(panel, atlas, k, summary), panel.exact)
             for k, heading in enumerate(headings)
         ]  # fmt: skip
     return [
@@ -165,11 +165,16 @@ def _heading(snapshot: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
 
 
 def _picture(
-    key: str, title: str, heading: Mapping[str, str], drawn: Figure, fact: str = ""
+    key: str,
+    title: str,
+    heading: Mapping[str, str],
+    drawn: Figure,
+    fact: str = "",
+    exact: bool = False,
 ) -> Picture:
     name = f"{key}-{heading['id']}"
     label = f"{heading['state']} · {heading['strain']}"
-    return Picture(name, label, to_svg(drawn, name, f"{title}, {label}"), fact)
+    return Picture(name, label, to_svg(drawn, name, f"{title}, {label}", exact=exact), fact)
 
 
 def _environment() -> jinja2.Environment:
