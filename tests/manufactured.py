@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.fourier import FourierMode, free_family, square_family
 from modeharvest.idic.support import Taper
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 
@@ -82,17 +84,24 @@ class CosinePattern:
     def __call__(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Grey levels, of standard deviation 1/sqrt(2), at positions [mm]."""
         total = np.zeros(np.broadcast_shapes(x.shape, y.shape))
-        for (kx, ky), phase in zip(self.wave_vectors, self.phases, strict=True):
+        grey: FloatArray = total / np.sqrt(len(self.phases))
+        return grey
             total += np.cos(kx * x + ky * y + phase)
         return np.asarray(total) / np.sqrt(len(self.phases))
 
 
-def image_pair(
-    pattern: CosinePattern, ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID
-) -> tuple[FloatArray, FloatArray]:
-    """Make f on the grid, and g(y) = f(x) with x + u(x) = y solved to rounding by iteration."""
-    x, y = np.meshgrid(grid.x, grid.y)
-    at = np.stack([x, y], axis=-1)
+Pattern = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def speckle(seed: int = 2, grid: PixelGrid = GRID) -> Pattern:
+    """Make the speckle of the virtual experiments, exact at any position [mm]."""
+    exact = Speckle(SpeckleSpec(seed=seed), grid.shape)
+    return lambda x, y: exact(*grid.to_px(x, y))
+
+
+def reference_points(ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID) -> FloatArray:
+    """(rows, cols, 2): X with X + u(X) = x at the pixels x, solved to rounding by iteration."""
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     reference = at.copy()
     for _ in range(300):
         # Far outside the domain the polynomials run away; nothing is sampled there.
@@ -103,7 +112,14 @@ def image_pair(
         change = abs(moved - reference).max()
         reference = moved
         if change < 1e-13:
-            break
-    else:
-        raise AssertionError(f"the inverse mapping has not converged: {change} mm")
-    return pattern(x, y), pattern(reference[..., 0], reference[..., 1])
+            return reference
+    raise AssertionError(f"the inverse mapping has not converged: {change} mm")
+
+
+def image_pair(
+    pattern: Pattern, ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID
+) -> tuple[FloatArray, FloatArray]:
+    """Make f on the grid, and g(x + u(x)) = f(x)."""
+    reference = reference_points(ansatz, a, grid)
+    f = pattern(*np.meshgrid(grid.x, grid.y))
+    return f, pattern(reference[..., 0], reference[..., 1])
