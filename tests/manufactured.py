@@ -84,10 +84,10 @@ class CosinePattern:
     def __call__(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Grey levels, of standard deviation 1/sqrt(2), at positions [mm]."""
         total = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for (kx, ky), phase in zip(self.wave_vectors, self.phases, strict=True):
+            total += np.cos(kx * x + ky * y + phase)
         grey: FloatArray = total / np.sqrt(len(self.phases))
         return grey
-            total += np.cos(kx * x + ky * y + phase)
-        return np.asarray(total) / np.sqrt(len(self.phases))
 
 
 Pattern = Callable[[FloatArray, FloatArray], FloatArray]
