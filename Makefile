@@ -5,7 +5,7 @@ ENV := scripts/env
 OUT := out/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint test-next bench clean
+.PHONY: help demo test lint test-next bench shipped clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | \
@@ -28,6 +28,10 @@ test-next: ## Run the tests on the next dolfinx (Debian unstable, in a root of i
 
 bench: ## Run every program in benchmarks/ (minutes; ratios within one run are what counts)
 	for program in benchmarks/*.py; do $(ENV) python $$program || exit; done
+
+shipped: ## Make the solution anew that ships with the package
+	$(ENV) python -m modeharvest fem paper-virtual --out out/shipped
+	cp out/shipped/solution.h5 src/modeharvest/cases/paper-virtual.h5
 
 clean: ## Remove what the other commands leave in this folder (not the cache, not out/)
 	rm -rf build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis \

@@ -33,7 +33,8 @@ def simulate(
     """Run a virtual compression test (collective over ``comm``; every rank gets the result).
 
     The solution's ``info["outcome"]`` says in words how far the path went; where it ended
-    early, the snapshots reached are there. ``info["critical"]`` is None where the specimen
+    early, the snapshots reached are there. ``info["warnings"]`` names states that are not stable
+    although their branch is meant to be. ``info["critical"]`` is None where the specimen
     stays stable, or is imperfect.
     """
     spec = experiment.specimen
@@ -65,6 +66,7 @@ class _Run:
         snapshots = self._snapshots(path, limit, branches)
         info = self._info(path, critical, branches)
         info["outcome"] = self._outcome(snapshots, limit, {"primary": path, **branches})
+        info["warnings"] = self._warnings(snapshots)
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _oriented(self, critical: Critical) -> Critical:
@@ -191,6 +193,15 @@ class _Run:
             "negative_pivots": [s.negative_pivots for s in states],
             "lowest_eigenvalues_N_per_mm4": [list(s.eigenvalues) for s in states],
         }
+
+    def _warnings(self, snapshots: list[Snapshot]) -> list[str]:
+        """What is met but not stable although its branch is meant to be."""
+        return [
+            f"{s.branch} at {100 * s.nominal_strain:g} % has {s.negative_pivots} negative pivots, so "
+            "it is not stable; the secondary bifurcation before it is not followed"
+            for s in snapshots
+            if s.branch != "primary" and s.negative_pivots
+        ]
 
     def _outcome(
         self, snapshots: list[Snapshot], limit: float, paths: dict[str, list[State]]

@@ -21,6 +21,8 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     Rows of expected and obtained values.
 ``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
     How good the images are, and what it all took.
+``simulation_outcome``, ``warnings``
+    How far the simulation got, and what to beware of.
 """
 
 from __future__ import annotations
@@ -127,6 +129,7 @@ def validate(
         "inverse_map_max_residual_px": images.max_residual_px,
         "factorisations": solution.info.get("factorisations"),
         "simulation_outcome": solution.info.get("outcome"),
+        "warnings": list(solution.info.get("warnings", [])),
         "versions": {**solution.info.get("versions", {}), **images.info.get("versions", {})},
     }
     summary["expected"] = expectations(summary) if specimen == Specimen() else []

@@ -88,6 +88,8 @@ def fem(case: CaseName, out: OutFolder) -> None:
         print(f"critical strain {100 * critical['strain']:.4f} %")
     for s in solution.snapshots:
         print(f"{100 * s.nominal_strain:6.2f} %  {s.branch:9}  negative pivots {s.negative_pivots}")
+    for warning in solution.info.get("warnings", []):
+        _errors.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
     outcome = str(solution.info.get("outcome", "complete"))
     if outcome != "complete":
         raise InputError(f"simulation {outcome}; what was reached is in {out / 'solution.h5'}")
@@ -165,6 +167,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     if summary.get("critical_strain") is not None:
         console.print(f"critical strain {100 * summary['critical_strain']:.4f} %")
     missed = [row["quantity"] for row in summary["expected"] if not row["ok"]]
+    for warning in summary["warnings"]:
+        console.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
     if summary["expected"]:
         console.print(f"expected values missed: {', '.join(missed) or 'none'}")
     console.print(f"report: {out / 'report.html'}")

@@ -1,0 +1,233 @@
+"""A reduced demo from end to end: what it leaves, running it again, and running into trouble."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from modeharvest import cli
+from modeharvest.case import read_case
+from modeharvest.errors import InputError
+from modeharvest.files import read_json
+from modeharvest.pipeline import Run, run
+
+CASE = """
+title = "A reduced demo"
+[experiment]
+strains = [0.08, 0.15]
+mesh_size = 0.35
+[experiment.specimen]
+holes_x = 4
+holes_y = 6
+[imaging]
+pixel_size = 0.025
+[imaging.speckle]
+seed = 3
+"""
+
+pytestmark = pytest.mark.dolfinx
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("case") / "reduced.toml"
+    path.write_text(CASE, "utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "out"
+    run(case, folder)
+    return folder
+
+
+@pytest.fixture
+def folder(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to damage."""
+    return Path(shutil.copytree(finished, tmp_path / "out"))
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {
+        str(path.relative_to(folder)): path.stat().st_mtime_ns
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def changed(before: dict[str, int], after: dict[str, int]) -> set[str]:
+    return {name for name in after if after[name] != before.get(name)} - {"stages.json"}
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def test_the_run_leaves_what_it_promises(finished: Path) -> None:
+    names = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
+    assert {
+        "solution.h5",
+        "solution.vtu",
+        "images/images.json",
+        "images/reference.tif",
+        "images/deformed_0800.tif",
+        "images/truth_1500.h5",
+        "correlation/result_0800.json",
+        "correlation/result_1500.json",
+        "report.html",
+        "summary.json",
+    } <= names
+    assert not [name for name in names if ".part" in name]
+
+
+def test_summary_holds_the_documented_keys_and_sound_numbers(finished: Path) -> None:
+    summary = read_json(finished / "summary.json")
+    assert 0.12 < summary["critical_strain"] < 0.14  # between the two snapshots, as simulated
+    assert summary["inverse_map_max_residual_px"] <= 1e-10
+    assert summary["factorisations"] <= 50
+    assert set(summary["timings_s"]) == {"fem", "image", "correlate", "validate"}
+    assert {"modeharvest", "dolfinx", "numpy"} <= set(summary["versions"])
+    before, after = summary["snapshots"]
+    assert (before["branch"], after["branch"]) == ("primary", "buckled+")
+    assert after["pattern_amplitude_px"] > 4 * before["pattern_amplitude_px"]
+    for s in (before, after):
+        assert s["negative_pivots"] == 0
+        assert s["outcome"] == "converged"
+        assert len(s["mode"]) == 7
+        assert s["rms_best_fit_px"] <= s["rms_w_px"]
+        # The best fit is a least-squares projection: what is left of w is orthogonal to first
+        # order to what a small change of the unknowns does.
+        parts = s["rms_best_fit_px"] ** 2 + s["rms_idic_to_best_fit_px"] ** 2
+        assert s["rms_w_px"] ** 2 == pytest.approx(parts, rel=0.05)
+    assert (
+        summary["energy_below_unstable"][0]["branch_N"]
+        < (summary["energy_below_unstable"][0]["unstable_N"])
+    )
+
+
+def test_running_again_changes_nothing(case: Path, folder: Path) -> None:
+    before = stamps(folder)
+    run(case, folder)
+    assert stamps(folder) == before
+
+
+def test_a_changed_option_repeats_only_what_depends_on_it(case: Path, folder: Path) -> None:
+    before = stamps(folder)
+    other = case.with_name("other.toml")
+    other.write_text(case.read_text("utf-8") + "[correlation]\norder = 3\n", "utf-8")
+    run(other, folder)
+    assert changed(before, stamps(folder)) == {
+        "correlation/result_0800.json",
+        "correlation/result_1500.json",
+        "report.html",
+        "summary.json",
+    }
+
+
+@pytest.mark.parametrize("step", ["images: strain", "correlate", "compare"])
+def test_an_interrupted_run_continues_to_the_same_end(
+    case: Path, finished: Path, tmp_path: Path, step: str
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in ("solution.h5", "solution.vtu", "stages.json"):
+        shutil.copy(finished / name, folder)
+
+    def interrupt(done: float, total: float, what: str) -> None:
+        if what.startswith(step) and done > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Run(read_case(case), folder, interrupt).all()
+    assert not (folder / "summary.json").exists()
+    assert not list(folder.rglob("*.part*"))
+    ours, theirs = run(case, folder), read_json(finished / "summary.json")
+    assert _numbers(ours) == _numbers(theirs)
+
+
+def _numbers(summary: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in summary.items() if key != "timings_s"}
+
+
+@pytest.mark.parametrize(
+    ("victim", "stage", "said"),
+    [
+        ("solution.h5", "image", "expected a solution"),
+        ("images/images.json", "correlate", "expected a JSON file"),
+        ("images/deformed_1500.tif", "correlate", "deformed_1500.tif"),
+        ("images/truth_1500.h5", "validate", "expected a truth file"),
+        ("correlation/result_1500.json", "validate", "expected a JSON file"),
+    ],
+)
+def test_a_truncated_file_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    case: Path,
+    folder: Path,
+    victim: str,
+    stage: str,
+    said: str,
+) -> None:
+    (folder / "stages.json").unlink()  # so that no stage counts as finished
+    path = folder / victim
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert command(monkeypatch, stage, case, "--out", folder) == 2
+    text = capsys.readouterr().err
+    (line,) = [row for row in text.splitlines() if row.startswith("error:")]
+    assert said in line
+    assert Path(victim).name in line
+
+
+def test_a_solution_without_the_strains_is_refused(case: Path, folder: Path) -> None:
+    other = read_case(case)
+    other = other.model_copy(
+        update={"experiment": type(other.experiment)(strains=(0.5e-1,), mesh_size=0.35)}
+    )
+    with pytest.raises(InputError, match="expected snapshots at strains"):
+        Run(other, folder).image()
+
+
+def test_strain_beyond_what_converges_is_told_and_the_rest_is_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    case = tmp_path / "far.toml"
+    text = CASE.replace("[0.08, 0.15]", "[0.02, 0.45]").replace("holes_x = 4", "holes_x = 2")
+    case.write_text(text.replace("holes_y = 6", "holes_y = 2"), "utf-8")
+    assert command(monkeypatch, "run", case, "--out", tmp_path / "out") == 2
+    (line,) = [r for r in capsys.readouterr().err.splitlines() if r.startswith("error:")]
+    assert "45 %" in line
+    summary = read_json(tmp_path / "out" / "summary.json")
+    assert [s["nominal_strain"] for s in summary["snapshots"]] == [0.02]
+
+
+def test_a_full_disk_leaves_nothing_that_looks_finished(case: Path, tmp_path: Path) -> None:
+    """No file may grow beyond 200 kB: the solution fits, an image does not."""
+    script = (
+        "import resource, signal, sys\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
+        "from modeharvest.cli import main\n"
+        f"sys.argv = ['modeharvest', 'run', {str(case)!r}, '--out', {str(tmp_path / 'out')!r}]\n"
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 2, done.stderr
+    assert "error: could not write" in done.stderr
+    assert "Traceback" not in done.stderr
+    left = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*.*")}
+    assert not {"summary.json", "report.html", "images/images.json"} & left
+    assert not [name for name in left if ".part" in name]
+    stages = json.loads((tmp_path / "out" / "stages.json").read_text()) if left else {}
+    assert "image" not in stages
