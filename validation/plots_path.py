@@ -160,7 +160,7 @@ def draw_convergence(result: Result) -> Figure:
                           annotation_clip=False)  # fmt: skip
         if any(np.isfinite([s for level in levels for _, s in level])):
             axes.set_yscale("log")
-        axes.set_xlim(0.5, len(result.history) + 0.5)
+        axes.set_xlim(0.5, max(1, len(result.history)) + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return drawn
 

@@ -1,0 +1,212 @@
+"""The report's pictures: right way up, in the right place, with units, and none of the globals.
+
+Guards: every colour bar states its unit; a field lands where its pixels are; missing values are
+left blank; the signed colours are even to both sides; the SVG stands on its own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import synthetic_report as made_up
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from modeharvest.idic.pattern import Pattern
+from modeharvest.idic.waves import Wave
+from modeharvest.validation.plots import PANELS, Atlas, Panel, draw_hero
+from modeharvest.validation.plots_fields import Scale, draw_field
+from modeharvest.validation.plots_path import (
+    draw_convergence,
+    draw_density,
+    draw_eigenvalues,
+    draw_load,
+    pattern_density,
+)
+from modeharvest.validation.sheet import Sheet
+from modeharvest.validation.style import BLUE, INK, MUTED, SIGNED, to_svg
+
+UNITS = {"µm", "mm⁶", "–"}
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return made_up.atlas()
+
+
+def colour_bar_units(drawn: Figure) -> list[str]:
+    return [axes.get_title(loc="left") for axes in drawn.axes if axes.get_label() == "colour bar"]
+
+
+def pixels(drawn: Figure) -> NDArray[np.uint8]:
+    drawn.canvas.draw()
+    return np.asarray(drawn.canvas.buffer_rgba())  # type: ignore[attr-defined]  # Agg's own
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.key)
+def test_every_panel_states_the_unit_of_its_colours(atlas: Atlas, panel: Panel) -> None:
+    units = colour_bar_units(panel.draw(atlas, 1))
+    assert set(units) <= UNITS
+    assert len(units) == (0 if panel.key == "phi1" else 1)  # a deformed shape has no colours
+
+
+def test_the_panels_of_the_paper_are_all_there() -> None:
+    named = " ".join(panel.paper for panel in PANELS)
+    assert all(f"({letter})" in named for letter in "abcdefghijklmnop")
+
+
+@pytest.mark.parametrize("name", ["residual", "w", "best", "loss"])
+def test_a_field_without_any_value_is_drawn_blank(atlas: Atlas, name: str) -> None:
+    nothing = np.full_like(atlas.comparisons[0].displacement, np.nan)
+    empty = replace(atlas.comparisons[0], displacement=nothing, residual=nothing[..., 0])
+    panel = next(p for p in PANELS if p.key == name)
+    drawn = panel.draw(replace(atlas, comparisons=[empty, empty]), 0)
+    assert colour_bar_units(drawn)
+
+
+def sides(drawn: Figure) -> dict[str, NDArray[np.float64]]:
+    """Mean colour of a small patch well inside each quarter of the map."""
+    shown = pixels(drawn)
+    box = drawn.axes[0].get_window_extent()
+    height = shown.shape[0]
+
+    def at(across: float, up: float) -> NDArray[np.float64]:
+        col = int(box.x0 + across * box.width)
+        row = int(height - box.y0 - up * box.height)
+        return shown[row - 4 : row + 4, col - 4 : col + 4, :3].mean(axis=(0, 1))
+
+    return {"upper left": at(0.2, 0.8), "upper right": at(0.8, 0.8),
+            "lower left": at(0.2, 0.2), "lower right": at(0.8, 0.2)}  # fmt: skip
+
+
+def test_a_field_is_drawn_the_right_way_up() -> None:
+    sheet = Sheet.of(made_up.plate(), made_up.GRID)
+    up = np.repeat(np.sign(sheet.grid.y)[:, None], sheet.grid.cols, axis=1)
+    colour = sides(draw_field(sheet, up, Scale.signed(up, "µm")))
+    for side in ("left", "right"):
+        red, blue = colour[f"upper {side}"], colour[f"lower {side}"]
+        assert red[0] > red[2] + 40
+        assert blue[2] > blue[0] + 40
+
+
+def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
+    sheet = Sheet.of(made_up.plate(), made_up.GRID)
+    X, Y = sheet.moved_corners(None)
+    moved_X, moved_Y = sheet.moved_corners(
+        lambda x, y: np.stack(np.broadcast_arrays(0.3 + 0 * x * y, 2 * y + 0 * x), axis=-1)
+    )
+    np.testing.assert_allclose(moved_X, X + 0.3, atol=1e-12)
+    np.testing.assert_allclose(moved_Y, 3 * Y, atol=1e-12)
+    assert np.all(np.diff(Y[:, 0]) <= 0)  # rows run down the image
+    nodes = sheet.moved_nodes(lambda x, y: np.stack([x, -y], axis=-1))
+    np.testing.assert_array_equal(nodes, sheet.outline.nodes * [1, -1])
+
+
+def test_averages_leave_missing_pixels_out() -> None:
+    sheet = Sheet.of(made_up.plate(), made_up.GRID, cells=26)
+    assert sheet.factor == 5
+    field = np.full(made_up.GRID.shape, 2.0)
+    field[::2] = np.nan
+    field[:5, :5] = np.nan
+    coarse = sheet.average(field)
+    assert coarse.shape == sheet.grid.shape == sheet.sample(field).shape
+    assert np.isnan(coarse[0, 0])
+    np.testing.assert_array_equal(coarse.ravel()[1:], 2.0)
+
+
+def test_the_signed_colours_darken_evenly_to_both_sides() -> None:
+    rgb = SIGNED(np.linspace(0.0, 1.0, 255))[:, :3]
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    lightness = 116 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16  # CIE L*
+    middle = 127
+    assert lightness.argmax() == middle
+    assert np.all(np.diff(lightness[: middle + 1]) > 0)
+    assert np.all(np.diff(lightness[middle:]) < 0)
+    # CIE's and Oklab's lightness are not the same: equal within a just noticeable few.
+    np.testing.assert_allclose(lightness, lightness[::-1], atol=5)
+
+
+def test_the_unstable_path_is_dashed_from_the_critical_point_on() -> None:
+    drawn = draw_load(made_up.PATH, made_up.CRITICAL_STRAIN)
+    primary = [line for line in drawn.axes[0].lines if line.get_color() == BLUE]
+    stable, unstable = primary
+    assert stable.get_linestyle() == "-"
+    assert unstable.get_linestyle() != "-"
+    # 0.06 lies a fifth of the way from (5 %, 0.5 N/mm) to (10 %, 1 N/mm)
+    for line, end in ((stable, -1), (unstable, 0)):
+        np.testing.assert_allclose(np.asarray(line.get_xydata())[end], [6.0, 0.6])
+
+
+def test_without_a_critical_point_the_solid_line_ends_with_the_last_stable_state() -> None:
+    drawn = draw_load({"primary": made_up.PATH["primary"]}, None)
+    stable = drawn.axes[0].lines[0]
+    assert np.asarray(stable.get_xdata())[-1] == 5.0
+
+
+@pytest.mark.parametrize("critical", [None, made_up.CRITICAL])
+@pytest.mark.parametrize("path", [{}, {"primary": {}}, made_up.PATH], ids=["none", "empty", "all"])
+def test_paths_of_any_completeness_are_drawn(
+    path: dict[str, dict[str, list[float]]], critical: dict[str, float] | None
+) -> None:
+    assert pixels(draw_load(path, None if critical is None else critical["strain"])).size
+    assert pixels(draw_eigenvalues(path, critical)).size
+
+
+def test_the_rings_are_at_the_wave_vectors(atlas: Atlas) -> None:
+    spectrum, _ = atlas.spectra[1]
+    waves = (Wave((1.0, 0.9), (0.1, 0.1), 0.0, 0.0), Wave((-1.0, 0.8), (0.1, 0.1), 0.0, 0.0))
+    pattern = Pattern(waves, None, "unknown", None, 0.0, ())
+    drawn = draw_density(spectrum, pattern, 0, pattern_density(spectrum, pattern))
+    rings = {tuple(np.ravel(line.get_xydata()).tolist()) for line in drawn.axes[0].lines}
+    # In units of 1/l, half of those of pi/l; a real wave has two vectors.
+    assert rings == {(0.5, 0.45), (-0.5, -0.45), (-0.5, 0.4), (0.5, -0.4)}
+
+
+def test_the_colours_of_a_density_end_at_the_pattern() -> None:
+    made_spectrum, _ = made_up.spectrum(made_up.comparison(0.1, 4.0))
+    wave = Wave((1.0, 1.0), (0.1, 0.1), 0.0, 0.0)
+    pattern = Pattern((wave,), None, "unknown", None, 0.0, ())
+    end = pattern_density(made_spectrum, pattern)
+    assert end == np.max(np.abs(made_spectrum.at((0.5, 0.5))) ** 2)
+    image = draw_density(made_spectrum, pattern, 1, end).axes[0].images[0]
+    assert image.get_clim() == (0.0, end)
+    assert pattern_density(made_spectrum, replace(pattern, waves=())) == 0.0
+
+
+def test_each_level_of_the_correlation_is_a_curve(atlas: Atlas) -> None:
+    history = atlas.comparisons[0].result.history
+    curves = draw_convergence(atlas.comparisons[0].result).axes[0].lines
+    assert [len(np.asarray(line.get_xdata())) for line in curves] == [2, 2]
+    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in curves])
+    np.testing.assert_array_equal(drawn, [step.step_px for step in history])
+    assert draw_convergence(replace(atlas.comparisons[0].result, history=())).axes
+
+
+def test_the_svg_stands_on_its_own(atlas: Atlas) -> None:
+    svg = to_svg(draw_hero(atlas, 1), "hero", 'a "title" & more')
+    assert svg.startswith("<svg viewBox=")
+    assert svg.endswith("</svg>")
+    assert 'aria-label="a &quot;title&quot; &amp; more"' in svg
+    ids = re.findall(r'\bid="([^"]+)"', svg)
+    assert len(ids) == len(set(ids))
+    assert all(name.startswith("hero-") for name in ids)
+    wanted = set(re.findall(r'url\(#([^)]+)\)|href="#([^"]+)"', svg))
+    assert {a or b for a, b in wanted} <= set(ids)
+    sources = re.findall(r'href="(?!#)([^"]{0,16})', svg)
+    assert sources
+    assert all(source.startswith("data:image/webp;") for source in sources)
+    assert "http" not in svg
+    assert "font-family" not in svg
+    assert to_hex(INK) not in svg
+    assert to_hex(MUTED) not in svg
+
+
+def test_drawing_leaves_matplotlib_as_it_was(atlas: Atlas) -> None:
+    before = dict(mpl.rcParams)
+    to_svg(draw_hero(atlas, 0), "hero", "")
+    assert dict(mpl.rcParams) == before
