@@ -23,8 +23,9 @@ from modeharvest.validation.plots import Atlas
 from modeharvest.validation.truth import Comparison
 
 GRID = PixelGrid.centred(130, 110, 0.05)
-MASK = np.abs(GRID.y)[:, None] <= DOMAIN.y_max
-MASK = MASK & (np.abs(GRID.x)[None, :] <= DOMAIN.x_max)
+MASK: NDArray[np.bool_] = (np.abs(GRID.y)[:, None] <= DOMAIN.y_max) & (
+    np.abs(GRID.x)[None, :] <= DOMAIN.x_max
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class MadeUpImages(ImageSet):
 
     def deformed(self, strain: float, *, camera: bool = False) -> NDArray[np.float32]:
         """White noise."""
-        return np.random.default_rng(0).random(GRID.shape, dtype=np.float32)
+        return np.asarray(np.random.default_rng(0).random(GRID.shape), dtype=np.float32)
 
     def deformed_mask(self, strain: float) -> NDArray[np.bool_]:
         """The reference's."""
@@ -82,11 +83,11 @@ def spectrum(one: Comparison) -> tuple[Spectrum, Pattern]:
 
 
 CRITICAL_STRAIN = 0.06
-CRITICAL = {
+CRITICAL: dict[str, Any] = {
     "strain": CRITICAL_STRAIN,
     "eigenvalues_N_per_mm4": [[0.055, 0.001], [0.06, 0.0], [0.07, -0.01]],
 }
-PATH = {
+PATH: dict[str, Any] = {
     "primary": {
         "nominal_strain": [0.0, 0.05, 0.1],
         "reaction_N_per_mm": [0.0, 0.5, 1.0],
@@ -149,7 +150,8 @@ def summary(of: Atlas, critical: float | None = 0.06) -> dict[str, Any]:
 
 
 def _snapshot(one: Comparison, pattern: Pattern) -> dict[str, Any]:
-    mode = one.result.mode_parameters().tolist() if one.result.ansatz.modes else []
+    has_mode = bool(one.result.ansatz.modes)
+    mode = [float(v) for v in one.result.mode_parameters()] if has_mode else []
     stats = {"rms_per_component": 0.1, "median_length": 0.1, "max_length": 0.5}
     return {
         "nominal_strain": one.strain,

@@ -78,7 +78,7 @@ def sides(drawn: Figure) -> dict[str, NDArray[np.float64]]:
     def at(across: float, up: float) -> NDArray[np.float64]:
         col = int(box.x0 + across * box.width)
         row = int(height - box.y0 - up * box.height)
-        return shown[row - 4 : row + 4, col - 4 : col + 4, :3].mean(axis=(0, 1))
+        return np.asarray(shown[row - 4 : row + 4, col - 4 : col + 4, :3].mean(axis=(0, 1)))
 
     return {"upper left": at(0.2, 0.8), "upper right": at(0.8, 0.8),
             "lower left": at(0.2, 0.2), "lower right": at(0.8, 0.2)}  # fmt: skip

@@ -52,9 +52,9 @@ def draw_load(path: Mapping[str, Any], critical: float | None) -> Figure:
                 axes.plot(100 * strain[above], load[above], color=BLUE, ls=(0, (3, 2)), marker="o",
                           ms=3, mfc="none")  # fmt: skip
                 _say(axes, 100 * strain[-1], load[-1], "primary, unstable", BLUE, (-4, 6), "right")
-        for name, branch in path.items():
-            if name != "primary":
-                _branch(axes, name, branch, critical, branching)
+        buckled = [name for name in path if name != "primary"]
+        for n, name in enumerate(buckled):
+            _branch(axes, name, path[name], critical, branching, below=32 + 11 * n)
         if critical is not None and np.isfinite(branching):
             axes.plot([100 * critical], [branching], "o", ms=8, mfc="none", mec=INK, mew=1.2)
             _say(axes, 100 * critical, branching, f"critical, {100 * critical:.3f} %", INK,
@@ -176,9 +176,14 @@ def _curve(x: str, y: str) -> tuple[Figure, Axes]:
 
 
 def _branch(
-    axes: Axes, name: str, branch: Mapping[str, Any], critical: float | None, branching: float
+    axes: Axes,
+    name: str,
+    branch: Mapping[str, Any],
+    critical: float | None,
+    branching: float,
+    below: float,
 ) -> None:
-    """A buckled branch, from the critical point on."""
+    """A buckled branch, from the critical point on; its name this far below its end [pt]."""
     strain, load = _column(branch, "nominal_strain"), _column(branch, _LOAD)
     if not strain.size:
         return
@@ -186,11 +191,10 @@ def _branch(
     if critical is not None:
         strain, load = np.insert(strain, 0, critical), np.insert(load, 0, branching)
     axes.plot(100 * strain, load, color=RED, lw=1.8)
-    _say(axes, 100 * strain[-1], load[-1], _words(name), RED, (4, -32), "right")
-
-
-def _words(name: str) -> str:
-    return f"{name.replace('+', ' (+)').replace('-', ' (−)')}, stable"
+    is_stable = not _column(branch, "negative_pivots").any()
+    sign = name.replace("+", " (+)").replace("-", " (−)")
+    words = f"{sign}, {'stable' if is_stable else 'unstable'}"
+    _say(axes, 100 * strain[-1], load[-1], words, RED, (4, -below), "right")
 
 
 def _say(axes: Axes, x: float, y: float, text: str, colour: str, shift: tuple[float, float],

@@ -99,10 +99,10 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     for snapshot in summary["snapshots"]:
         said += _about(snapshot)
     said += [
-        "Standard errors take the whole residual for white noise in both images. There is no "
-        "noise in these images: the residual is what the ansatz can't say, so a standard error "
-        "tells how firmly the images hold a parameter, not how far it is from the truth. The best "
-        "fit beside it does.",
+        "Standard errors take the whole residual for white noise in both images. No noise was "
+        "added to these images: the residual is what the ansatz can't say, so a standard error "
+        "tells how firmly the images hold a parameter, not how far it is from the truth. Compare "
+        "it with the best fit beside it.",
         "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
         "gradient and leaves out the rims of the holes: even without any noise the two differ.",
         "rms is per component: the root of the mean square over both components of all material "
