@@ -66,7 +66,9 @@ def gather_nodes(V: Any, values: NDArray[np.float64], count: int) -> NDArray[np.
     given = np.asarray(mesh.geometry.input_global_indices)
     result = np.zeros((count, 2))
     owned = np.zeros((count, 1))
-    nodes, dofs = mesh.geometry.dofmap.ravel(), V.dofmap.list.ravel()
+    geometry = mesh.geometry  # "dofmap" became "dofmaps", one for each cell type, in 0.10
+    dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+    nodes, dofs = dofmap.ravel(), V.dofmap.list.ravel()
     result[given[nodes]] = values.reshape(-1, 2)[dofs]
     owned[given[nodes]] = 1.0
     mesh.comm.Allreduce(MPI.IN_PLACE, result)

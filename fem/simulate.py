@@ -197,8 +197,8 @@ class _Run:
     def _warnings(self, snapshots: list[Snapshot]) -> list[str]:
         """What is met but not stable although its branch is meant to be."""
         return [
-            f"{s.branch} at {100 * s.nominal_strain:g} % has {s.negative_pivots} negative pivots, so "
-            "it is not stable; the secondary bifurcation before it is not followed"
+            f"{s.branch} at {100 * s.nominal_strain:g} % is not stable ({s.negative_pivots} "
+            "negative pivots): the secondary bifurcation before it is not followed"
             for s in snapshots
             if s.branch != "primary" and s.negative_pivots
         ]

@@ -54,7 +54,9 @@ def _evaluator(material: Any) -> Any:
     """W, P and tangent of a material as compiled by dolfinx, at a constant F."""
     element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    mesh = dolfinx.mesh.create_mesh(MPI.COMM_SELF, np.array([[0, 1, 2]]), corners, element)
+    mesh = dolfinx.mesh.create_mesh(
+        MPI.COMM_SELF, cells=np.array([[0, 1, 2]]), x=corners, e=element
+    )
     constant = dolfinx.fem.Constant(mesh, EYE)
     F = ufl.variable(constant)
     energy = material.energy(F)
