@@ -8,12 +8,11 @@ from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.setup import Identification
 from modeharvest.imaging.imageset import ImagingSpec, make_images
 
+EXPERIMENT = Experiment(strains=(0.078, 0.128), mesh_size=0.2)
+IMAGING = ImagingSpec(pixel_size=0.01)
 
-def main(
-    experiment=Experiment(strains=(0.078, 0.128), mesh_size=0.2),
-    imaging=ImagingSpec(pixel_size=0.01),
-    folder="out/example",
-):
+
+def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
     """Return, for each strain, the rms per component [px] of w and of the best possible fit."""
     solution = simulate(experiment)
     print("critical strain", solution.info["critical"]["strain"])
@@ -32,7 +31,7 @@ def main(
             np.sqrt(np.mean((truth - fit.displacement())[mask] ** 2)) / grid.pixel_size
             for fit in (result, best)
         ]
-        print(strain, result.outcome.name, result.unknowns[ansatz.phi_slice(0)], errors[strain])
+        print(strain, result.outcome.name, result.mode_parameters(), errors[strain])
     return errors
 
 
