@@ -121,6 +121,10 @@ class Iteration:
     pixels: int
 
 
+_ROUNDING = 1e-10
+"""Columns of the Jacobian smaller than this share of the largest one are taken for zero."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScaledEigen:
     """A positive semi-definite matrix, scaled to a unit diagonal and decomposed.
@@ -128,7 +132,7 @@ class ScaledEigen:
     Parameters
     ----------
     scale
-        (n,): square root of the diagonal, 1 where that is zero.
+        (n,): square root of the diagonal; infinite where that is nothing but rounding.
     values, vectors
         Eigenvalues, ascending, and eigenvectors of the scaled matrix.
     """
@@ -141,7 +145,9 @@ class ScaledEigen:
     def of(cls, matrix: FloatArray) -> ScaledEigen:
         """Decompose a matrix."""
         diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        scale = np.where(diagonal > 0, diagonal, 1.0)
+        # Scaling rounding up to 1 would make a direction of it, with enormous steps along it.
+        seen = diagonal > _ROUNDING * diagonal.max(initial=0.0)
+        scale = np.where(seen, diagonal, np.inf)
         values, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
         return cls(scale, values, vectors)
 

@@ -107,15 +107,21 @@ class Result:
         Parameters
         ----------
         noise_sd
-            Standard deviation of the noise in an image [grey levels]; by default
-            :attr:`noise_sd`.
+            Standard deviation of the noise in an image [grey levels]; by default the one that
+            makes the residual nothing but noise.
         noisy_images
-            2 if both images are noisy, 2 s^2 M^-1; 1 if only the deformed one is, s^2 M^-1.
+            2 if both images are noisy, 2 s^2 M^-1; 1 if only one is, s^2 M^-1.
+
+        Notes
+        -----
+        The noise of the deformed image weighs 1/det F more than that: where the material has
+        shrunk, neighbouring pixels of the reference share noise.
         """
         if noisy_images not in (1, 2):
             raise InputError(f"expected 1 or 2 noisy images, got {noisy_images}")
-        sd = self.noise_sd if noise_sd is None else noise_sd
-        return noisy_images * sd**2 * self.inverse
+        # The residual holds the noise of however many images are noisy.
+        residual = 2.0 * self.noise_sd**2
+        return (residual if noise_sd is None else noisy_images * noise_sd**2) * self.inverse
 
     def standard_errors(self, noise_sd: float | None = None) -> FloatArray:
         """(n,): square roots of the diagonal of :meth:`covariance`."""
