@@ -157,16 +157,14 @@ def draw_blend(
     """Let the deformed image dissolve, from left to right, into what was measured in it."""
     with style():
         drawn, axes = _map(sheet, width=3.2)
-        _show_grey(axes, sheet, image, material, grid)
+        # Gone where the field is opaque, or slivers of it would show along the holes.
+        _show_grey(axes, sheet, image, material, grid, dissolve=True)
         edge = _edge(sheet, motion)
         axes.add_patch(edge)
         X, Y = sheet.moved_corners(motion)
-        along = np.linspace(0.0, 1.0, values.shape[1])[None, :]
-        up = np.linspace(0.0, 1.0, values.shape[0])[:, None]
-        opacity = np.clip((along + 0.25 * up - 0.48) / 0.28, 0.0, 1.0)
-        quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
-                                norm=scale.normalise, alpha=opacity**2 * (3 - 2 * opacity),
-                                rasterized=True, linewidth=0, antialiased=False)  # fmt: skip
+        colours = scale.colours(scale.normalise(values))
+        colours[..., 3] *= _ramp(values.shape)
+        quads = axes.pcolormesh(X, Y, colours, rasterized=True)
         quads.set_clip_path(edge)
         colour_bar(drawn, axes, scale)
     return drawn
@@ -208,8 +206,20 @@ def colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
     bar.ax.set_label("colour bar")
 
 
+def _ramp(shape: tuple[int, ...]) -> FloatArray:
+    """0 on the left, 1 on the right, a smooth slope between them that leans to the left."""
+    up, along = np.mgrid[0 : 1 : shape[0] * 1j, 0 : 1 : shape[1] * 1j]
+    t = np.clip((along + 0.25 * up - 0.48) / 0.28, 0.0, 1.0)
+    return np.asarray(t**2 * (3 - 2 * t))
+
+
 def _show_grey(
-    axes: Axes, sheet: Sheet, image: NDArray[np.float32], material: BoolArray, grid: PixelGrid
+    axes: Axes,
+    sheet: Sheet,
+    image: NDArray[np.float32],
+    material: BoolArray,
+    grid: PixelGrid,
+    dissolve: bool = False,
 ) -> None:
     """Show an image averaged over blocks of pixels, its background transparent."""
     joined = max(1, sheet.factor // 2)
@@ -223,7 +233,7 @@ def _show_grey(
     cover = blocks(material)
     level = blocks(np.where(material, image, 0.0)) / np.maximum(cover, 1e-9)
     rgba = np.repeat(np.clip(level, 0.0, 1.0)[..., None], 4, axis=2)
-    rgba[..., 3] = cover
+    rgba[..., 3] = cover * np.minimum(1.0, 4.0 * (1.0 - _ramp(coarse.shape))) if dissolve else cover
     axes.imshow(np.nan_to_num(rgba), extent=coarse.extent, interpolation="antialiased",
                 rasterized=True, aspect="auto")  # fmt: skip
     axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])

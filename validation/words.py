@@ -32,7 +32,7 @@ _DETAILS = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}
 def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
     """The few numbers at the top: what they are called, the number, its unit, a remark."""
     last = summary["snapshots"][-1]
-    at = f"at {100 * last['nominal_strain']:.4g} %"
+    at = f"at {100 * last['nominal_strain']:.4g}\N{NO-BREAK SPACE}%"
     critical = summary.get("critical_strain")
     expected = summary.get("expected", [])
     met = sum(bool(row["ok"]) for row in expected)
