@@ -81,7 +81,8 @@ def modes_nearest_zero(
     solver.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
     solver.setTarget(0.0)
     solver.setDimensions(count)
-    solver.setTolerances(1e-9, 200)
+    solver.setTolerances(1e-8, 200)
+    solver.setPurify(False)  # the start vector is in the range of K^-1 M already
     start = mass.createVecRight()
     first, last = start.getOwnershipRange()
     start.array[:] = [((k * 7919) % 1009) / 1009.0 - 0.5 for k in range(first, last)]
