@@ -99,7 +99,7 @@ class Result:
         An upper bound: what the ansatz can't describe is in the residual too.
         """
         freedom = max(1, self.pixels - self.ansatz.size)
-        return float(self.residual_rms * np.sqrt(self.pixels / freedom / 2.0))
+        return float(self.residual_rms * np.sqrt(max(1, self.pixels) / freedom / 2.0))
 
     def covariance(self, noise_sd: float | None = None, noisy_images: int = 2) -> FloatArray:
         """(n, n) covariance of the unknowns under white noise: the Cramer-Rao bound.
@@ -175,23 +175,21 @@ class Result:
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""
-        inverse = [[None if np.isinf(v) else float(v) for v in row] for row in self.inverse]
-        condition = self.condition_number
         content = {
             "format": FORMAT,
             "outcome": self.outcome.value,
             "explanation": self.outcome.explanation,
             "unknowns": dict(zip(self.names, map(float, self.unknowns), strict=True)),
             "units": list(self.ansatz.units),
-            "residual_rms": self.residual_rms,
+            "residual_rms": _to_json(self.residual_rms),
             "pixels": self.pixels,
             "left_image": self.left_image,
-            "condition_number": None if np.isinf(condition) else condition,
-            "history": [vars(step) for step in self.history],
+            "condition_number": _to_json(self.condition_number),
+            "history": [{k: _to_json(v) for k, v in vars(s).items()} for s in self.history],
             "timings_s": dict(self.timings_s),
             "grid": vars(self.grid),
             "ansatz": ansatz_to_dict(self.ansatz),
-            "inverse": inverse,
+            "inverse": [[_to_json(float(v)) for v in row] for row in self.inverse],
         }
         write_json(path, content)
 
@@ -208,25 +206,35 @@ class Result:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise InputError(f"expected a {FORMAT} file at {path}; correlate again")
         try:
-            inverse = [[np.inf if v is None else v for v in row] for row in content["inverse"]]
-            condition = content["condition_number"]
+            steps = ({k: _from_json(v) for k, v in s.items()} for s in content["history"])
             return cls(
                 ansatz=ansatz_from_dict(content["ansatz"]),
                 grid=PixelGrid(**content["grid"]),
                 unknowns=np.array(list(content["unknowns"].values())),
-                inverse=np.array(inverse),
-                residual_rms=content["residual_rms"],
+                inverse=np.array([[_from_json(v) for v in row] for row in content["inverse"]]),
+                residual_rms=_from_json(content["residual_rms"]),
                 pixels=content["pixels"],
                 left_image=content["left_image"],
                 outcome=Outcome(content["outcome"]),
-                condition_number=np.inf if condition is None else condition,
-                history=tuple(Iteration(**step) for step in content["history"]),
+                condition_number=_from_json(content["condition_number"]),
+                history=tuple(Iteration(**step) for step in steps),
                 timings_s=content["timings_s"],
             )
-        except (KeyError, TypeError, AttributeError) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise InputError(
                 f"expected a complete {FORMAT} file at {path}, got: {error!r}; correlate again"
             ) from error
+
+
+def _to_json(value: Any) -> Any:
+    """Null for infinity, which JSON doesn't know."""
+    return None if value == np.inf else value
+
+
+def _from_json(value: Any) -> Any:
+    return np.inf if value is None else value
 
 
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
