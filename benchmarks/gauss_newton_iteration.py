@@ -1,81 +1,121 @@
-"""What a Gauss-Newton iteration costs, in bicubic samplings of the same pixels.
+"""What a Gauss-Newton iteration costs, in samplings of the same pixels, and in images of memory.
 
-Both run on one thread in one process, so that the ratio means something on a busy machine; the
-bound of the design is 5. An iteration samples value and gradient by a quintic spline, assembles
-and solves the normal equations of 77 unknowns.
+The paper's image size and 77 unknowns, on one thread in one process; every lap runs all
+contestants in turn and the medians are compared, so that the ratios mean something on a busy
+machine. The design's bound: 5 bicubic samplings of value and gradient. An iteration samples
+value and gradient, assembles and solves the normal equations.
 
-Run: python benchmarks/gauss_newton_iteration.py
+Run: scripts/env python benchmarks/gauss_newton_iteration.py
 """
 
 from __future__ import annotations
 
+import statistics
 import time
+import tracemalloc
 from collections.abc import Callable
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.gauss_newton import ScaledEigen
+from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.gauss_newton import GaussNewtonOptions, ScaledEigen
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage, sample_points
 
 REPEATS = 7
+GRID = PixelGrid.centred(2207, 1651, 0.01)
+Image = NDArray[np.float64]
+Work = Callable[[], object]
 
 
-def fastest(work: Callable[[], object]) -> float:
-    """Seconds of the fastest of several runs, after one that compiles."""
-    work()
-    laps = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        work()
-        laps.append(time.perf_counter() - begin)
-    return min(laps)
+def medians(contestants: dict[str, Work]) -> dict[str, float]:
+    """Seconds of each, the median of some laps in turn after one that compiles."""
+    laps: dict[str, list[float]] = {name: [] for name in contestants}
+    for repeat in range(REPEATS + 1):
+        for name, work in contestants.items():
+            begin = time.perf_counter()
+            work()
+            if repeat > 0:
+                laps[name].append(time.perf_counter() - begin)
+    return {name: statistics.median(seconds) for name, seconds in laps.items()}
 
 
-def material(grid: PixelGrid) -> np.ndarray:
+def material() -> NDArray[np.bool_]:
     """The paper's 6 x 10 holes."""
-    x, y = np.meshgrid(grid.x, grid.y)
+    x, y = np.meshgrid(GRID.x, GRID.y)
     holes = np.hypot(x % 1.9 - 0.95, y % 1.9 - 0.95) < 0.75
     cellular = (abs(x) < 5.7) & (abs(y) < 9.5)
     return (abs(x) < 7.6) & (abs(y) < 10.4) & ~(holes & cellular)
 
 
-def main() -> None:
-    numba.set_num_threads(1)
-    grid = PixelGrid.centred(2207, 1651, 0.01)
-    mask = material(grid)
-    noise = np.random.default_rng(0).normal(size=(2, *grid.shape))
-    f, g = (ndimage.gaussian_filter(image, 3.0) for image in noise)
-    ansatz = Ansatz.square(Box.centred(15.2, 20.8), Box.centred(11.4, 19.0), 1.9)
-    a, quintic, cubic = ansatz.start(0.02), SplineImage.of(g, 5), SplineImage.of(g, 3)
-    assembly = Assembly(ansatz, grid, mask)
-
-    def iteration() -> None:
-        equations = assembly.images(a, f, quintic)
-        ScaledEigen.of(equations.matrix).solve(equations.gradient)
-
-    u = ansatz.displacement(a, grid.x, grid.y)[mask] / grid.pixel_size
+def contestants(
+    ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]
+) -> tuple[dict[str, Work], int]:
+    """What to compare, and at how many pixels."""
+    a = ansatz.start(0.02)
+    quintic, cubic = SplineImage.of(g, 5), SplineImage.of(g, 3)
+    assembly = Assembly(ansatz, GRID, mask)
+    u = ansatz.displacement(a, GRID.x, GRID.y)[mask] / GRID.pixel_size
     row, col = np.nonzero(mask)
     row, col = row - u[:, 1], col + u[:, 0]
     out = [np.empty(row.size) for _ in range(3)]
+    filtered = ndimage.spline_filter(g, order=3, mode="mirror")
+    slopes = [ndimage.spline_filter(d, order=3, mode="mirror") for d in np.gradient(g)]
 
-    def sampling(spline: SplineImage) -> None:
+    def iterate(spline: SplineImage) -> None:
+        equations = assembly.images(a, f, spline)
+        ScaledEigen.of(equations.matrix).solve(equations.gradient)
+
+    def sample(spline: SplineImage) -> None:
         sample_points(spline.coefficients, spline.order, row, col, row.size, *out)
 
-    ns = 1e9 / row.size
-    bicubic = ns * fastest(lambda: sampling(cubic))
-    biquintic = ns * fastest(lambda: sampling(quintic))
-    whole = ns * fastest(iteration)
-    print(f"pixels of material            {row.size}")
-    print(f"bicubic value and gradient    {bicubic:6.1f} ns/px")
-    print(f"quintic value and gradient    {biquintic:6.1f} ns/px")
-    print(f"Gauss-Newton iteration        {whole:6.1f} ns/px")
-    print(f"ratio to bicubic              {whole / bicubic:6.2f}  (bound: 5)")
+    def scipy_three() -> None:
+        for image in (filtered, *slopes):
+            ndimage.map_coordinates(image, [row, col], order=3, mode="mirror", prefilter=False)
+
+    found: dict[str, Work] = {
+        "bicubic value and gradient": lambda: sample(cubic),
+        "quintic value and gradient": lambda: sample(quintic),
+        "scipy, order 3: value and two gradient images": scipy_three,
+        "Gauss-Newton iteration, cubic": lambda: iterate(cubic),
+        "Gauss-Newton iteration, quintic (default)": lambda: iterate(quintic),
+    }
+    return found, int(row.size)
+
+
+def peak_memory(ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]) -> float:
+    """Most that a whole correlation allocates beside its input [float32 images of the size]."""
+    # The memory doesn't depend on how many iterations there are.
+    options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
+    images = f.astype(np.float32), g.astype(np.float32)
+    tracemalloc.start()
+    correlate(*images, GRID, ansatz, ansatz.start(0.001, 0.1), mask, mask, options)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak / images[0].nbytes
+
+
+def main() -> None:
+    numba.set_num_threads(1)
+    mask = material()
+    noise = np.random.default_rng(0).normal(size=(2, *GRID.shape))
+    f, g = (ndimage.gaussian_filter(image, 3.0) for image in noise)
+    ansatz = Ansatz.square(Box.centred(15.2, 20.8), Box.centred(11.4, 19.0), 1.9)
+    to_compare, pixels = contestants(ansatz, f, g, mask)
+    seconds = medians(to_compare)
+    unit = seconds["bicubic value and gradient"]
+    print(f"{GRID.rows} x {GRID.cols} px, {pixels} of them material; {ansatz.size} unknowns\n")
+    print("| one thread | ns/px | bicubic samplings |\n|---|---|---|")
+    for name, s in seconds.items():
+        print(f"| {name} | {1e9 * s / pixels:.1f} | {s / unit:.2f} |")
+    print("\nbound of the design: 5 bicubic samplings")
+    print(f"peak memory of a correlation: {peak_memory(ansatz, f, g, mask):.0f} float32 images")
 
 
 if __name__ == "__main__":
