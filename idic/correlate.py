@@ -54,7 +54,7 @@ class CorrelationOptions:
     """
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
-    edge_px: int = 3
+    edge_px: int = 2
     order: int = 5
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
 

@@ -41,7 +41,7 @@ class Identification:
     v0_degree: int = 5
     v_degree: int = 6
     start_amplitude: float = 1.0
-    edge_px: int = 3
+    edge_px: int = 2
     order: int = 5
     camera: bool = False
 

@@ -92,7 +92,7 @@ def test_history_and_sums_are_consistent(found: Result, images: Images) -> None:
     assert [s.factor for s in found.history] == sorted(s.factor for s in found.history)[::-1]
     assert found.history[-1].step_px <= GaussNewtonOptions().tolerance_px
     assert found.iterations == sum(s.factor == 1 for s in found.history)
-    assert found.pixels == eroded(MASK, 3).sum()
+    assert found.pixels == eroded(MASK, CorrelationOptions().edge_px).sum()
     residual = found.residual(*images)[eroded(MASK, 3)]
     # The kernel's own f and g are stored in float32: 6e-8 of the grey levels each.
     assert np.sqrt((residual**2).mean()) == pytest.approx(found.residual_rms, abs=3e-7)

@@ -37,7 +37,7 @@ def test_the_standard_start_finds_the_truth() -> None:
     # float32 pixels are rounded by 3e-8 and a quintic amplifies that by up to 56.
     assert result.residual_rms < 2e-6
     assert abs(result.residual(f, g)[MASK]).max() < 1e-4
-    assert result.pixels == eroded(MASK, 3).sum()
+    assert result.pixels == eroded(MASK, CorrelationOptions().edge_px).sum()
     assert result.left_image == 0
     # Unknowns, too: those of the mode to the displacement's error over v1 max||phi|| = 6 px.
     np.testing.assert_allclose(result.mode_parameters(), truth[-7:], atol=1e-5)

@@ -89,6 +89,7 @@ def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
     worst = max(abs(v) for v in snapshot["mode_deviation_percent"])
     pattern, best = snapshot["pattern_amplitude_px"], snapshot["rms_best_fit_px"]
     loss = snapshot["rms_idic_to_best_fit_px"]
+    length = snapshot["details_px"]["idic_to_best_fit"]["rms_length"]
     return [
         Expectation("negative pivots" + at, "-", "0", snapshot["negative_pivots"],
                     snapshot["negative_pivots"] == 0, "stability"),
@@ -100,4 +101,6 @@ def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
                     best, 1.7 <= best <= 2.1, INDEPENDENT),
         Expectation("IDIC − best fit, rms per component" + at, "px", "at most 0.35", loss,
                     loss <= 0.35, INDEPENDENT),
+        Expectation("IDIC − best fit, rms of the vector's length" + at, "px", "at most 0.35",
+                    length, length <= 0.35, "the same, read strictly"),
     ]  # fmt: skip
