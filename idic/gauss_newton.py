@@ -102,7 +102,7 @@ class Iteration:
     factor
         Binning of the level [px].
     number
-        From 1 on each level.
+        From 1 on each level, and again whenever the pixels used are chosen anew.
     mean_square
         Mean of r^2 after the step.
     step_px
