@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from modeharvest.imaging.interpolation import compiled, sample_points
+from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.interpolation import sample_points
 
 BLOCK = 256
 """Pixels gathered at a time."""
@@ -32,7 +33,7 @@ IMAGE = -1
 """``component`` of :func:`accumulate` for a pair of images; 0 and 1 are displacements."""
 
 
-@compiled()
+@compiled(relaxed=True)
 def _chebyshev_block(xi: Any, columns: Any, n: int, T: Any) -> None:
     """T_0 ... T_K at the block's columns."""
     for m in range(n):
@@ -43,7 +44,7 @@ def _chebyshev_block(xi: Any, columns: Any, n: int, T: Any) -> None:
             T[a, m] = 2.0 * T[1, m] * T[a - 1, m] - T[a - 2, m]
 
 
-@compiled()
+@compiled(relaxed=True)
 def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
     """Sum C[a, b] T_a(xi) T_b(eta) along the block; eta_T holds T_b of the row."""
     degree = C.shape[0] - 1
@@ -57,7 +58,7 @@ def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
             out[m] += along * T[a, m]
 
 
-@compiled()
+@compiled(relaxed=True)
 def _modes_block(
     row: int,
     columns: Any,
@@ -93,7 +94,7 @@ def _modes_block(
             cosines[w, m] = per_mm * v[i, m] * tau * (cos_x[w, k] * cy - sin_x[w, k] * sy)
 
 
-@compiled()
+@compiled(relaxed=True)
 def _model_block(
     component: int,
     f: Any,
@@ -137,7 +138,7 @@ def _model_block(
     return off
 
 
-@compiled()
+@compiled(relaxed=True)
 def _base_fields_block(n: int, waves: Any, phi: Any, sines: Any, cosines: Any, E: Any) -> None:
     """Fill the base fields between the gradient and the residual."""
     gx, gy = E[0], E[1]
@@ -154,7 +155,7 @@ def _base_fields_block(n: int, waves: Any, phi: Any, sines: Any, cosines: Any, E
             E[k + 2, m] = cosines[w, m] * (A * gx[m] + B * gy[m])
 
 
-@compiled()
+@compiled(relaxed=True)
 def _moments_block(n: int, pairs: Any, T: Any, E: Any, product: Any, row_moments: Any) -> None:
     """Add sum e e' T_a over the block to row_moments[pair, a] for a up to the pair's degree."""
     for p in range(pairs.shape[0]):
@@ -186,7 +187,7 @@ def _moments_block(n: int, pairs: Any, T: Any, E: Any, product: Any, row_moments
             a += 1
 
 
-@compiled()
+@compiled(relaxed=True)
 def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
     """Multiply the moments of a row by T_b(eta) of that row, and add them."""
     for p in range(pairs.shape[0]):
@@ -198,7 +199,7 @@ def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
                 moments[p, a, b] += value * eta_T[b]
 
 
-@compiled(parallel=True)
+@compiled(parallel=True, relaxed=True)
 def accumulate(
     component: int,
     f: Any,

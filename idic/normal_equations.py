@@ -8,6 +8,7 @@ mode families then make from it the matrix of the unknowns.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -190,10 +191,11 @@ class Assembly:
         left = np.zeros(BANDS, dtype=np.int64)
         # One type of f for images and displacements means one compilation.
         f = np.ascontiguousarray(f, dtype=np.float64)
-        accumulate(
-            component, f, coefficients, order, grid.pixel_size, columns, row_start,
-            xi, eta, *_tables(ansatz, grid, a), self._pairs, BANDS, moments, left,
-        )  # fmt: skip
+        pixels: tuple[Any, ...] = (f, coefficients, order, grid.pixel_size, columns, row_start)
+        tables: tuple[Any, ...] = (xi, eta, *_tables(ansatz, grid, a))
+        sums: tuple[Any, ...] = (self._pairs, BANDS, moments, left)
+        kernel: Callable[..., None] = accumulate
+        kernel(component, *pixels, *tables, *sums)
         off = int(left.sum())
         return self._from_moments(moments.sum(axis=0), columns.size - off, off)
 

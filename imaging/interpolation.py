@@ -9,29 +9,20 @@ Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from modeharvest.errors import InputError
+from modeharvest.imaging.compiled import compiled
 
 FloatArray = NDArray[np.float64]
 
 PAD = 3
 """Rows and columns of mirrored coefficients around the image, so that no tap needs a test."""
-
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
-
-
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """``numba.njit`` with the project's options and a type that mypy knows."""
-    decorate = njit(cache=True, fastmath=_FASTMATH, error_model="numpy", **options)
-    return cast("Callable[[Callable[..., Any]], Callable[..., Any]]", decorate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +102,7 @@ class SplineImage:
         return value.reshape(row.shape), d_row.reshape(row.shape), d_col.reshape(row.shape)
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def cubic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Weights of the 4 taps -1 ... 2 and their derivatives, at the fraction 0 <= t <= 1."""
     s = 1.0 - t
@@ -126,7 +117,7 @@ def cubic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return w, d
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def quintic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Weights of the 6 taps -2 ... 3 and their derivatives, at the fraction 0 <= t <= 1."""
     s = 1.0 - t
@@ -152,20 +143,20 @@ def quintic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return w, d
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def _dot4(c: Any, i: int, j: int, w: Any) -> float:
     total: float = w[0] * c[i, j] + w[1] * c[i + 1, j] + w[2] * c[i + 2, j] + w[3] * c[i + 3, j]
     return total
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def _dot6(c: Any, i: int, j: int, w: Any) -> float:
     low: float = w[0] * c[i, j] + w[1] * c[i + 1, j] + w[2] * c[i + 2, j]
     high: float = w[3] * c[i + 3, j] + w[4] * c[i + 4, j] + w[5] * c[i + 5, j]
     return low + high
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def sample_cubic(c: Any, row: float, col: float) -> tuple[float, float, float]:
     """(value, d_row, d_col) at a position inside the image [px]."""
     i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
@@ -183,7 +174,7 @@ def sample_cubic(c: Any, row: float, col: float) -> tuple[float, float, float]:
     )
 
 
-@compiled(forceinline=True)
+@compiled(inline=True, relaxed=True)
 def sample_quintic(c: Any, row: float, col: float) -> tuple[float, float, float]:
     """(value, d_row, d_col) at a position inside the image [px]."""
     i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
@@ -201,7 +192,7 @@ def sample_quintic(c: Any, row: float, col: float) -> tuple[float, float, float]
     )
 
 
-@compiled()
+@compiled(relaxed=True)
 def sample_points(
     c: Any, order: int, row: Any, col: Any, n: int, value: Any, d_row: Any, d_col: Any
 ) -> None:
