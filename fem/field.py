@@ -171,6 +171,11 @@ class Solution:
         InputError
             If the file is missing, cut short or of another format.
         """
+        if not Path(path).is_file():
+            raise InputError(
+                f"expected a solution (HDF5) at {path}, found no such file; make it with "
+                "'modeharvest fem'"
+            )
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs.get("format") != FORMAT:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from modeharvest.errors import InputError
-from modeharvest.files import atomic, read_json, write_json
+from modeharvest.files import atomic, read_json, require_writable, write_json
 
 
 def test_a_finished_write_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -36,6 +36,14 @@ def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"could not write .*a\.txt: No space left"), atomic(path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+    require_writable(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="could not write"):
+        require_writable(tmp_path / "file")
 
 
 def test_json_round_trip_and_a_cut_file(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import io
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,21 @@ def atomic(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"could not write {path}: {error.strerror or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # it may never have been there, nor its folder
+            temporary.unlink(missing_ok=True)
+
+
+def require_writable(folder: Path | str) -> None:
+    """Make ``folder`` and check that files can be written there, before long work begins.
+
+    Raises
+    ------
+    InputError
+        If not.
+    """
+    with atomic(Path(folder) / "writable") as temporary:
+        temporary.touch()
+    (Path(folder) / "writable").unlink()
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from modeharvest import __version__
 from modeharvest.case import Case, read_case, shipped_cases, shipped_solution
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json, write_json
+from modeharvest.files import read_json, require_writable, write_json
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
@@ -205,21 +205,25 @@ class Run:
     # -- what is finished ---------------------------------------------------------------
 
     def _finished(self, stage: str) -> dict[str, Any]:
-        path = self.folder / "stages.json"
-        stages = read_json(path) if path.is_file() else {}
-        return dict(stages.get(stage, {}))
+        return dict(self._record().get(stage, {}))
+
+    def _record(self) -> dict[str, Any]:
+        """What ``stages.json`` says; nothing if it is missing or damaged."""
+        try:
+            return dict(read_json(self.folder / "stages.json"))
+        except (InputError, TypeError, ValueError):
+            return {}
 
     def _stage(self, name: str, key: str, work: Callable[[], object], *outputs: Path) -> None:
         """Do the work unless it was finished with the same key and its files are there."""
         done = self._finished(name)
         if done.get("key") == key and all(path.is_file() for path in outputs):
             return
+        require_writable(self.folder)
         begin = time.perf_counter()
         work()
         record = {"key": key, "seconds": time.perf_counter() - begin}
-        path = self.folder / "stages.json"
-        stages = read_json(path) if path.is_file() else {}
-        write_json(path, {**stages, name: record})
+        write_json(self.folder / "stages.json", {**self._record(), name: record})
 
 
 def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
