@@ -44,6 +44,7 @@ __all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
 
 FORMAT = "modeharvest-images-1"
 SIDECAR = "images.json"
+_OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,14 +294,11 @@ def _file_names(entry: dict[str, Any]) -> list[str]:
 
 
 def _discard(folder: Path) -> None:
-    """Take away an older set, the mark of completeness first."""
-    try:
-        info = read_json(folder / SIDECAR)
-        names = [Path(name).name for name in info["files"]]
-    except (InputError, KeyError, TypeError):
-        names = []
-    for name in (SIDECAR, *names):
-        (folder / name).unlink(missing_ok=True)
+    """Take away an older or an unfinished set, the mark of completeness first."""
+    (folder / SIDECAR).unlink(missing_ok=True)
+    for pattern in _OWN_FILES:
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
 
 
 def _label(strain: float) -> str:

@@ -14,7 +14,7 @@ import pytest
 from modeharvest import cli
 from modeharvest.case import read_case
 from modeharvest.errors import InputError
-from modeharvest.files import read_json
+from modeharvest.files import read_json, write_json
 from modeharvest.pipeline import Run, run
 
 CASE = """
@@ -178,7 +178,9 @@ def test_a_truncated_file_is_named(
     stage: str,
     said: str,
 ) -> None:
-    (folder / "stages.json").unlink()  # so that no stage counts as finished
+    stages = read_json(folder / "stages.json")
+    del stages[stage]
+    write_json(folder / "stages.json", stages)
     path = folder / victim
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert command(monkeypatch, stage, case, "--out", folder) == 2
@@ -186,6 +188,26 @@ def test_a_truncated_file_is_named(
     (line,) = [row for row in text.splitlines() if row.startswith("error:")]
     assert said in line
     assert Path(victim).name in line
+
+
+def test_results_and_images_of_another_case_are_not_taken(case: Path, folder: Path) -> None:
+    other = case.with_name("other_start.toml")
+    text = case.read_text("utf-8")
+    other.write_text(text + "[correlation]\nstart_amplitude = 2.0\n", "utf-8")
+    with pytest.raises(InputError, match="results of this case"):
+        Run(read_case(other), folder).validate()
+    other.write_text(text.replace("seed = 3", "seed = 4"), "utf-8")
+    with pytest.raises(InputError, match="images made with this case's options"):
+        Run(read_case(other), folder).correlate()
+
+
+def test_a_stage_that_fails_leaves_no_older_result(case: Path, folder: Path) -> None:
+    (folder / "images" / "deformed_1500.tif").write_bytes(b"")
+    other = case.with_name("other_order.toml")
+    other.write_text(case.read_text("utf-8") + "[correlation]\norder = 3\n", "utf-8")
+    with pytest.raises(InputError, match="deformed_1500"):
+        Run(read_case(other), folder).correlate()
+    assert not (folder / "correlation" / "result_1500.json").exists()
 
 
 def test_a_solution_without_the_strains_is_refused(case: Path, folder: Path) -> None:

@@ -97,24 +97,40 @@ class Run:
         return ImageSet.read(folder)
 
     def correlate(self) -> dict[float, Result]:
-        """Correlate every deformed image with the reference; leaves ``correlation/``."""
-        images = ImageSet.read(self.folder / "images")
+        """Correlate every deformed image with the reference; leaves ``correlation/``.
+
+        Raises
+        ------
+        InputError
+            If the images were made with other options than this case's.
+        """
+        images = self._images()
         paths = {strain: self._result_path(strain) for strain in images.strains}
-        key = _digest([images.info["key"], self.case.plain()["correlation"], __version__])
 
         def work() -> None:
             for strain, path in paths.items():
                 self._correlate_one(images, strain).write(path)
 
-        self._stage("correlate", key, work, *paths.values())
+        self._stage("correlate", self._correlate_key(images), work, *paths.values())
         return {strain: Result.read(path) for strain, path in paths.items()}
 
     def validate(self) -> dict[str, Any]:
-        """Compare the results with the truth; leaves ``report.html`` and ``summary.json``."""
-        images = ImageSet.read(self.folder / "images")
+        """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If the results are not of these images and this case.
+        """
+        images = self._images()
+        key = self._correlate_key(images)
+        if self._finished("correlate").get("key") != key:
+            raise InputError(
+                f"expected results of this case in {self.folder / 'correlation'}, found none that "
+                "are finished; make them with 'modeharvest correlate'"
+            )
         results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
         path = self.folder / "summary.json"
-        key = _digest([self._finished("correlate").get("key"), __version__])
 
         def work() -> None:
             case = self.case
@@ -123,6 +139,7 @@ class Run:
             taken = {stage: self._finished(stage).get("seconds") for stage in STAGES[:-1]}
             validate(measured, case.plain(), taken, self.folder, self.progress)
 
+        key = _digest([key, self.case.title, __version__])
         self._stage("validate", key, work, path, self.folder / "report.html")
         summary: dict[str, Any] = read_json(path)
         return summary
@@ -146,6 +163,18 @@ class Run:
         return summary
 
     # -- parts --------------------------------------------------------------------------
+
+    def _images(self) -> ImageSet:
+        images = ImageSet.read(self.folder / "images")
+        if images.spec != self.case.imaging:
+            raise InputError(
+                f"expected images made with this case's options in {images.folder}, found others; "
+                "make them again with 'modeharvest image'"
+            )
+        return images
+
+    def _correlate_key(self, images: ImageSet) -> str:
+        return _digest([images.info["key"], self.case.plain()["correlation"], __version__])
 
     def _experiment(self) -> list[Any]:
         return [self.case.plain()["experiment"], __version__]
@@ -220,6 +249,8 @@ class Run:
         if done.get("key") == key and all(path.is_file() for path in outputs):
             return
         require_writable(self.folder)
+        for path in outputs:  # what is there is of other inputs: not to be taken for this
+            path.unlink(missing_ok=True)
         begin = time.perf_counter()
         work()
         record = {"key": key, "seconds": time.perf_counter() - begin}
