@@ -14,6 +14,7 @@ import pytest
 from modeharvest import cli
 from modeharvest.case import read_case
 from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.pipeline import Run, run
 
@@ -230,6 +231,26 @@ def test_strain_beyond_what_converges_is_told_and_the_rest_is_kept(
     assert "45 %" in line
     summary = read_json(tmp_path / "out" / "summary.json")
     assert [s["nominal_strain"] for s in summary["snapshots"]] == [0.02]
+
+
+def test_under_mpirun_one_rank_writes_and_talks(case: Path, finished: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "modeharvest",
+        "fem",
+        str(case),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    done = subprocess.run(
+        ["mpirun", "-n", "2", *command], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("critical strain") == 1
+    ours = Solution.read(tmp_path / "out" / "solution.h5")
+    theirs = Solution.read(finished / "solution.h5")
+    assert abs(ours.info["critical"]["strain"] - theirs.info["critical"]["strain"]) < 1e-8
 
 
 def test_a_full_disk_leaves_nothing_that_looks_finished(case: Path, tmp_path: Path) -> None:

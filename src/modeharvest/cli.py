@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +18,7 @@ from modeharvest import __version__
 from modeharvest.case import case_text, read_case, shipped_cases
 from modeharvest.console import ProgressBars
 from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.ranks import is_first
 
 app = typer.Typer(
     help=(
@@ -161,7 +164,7 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     }
     for label, key in rows.items():
         table.add_row(escape(label), *(_cell(s.get(key)) for s in summary["snapshots"]))
-    console = Console()
+    console = Console(highlight=False)
     console.print(table)
     console.print("rms: per component, over all material pixels")
     if summary.get("critical_strain") is not None:
@@ -184,6 +187,15 @@ class _InterruptedError(Exception):
 
 def main() -> None:
     """Entry point of the ``modeharvest`` command."""
+    if is_first():
+        _run()
+    else:  # under mpirun one speaks for all
+        _errors.quiet = True
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+            _run()
+
+
+def _run() -> None:
     try:
         app()
     except (InputError, MissingDependencyError) as error:

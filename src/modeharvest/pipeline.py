@@ -30,6 +30,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.progress import Progress, silent
+from modeharvest.ranks import agreed, is_first
 from modeharvest.validation.study import Measured, validate
 
 STAGES = ("fem", "image", "correlate", "validate")
@@ -74,12 +75,13 @@ class Run:
         path = self.folder / "solution.h5"
 
         def work() -> None:
-            solution, is_writer = self._simulate()
-            if is_writer:
+            solution = self._simulate()
+            if is_first():
                 solution.write(path)
                 solution.write_vtu(path.with_suffix(".vtu"))
 
-        self._stage("fem", _digest(self._experiment()), work, path)
+        key = _digest([self.case.plain()["experiment"], __version__])
+        self._stage("fem", key, work, path, collective=True)
         return Solution.read(path)
 
     def image(self) -> ImageSet:
@@ -176,20 +178,15 @@ class Run:
     def _correlate_key(self, images: ImageSet) -> str:
         return _digest([images.info["key"], self.case.plain()["correlation"], __version__])
 
-    def _experiment(self) -> list[Any]:
-        return [self.case.plain()["experiment"], __version__]
-
-    def _simulate(self) -> tuple[Solution, bool]:
+    def _simulate(self) -> Solution:
         try:
-            from mpi4py import MPI
-
             from modeharvest.fem.simulate import simulate
         except ImportError as error:
             shipped = self._shipped()
             if shipped is None:
                 raise MissingDependencyError(_NO_DOLFINX) from error
-            return shipped, True
-        return simulate(self.case.experiment, self.progress), MPI.COMM_WORLD.rank == 0
+            return shipped
+        return simulate(self.case.experiment, self.progress)
 
     def _shipped(self) -> Solution | None:
         """The solution that comes with the package, if it is of this very experiment."""
@@ -243,18 +240,32 @@ class Run:
         except (InputError, TypeError, ValueError):
             return {}
 
-    def _stage(self, name: str, key: str, work: Callable[[], object], *outputs: Path) -> None:
-        """Do the work unless it was finished with the same key and its files are there."""
-        done = self._finished(name)
-        if done.get("key") == key and all(path.is_file() for path in outputs):
+    def _stage(
+        self,
+        name: str,
+        key: str,
+        work: Callable[[], object],
+        *outputs: Path,
+        collective: bool = False,
+    ) -> None:
+        """Do the work unless it was finished with the same key and its files are there.
+
+        Under mpirun, rank 0 does it alone and the others wait, unless it is ``collective``.
+        """
+        finished = self._finished(name).get("key") == key
+        if agreed(finished and all(path.is_file() for path in outputs)):
             return
-        require_writable(self.folder)
-        for path in outputs:  # what is there is of other inputs: not to be taken for this
-            path.unlink(missing_ok=True)
         begin = time.perf_counter()
-        work()
-        record = {"key": key, "seconds": time.perf_counter() - begin}
-        write_json(self.folder / "stages.json", {**self._record(), name: record})
+        if is_first():
+            require_writable(self.folder)
+            for path in outputs:  # what is there is of other inputs: not to be taken for this
+                path.unlink(missing_ok=True)
+        if is_first() or collective:
+            work()
+        if is_first():
+            record = {"key": key, "seconds": time.perf_counter() - begin}
+            write_json(self.folder / "stages.json", {**self._record(), name: record})
+        agreed(True)  # nobody reads the files before they are there
 
 
 def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
