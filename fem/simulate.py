@@ -152,7 +152,7 @@ class _Run:
         e = self.experiment
         return {
             "specimen": asdict(e.specimen),
-            "material": {"kind": type(e.material).__name__, **asdict(e.material)},  # type: ignore[call-overload]
+            "material": {"kind": type(e.material).__name__, **vars(e.material)},
             "loading": {"edges": e.edges, "length_mm": e.specimen.length},
             "mesh_size_mm": e.mesh_size,
             "imperfection": asdict(e.imperfection),

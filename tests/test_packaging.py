@@ -140,7 +140,6 @@ def test_the_installed_version_is_the_package_s(installed: Path, tmp_path: Path)
     assert run(installed, "-c", script, cwd=tmp_path).strip() == modeharvest.__version__
 
 
-@pytest.mark.skipif(not (SOURCE / "cli.py").exists(), reason="there is no command line yet")
 def test_the_installed_command_says_its_version(installed: Path, tmp_path: Path) -> None:
     command = installed.with_name("modeharvest")
     assert modeharvest.__version__ in run(command, "--version", cwd=tmp_path)

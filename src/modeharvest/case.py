@@ -63,10 +63,14 @@ class Case(BaseModel):
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""
         content = {name: getattr(self, name) for name in type(self).model_fields}
-        content = {k: asdict(v) if is_dataclass(v) else v for k, v in content.items()}  # type: ignore[arg-type]
+        content = {k: _as_plain(v) for k, v in content.items()}
         kinds = {cls: kind for kind, cls in MATERIALS.items()}
         content["experiment"]["material"]["kind"] = kinds[type(self.experiment.material)]
         return content
+
+
+def _as_plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def shipped_cases() -> dict[str, str]:

@@ -136,8 +136,8 @@ class Run:
 
         def work() -> None:
             case = self.case
-            specimen, how = case.experiment.specimen, case.correlation
-            measured = Measured(specimen, how, self._solution(), images, results)
+            experiment, how = case.experiment, case.correlation
+            measured = Measured(experiment, how, self._solution(), images, results)
             taken = {stage: self._finished(stage).get("seconds") for stage in STAGES[:-1]}
             validate(measured, case.plain(), taken, self.folder, self.progress)
 
