@@ -1,0 +1,237 @@
+"""A periodic cell under macroscopic loading: equilibrium, effective stiffness, path.
+
+The displacement is u = (F̄ - I) X + w with a periodic fluctuation w. Unknown are the masters'
+fluctuations and those components of F̄ whose mean stress is prescribed; one master is held,
+because translations cost nothing. The fluctuation's factor serves the few macroscopic unknowns
+by block elimination, which gives the lattice's effective tangent moduli as a by-product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array
+
+from modeharvest.fem.body import FreeBody
+from modeharvest.fem.lattices import UnitCell
+from modeharvest.fem.macroscopic import MacroLoading
+from modeharvest.fem.materials import Material
+from modeharvest.fem.reduction import Reduction, factorise
+
+FloatArray = NDArray[np.float64]
+
+_ITERATIONS = 12
+_SMALLEST_STEP = 1e-6  # of the load
+# Forces must be smaller than what a change of the load by this would make.
+_LOAD_TOLERANCE = 1e-11
+_AT_REST = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CellState:
+    """An equilibrium of a cell on its primary path.
+
+    Parameters
+    ----------
+    load
+        The load parameter e: for compressions the nominal strain [-].
+    gradient, gradient_rate
+        (2, 2) F̄ and dF̄/de [-].
+    fluctuation, fluctuation_rate
+        (2 count,) w of the masters in the order of ``Reduction``, and dw/de [mm].
+    stress
+        (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
+    stiffness
+        (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
+    moduli
+        (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
+    """
+
+    load: float
+    gradient: FloatArray
+    gradient_rate: FloatArray
+    fluctuation: FloatArray
+    fluctuation_rate: FloatArray
+    stress: FloatArray
+    stiffness: csr_array
+    moduli: FloatArray
+
+
+class PeriodicCell:
+    """One cell of a lattice with a material: what its equilibrium equations need.
+
+    ``mass`` is the reduced mass matrix of unit density [mm^2], ``filling`` the share of the cell
+    that is material [-]; ``factorisations`` counts every factorisation of an equilibrium.
+
+    Parameters
+    ----------
+    cell
+        Mesh and lattice vectors [mm]; primitive or enlarged.
+    material
+        Strain energy density [MPa].
+    """
+
+    def __init__(self, cell: UnitCell, material: Material) -> None:
+        self.cell = cell
+        self.body = FreeBody(cell.mesh, material)
+        mass = self.body.mass()
+        self.reduction = Reduction(mass, cell.periodicity)
+        self.mass = self.reduction.reduced(mass)
+        self.filling = float(mass.sum()) / (2.0 * cell.area)
+        self.factorisations = 0
+        # Displacements of F̄_11, F̄_12, F̄_21, F̄_22 = 1 (the others 0), as columns.
+        X, zero = cell.mesh.nodes, np.zeros(len(cell.mesh.nodes))
+        modes = [(X[:, 0], zero), (X[:, 1], zero), (zero, X[:, 0]), (zero, X[:, 1])]
+        self._affine = np.stack([np.stack(m, axis=1).ravel() for m in modes], axis=1)
+        self._moving = self.reduction.order // 2 != 0  # master 0 is held
+
+    def displacement(self, state: CellState) -> FloatArray:
+        """(n, 2) displacement of the mesh's nodes, affine part included [mm]."""
+        return self._displacement(state.gradient.ravel(), state.fluctuation)
+
+    def equilibrium(
+        self, loading: MacroLoading, load: float, near: CellState | None = None
+    ) -> CellState | None:
+        """The equilibrium at a load, by Newton's method along the tangent of a state nearby.
+
+        None where Newton's method does not arrive, or arrives at a reversed element.
+        """
+        F: FloatArray = np.eye(2).ravel()
+        w: FloatArray = np.zeros(self.reduction.size)
+        if near is not None:
+            F = (near.gradient + (load - near.load) * near.gradient_rate).ravel()
+            w = near.fluctuation + (load - near.load) * near.fluctuation_rate
+        F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
+        for _ in range(_ITERATIONS):
+            system = _System(self, loading, load, F, w)
+            if not system.is_finite:
+                return None
+            if system.is_solved:
+                u = self._displacement(F, w)
+                return system.state() if self.body.smallest_jacobian(u) > 0 else None
+            dF, dw = system.step()
+            F, w = F + dF, w + dw
+        return None
+
+    def _displacement(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
+        affine = (self._affine @ (gradient - np.eye(2).ravel())).reshape(-1, 2)
+        return np.asarray(affine + self.reduction.displacement(fluctuation, _AT_REST))
+
+
+class _System:
+    """The linearised equations of a cell at a trial state."""
+
+    def __init__(
+        self,
+        cell: PeriodicCell,
+        loading: MacroLoading,
+        load: float,
+        gradient: FloatArray,
+        fluctuation: FloatArray,
+    ) -> None:
+        self.cell, self.loading, self.load = cell, loading, load
+        self.gradient, self.fluctuation = gradient, fluctuation
+        self.area = cell.cell.area
+        u = cell._displacement(gradient, fluctuation)
+        forces = cell.body.forces(u)
+        self.forces = cell.reduction.gathered(forces)[cell._moving]
+        self.macro_forces = cell._affine.T @ forces
+        self.is_finite = bool(np.isfinite(forces).all())
+        if self.is_finite:
+            self._eliminate(cell.body.stiffness(u))
+
+    def _eliminate(self, stiffness: csr_array) -> None:
+        """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
+        cell, moving = self.cell, np.flatnonzero(self.cell._moving)
+        self.stiffness, self.on_affine = stiffness, stiffness @ cell._affine
+        self.coupling = cell.reduction.gathered(self.on_affine)[moving]
+        inner = cell.reduction.reduced(stiffness).at(_AT_REST)[moving][:, moving]
+        self._factor: Any = factorise(csc_array(inner))
+        cell.factorisations += 1
+        self.response = -self._factor.solve(self.coupling)
+        self.condensed = cell._affine.T @ self.on_affine + self.coupling.T @ self.response
+        free = self.loading.free
+        self.rate = self.loading.rate
+        self.rate[free] = np.linalg.solve(
+            self.condensed[np.ix_(free, free)],
+            (self.area * self.loading.dead - self.condensed @ self.rate)[free],
+        )
+
+    @property
+    def _unbalanced(self) -> FloatArray:
+        """(4,) mean stress in excess of what is prescribed, times the area [N]; 0 elsewhere."""
+        excess = self.macro_forces - self.area * self.load * self.loading.dead
+        return np.where(self.loading.free, excess, 0.0)
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether no force, inner or macroscopic, is left."""
+        inner = _LOAD_TOLERANCE * np.linalg.norm(self.on_affine @ self.rate)
+        outer = _LOAD_TOLERANCE * np.linalg.norm(self.condensed) * np.linalg.norm(self.rate)
+        return bool(
+            np.linalg.norm(self.forces) <= inner and np.linalg.norm(self._unbalanced) <= outer
+        )
+
+    def step(self) -> tuple[FloatArray, FloatArray]:
+        """Newton's changes of F̄ (4,) and of the fluctuation."""
+        free, relaxed = self.loading.free, -self._factor.solve(self.forces)
+        dF = np.zeros(4)
+        dF[free] = np.linalg.solve(
+            self.condensed[np.ix_(free, free)],
+            -(self._unbalanced + self.coupling.T @ relaxed)[free],
+        )
+        return dF, self._full(relaxed + self.response @ dF)
+
+    def state(self) -> CellState:
+        """The state reached, with its rates and moduli."""
+        return CellState(
+            load=self.load,
+            gradient=self.gradient.reshape(2, 2),
+            gradient_rate=self.rate.reshape(2, 2),
+            fluctuation=self.fluctuation,
+            fluctuation_rate=self._full(self.response @ self.rate),
+            stress=np.asarray(self.macro_forces.reshape(2, 2) / self.area),
+            stiffness=self.stiffness,
+            moduli=self.condensed.reshape(2, 2, 2, 2) / self.area,
+        )
+
+    def _full(self, moving: FloatArray) -> FloatArray:
+        every = np.zeros(self.cell.reduction.size)
+        every[self.cell._moving] = moving
+        return every
+
+
+@dataclass(eq=False)
+class CellPath:
+    """The primary path of a cell under one loading; states already found are kept."""
+
+    cell: PeriodicCell
+    loading: MacroLoading
+    states: list[CellState] = field(default_factory=list)
+
+    def at(self, load: float) -> CellState | None:
+        """The equilibrium at a load [-], from the nearest state known by as many steps as needed.
+
+        None where steps down to 1e-6 don't converge.
+        """
+        if not self.states:
+            start = self.cell.equilibrium(self.loading, 0.0)
+            if start is None:
+                return None
+            self.states.append(start)
+        here = min(self.states, key=lambda state: abs(state.load - load))
+        step = load - here.load
+        while here.load != load:
+            to = load if abs(load - here.load) <= abs(step) else here.load + step
+            found = self.cell.equilibrium(self.loading, to, here)
+            if found is None:
+                step *= 0.5
+                if abs(step) < _SMALLEST_STEP:
+                    return None
+                continue
+            self.states.append(found)
+            here = found
+        return here
