@@ -107,7 +107,7 @@ class PeriodicCell:
         F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
         for _ in range(_ITERATIONS):
             system = _System(self, loading, load, F, w)
-            if not system.is_finite:
+            if not system.is_regular:
                 return None
             if system.is_solved:
                 u = self._displacement(F, w)
@@ -139,8 +139,8 @@ class _System:
         forces = cell.body.forces(u)
         self.forces = cell.reduction.gathered(forces)[cell._moving]
         self.macro_forces = cell._affine.T @ forces
-        self.is_finite = bool(np.isfinite(forces).all())
-        if self.is_finite:
+        self.is_regular = bool(np.isfinite(forces).all())
+        if self.is_regular:
             self._eliminate(cell.body.stiffness(u))
 
     def _eliminate(self, stiffness: csr_array) -> None:
@@ -149,8 +149,12 @@ class _System:
         self.stiffness, self.on_affine = stiffness, stiffness @ cell._affine
         self.coupling = cell.reduction.gathered(self.on_affine)[moving]
         inner = cell.reduction.reduced(stiffness).at(_AT_REST)[moving][:, moving]
-        self._factor: Any = factorise(csc_array(inner))
         cell.factorisations += 1
+        try:
+            self._factor: Any = factorise(csc_array(inner))
+        except RuntimeError:  # SuperLU: exactly singular
+            self.is_regular = False
+            return
         self.response = -self._factor.solve(self.coupling)
         self.condensed = cell._affine.T @ self.on_affine + self.coupling.T @ self.response
         free = self.loading.free

@@ -171,25 +171,36 @@ def _chunks(numbers: IntArray, size: int) -> Iterator[IntArray]:
 
 
 def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
-    """The lattice must be one body: translations along cycles must span the plane's lattice."""
+    """The lattice must be one body that holds together along both lattice vectors."""
+    piece = _pieces(found.master[mesh.cells], found.count)[found.master]
+    if piece.max() > 0:
+        largest = np.argmax(np.bincount(piece))
+        raise InputError(
+            "periodic cell: expected one body, got parts that nothing holds: "
+            f"{_named(np.flatnonzero(piece != largest), mesh.nodes)}; connect or remove them"
+        )
     shifts = _cycle_shifts(mesh, found)
     rank = np.linalg.matrix_rank(shifts) if len(shifts) else 0
-    if rank == 2:
-        return
-    alone = np.unique(sides)[np.bincount(found.master)[found.master[np.unique(sides)]] == 1]
-    raise InputError(
-        "periodic cell: expected the lattice to hold together along both lattice vectors, but "
-        f"{'no' if rank == 0 else 'only one'} direction has partners; without one are "
-        f"{_named(alone, mesh.nodes)}; check the lattice vectors"
-    )
+    if rank < 2:
+        outline = np.unique(sides)
+        alone = outline[np.bincount(found.master)[found.master[outline]] == 1]
+        raise InputError(
+            "periodic cell: expected the lattice to hold together along both lattice vectors, but "
+            f"{'no' if rank == 0 else 'only one'} direction has partners; without one are "
+            f"{_named(alone, mesh.nodes)}; check the lattice vectors"
+        )
+
+
+def _pieces(cells: IntArray, count: int) -> IntArray:
+    """(count,) which connected piece each node belongs to."""
+    start, end = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    links = coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 def _cycle_shifts(mesh: Mesh, found: Periodicity) -> IntArray:
     """(p, 2) differing shifts of nodes that are the same master and in the same piece."""
-    n = len(mesh.nodes)
-    start, end = np.repeat(mesh.cells[:, 0], 6), mesh.cells.ravel()
-    links = coo_array((np.ones(len(start)), (start, end)), shape=(n, n))
-    _, piece = connected_components(links, directed=False)
+    piece = _pieces(mesh.cells, len(mesh.nodes))
     order = np.lexsort((piece, found.master))
     same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
     return np.asarray(np.unique(np.diff(found.shift[order], axis=0)[same], axis=0))

@@ -126,6 +126,15 @@ def test_lattice_vectors_that_do_not_fit_are_refused(lattice: FloatArray, messag
         find_periodicity(SQUARE.mesh, lattice)
 
 
+def test_a_part_that_nothing_holds_is_named() -> None:
+    island = plate(0.2, 0.2, 1, 1)  # in the hole
+    first = len(SQUARE.mesh.nodes)
+    nodes = np.vstack([SQUARE.mesh.nodes, island.nodes])
+    mesh = Mesh(nodes, np.vstack([SQUARE.mesh.cells, island.cells + first]), "T6")
+    with pytest.raises(InputError, match=rf"one body.* {first} at"):
+        UnitCell(mesh, np.eye(2))
+
+
 def test_bad_cells_are_refused() -> None:
     with pytest.raises(InputError, match="must not touch"):
         square(1.0, 1.0, SIZE)
