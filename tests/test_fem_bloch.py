@@ -23,6 +23,7 @@ from modeharvest.fem.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattices import HEXAGONAL_ZONE, SQUARE_ZONE, UnitCell, hexagonal, square
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.fem.meshing import join, rectangle
 from modeharvest.fem.reduction import factorise, negative_pivots
 from modeharvest.fem.zone import Zone, folded, is_same, zone_path
 
@@ -48,6 +49,16 @@ def waves_of(kind: str, load: float, copies: int = 1) -> BlochWaves:
     state = CellPath(cell, uniaxial()).at(load)
     assert state is not None
     return BlochWaves(cell, state)
+
+
+def columns_with_ties() -> UnitCell:
+    """Columns 0.3 mm wide and 1 mm apart, with a tie 0.1 mm thick every millimetre."""
+    half, column, tie = 0.45, 0.3, 0.1
+    low, middle = rectangle(column, half, 3, 4), rectangle(column, tie, 3, 1)
+    beside = rectangle(1.0 - column, tie, 8, 1)
+    places = [(low, (0.0, 0.0)), (middle, (0.0, half)), (low, (0.0, half + tie))]
+    blocks = [block.placed((1.0, 1.0), at) for block, at in [*places, (beside, (column, half))]]
+    return UnitCell(join(blocks, 1e-7), np.eye(2))
 
 
 def path_of(cell: UnitCell, loading: MacroLoading) -> CellPath:
@@ -205,6 +216,32 @@ def test_the_first_critical_point_does_not_depend_on_the_cell() -> None:
     twice = first_critical(path_of(cell_of("square", 6, 2), uniaxial()), search)
     assert twice.load == pytest.approx(once.load, rel=1e-6)
     assert twice.waves == ((0.0, 0.0),)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_a_critical_wave_between_the_points_of_the_grid_is_found(kind: str) -> None:
+    path = path_of(cell_of(kind, 6), equibiaxial())
+    on = first_critical(path)
+    off = first_critical(path, CriticalSearch(divisions=3))  # no M among its points
+    assert off.load == pytest.approx(on.load, rel=1e-6)  # stationary: of second order in k
+    assert any(is_same(off.waves[0], wave) for wave in on.waves)
+
+
+def test_columns_with_slender_ties_sway_together() -> None:
+    # The effective medium loses ellipticity first: known of frames, e.g. Triantafyllidis &
+    # Schnaidt, J. Mech. Phys. Solids 41 (1993) 1533-1565.
+    path = path_of(columns_with_ties(), uniaxial(1))
+    found = first_critical(path)
+    assert found.waves == ()
+    angle = found.least.angle
+    assert angle is not None
+    assert abs(math.sin(angle)) == pytest.approx(1.0, abs=1e-4)  # k along the columns
+    before, after = path.at(0.99 * found.load), path.at(1.01 * found.load)
+    assert before is not None
+    assert after is not None
+    long: Wave = (0.0, 0.02)
+    assert BlochWaves(path.cell, before).unstable(long) == 0
+    assert BlochWaves(path.cell, after).unstable(long) == 1
 
 
 def test_a_stable_lattice_is_an_outcome_not_a_failure() -> None:
