@@ -12,6 +12,7 @@ from modeharvest.fem.continuation import MODES, State, Walker, along, interpolat
 from modeharvest.fem.stability import Mode
 
 _SEARCHES = 20  # equilibria tried on the way to one critical point
+_ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to become
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,8 @@ def locate_critical(walker: Walker, low: State, high: State) -> Critical | None:
     Interpolates the critical eigenvalue between equilibria, within the bracket that the
     inertia gives. Where the inertia below the point found is not zero, another mode
     became critical earlier, and that one is looked for. None if an equilibrium in
-    between can't be found.
+    between can't be found, or if no eigenvalue passes zero: then the two states are not on
+    one path.
     """
     modes = walker.modes
     for _ in range(MODES):
@@ -54,6 +56,9 @@ def locate_critical(walker: Walker, low: State, high: State) -> Critical | None:
         if found is None:
             return None
         low, critical, below = found
+        (_, first), (_, last) = critical.eigenvalues[0], critical.eigenvalues[-1]
+        if abs(last) > _ZERO * abs(first):
+            return None
         if below is None or below.negative_pivots == 0:
             return critical
         high, modes = below, walker.modes

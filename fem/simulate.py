@@ -52,22 +52,37 @@ class _Run:
 
     def solution(self) -> Solution:
         """Walk the path and put together what it gave."""
-        strains = self.experiment.strains
-        perfect = self.experiment.imperfection.is_none
-        path = [self.walker.start()]
-        self.walker.primary(path, strains, until_unstable=perfect, refuse_unstable=not perfect)
-        critical, branches = None, {}
-        if path[-1].negative_pivots > 0:
-            critical = locate_critical(self.walker, path[-2], path[-1])
-            self.walker.primary(path, strains)
-            if critical is not None:
-                branches = self._branches(self._oriented(critical))
+        path, critical = self._primary()
+        branches = {} if critical is None else self._branches(self._oriented(critical))
         limit = _stable_until(path, critical)
         snapshots = self._snapshots(path, limit, branches)
         info = self._info(path, critical, branches)
         info["outcome"] = self._outcome(snapshots, limit, {"primary": path, **branches})
         info["warnings"] = self._warnings(snapshots)
         return Solution(self.mesh, tuple(snapshots), info)
+
+    def _primary(self) -> tuple[list[State], Critical | None]:
+        """The primary path through all strains, and where it becomes unstable.
+
+        Without a bifurcation there is one natural path, which bends where the pattern sets in:
+        in an imperfect specimen, and in one with an odd number of holes both ways, whose
+        pattern has the specimen's own symmetries. Long steps slip off it, so it is walked
+        again from the last stable state, and no unstable one is accepted.
+        """
+        strains = self.experiment.strains
+        path = [self.walker.start()]
+        if self.experiment.imperfection.is_none:
+            self.walker.primary(path, strains, until_unstable=True)
+            if path[-1].negative_pivots == 0:
+                return path, None
+            critical = locate_critical(self.walker, path[-2], path[-1])
+            if critical is not None:
+                self.walker.primary(path, strains)
+                return path, critical
+            path.pop()
+            self.walker.factor = None
+        self.walker.primary(path, strains, refuse_unstable=True)
+        return path, None
 
     def _oriented(self, critical: Critical) -> Critical:
         """The critical point with its mode turned to a positive overlap with the pattern.

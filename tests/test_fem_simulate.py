@@ -166,6 +166,28 @@ def test_specimen_that_stays_stable_has_no_critical_strain() -> None:
     assert [(s.branch, s.negative_pivots) for s in solution.snapshots] == [("primary", 0)] * 2
 
 
+def test_odd_numbers_of_holes_both_ways_have_no_bifurcation_into_the_pattern() -> None:
+    """There the pattern has both mirror symmetries of the specimen, as the primary path has.
+
+    So the path itself bends into the pattern and stays stable; long steps slip off it, and
+    have to end where short ones do.
+    """
+    specimen = Specimen(5, 7)
+    found = []
+    for step in (0.026, 0.01):
+        path = PathOptions(first_step=step, largest_step=step)
+        solution = simulate(Experiment(specimen, strains=(0.05, 0.12), mesh_size=0.35, path=path))
+        assert solution.info["critical"] is None
+        assert solution.info["outcome"] == "complete"
+        assert not any(solution.info["path"]["primary"]["negative_pivots"])
+        found.append(solution)
+    pattern = specimen.pattern(found[0].mesh.nodes)
+    small, large = (abs(np.vdot(pattern, s.displacement)) for s in found[0].snapshots)
+    assert large > 20 * small
+    before, after = (s.snapshots[1].displacement for s in found)
+    np.testing.assert_allclose(before, after, atol=1e-6)
+
+
 def test_scatter_leads_to_the_perfect_branch_as_it_vanishes() -> None:
     specimen = Specimen(4, 2)
     perfect = simulate(small(specimen=specimen, strains=(0.17,), branches=ALL)).snapshots
