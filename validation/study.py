@@ -13,6 +13,7 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``pattern_amplitude_px``, ``pattern_inner_px``, ``pattern_corners_px`` (largest length of
     v1 phi1), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
     [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
+    ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
     ``mode_standard_error``, ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
     the full image), ``iterations_all_levels``, ``outcome``, ``outcome_why``,
     ``condition_number``, ``undetermined``, ``pixels``, ``details_px`` (more statistics of w,
@@ -177,7 +178,8 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "idic_to_best_fit": comparison.idic_to_best,
     }
     px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
-    pitch = specimen.pitch
+    phi, pitch = result.ansatz.phi_slice(0), specimen.pitch
+    ideal = measured.how.start(result.ansatz, specimen, comparison.strain)[phi]
     return {
         "nominal_strain": comparison.strain,
         "branch": state.branch,
@@ -189,10 +191,11 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "rms_best_fit_px": px["best_fit"]["rms_per_component"],
         "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
         "rms_residual": result.residual_rms,
-        "mode": mode_equivalent(result.mode_parameters(), pitch)[0].tolist(),
-        "mode_standard_error": _plain(result.standard_errors()[result.ansatz.phi_slice(0)]),
-        "mode_deviation_percent": mode_deviation(result.mode_parameters(), pitch).tolist(),
-        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch)[0].tolist(),
+        "mode": mode_equivalent(result.mode_parameters(), pitch, ideal)[0].tolist(),
+        "mode_ideal": ideal.tolist(),
+        "mode_standard_error": _plain(result.standard_errors()[phi]),
+        "mode_deviation_percent": mode_deviation(result.mode_parameters(), pitch, ideal).tolist(),
+        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
         "iterations": result.iterations,
         "iterations_all_levels": len(result.history),
         "outcome": result.outcome.name.lower(),

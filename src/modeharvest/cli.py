@@ -87,8 +87,7 @@ def fem(case: CaseName, out: OutFolder) -> None:
     """
     solution = _with_bars(case, out, None, lambda stages: stages.fem())
     critical = solution.info.get("critical")
-    if critical is not None:
-        print(f"critical strain {100 * critical['strain']:.4f} %")
+    print(_critical_line(None if critical is None else critical["strain"]))
     for s in solution.snapshots:
         print(f"{100 * s.nominal_strain:6.2f} %  {s.branch:9}  negative pivots {s.negative_pivots}")
     for warning in solution.info.get("warnings", []):
@@ -167,14 +166,19 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print("rms: per component, over all material pixels")
-    if summary.get("critical_strain") is not None:
-        console.print(f"critical strain {100 * summary['critical_strain']:.4f} %")
+    console.print(_critical_line(summary["critical_strain"]))
     missed = [row["quantity"] for row in summary["expected"] if not row["ok"]]
     for warning in summary["warnings"]:
         console.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
     if summary["expected"]:
         console.print(f"expected values missed: {', '.join(missed) or 'none'}")
     console.print(f"report: {out / 'report.html'}")
+
+
+def _critical_line(strain: float | None) -> str:
+    if strain is None:
+        return "no bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
+    return f"critical strain {100 * strain:.4f} %"
 
 
 def _cell(value: object) -> str:
