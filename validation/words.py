@@ -63,8 +63,9 @@ def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 def mode_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Rows of the mode's parameters: for each snapshot value, standard error and best fit."""
     snapshots = [s for s in summary["snapshots"] if len(s.get("mode", ())) == len(_MODE)]
+    ideal = snapshots[0].get("mode_ideal", REFERENCE_MODE) if snapshots else REFERENCE_MODE
     return [
-        {"name": name, "unit": unit, "ideal": _item(snapshots[0].get("mode_ideal", REFERENCE_MODE), k),
+        {"name": name, "unit": unit, "ideal": ideal[k],
          "cells": [{"value": s["mode"][k], "error": _item(s.get("mode_standard_error"), k),
                     "best": _item(s.get("mode_best_fit"), k)} for s in snapshots]}
         for k, (name, unit) in enumerate(_MODE) if snapshots
