@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 
 from modeharvest.fem.cell import CellState, PeriodicCell
+from modeharvest.fem.condensation import Condensation, CondensedWave
 from modeharvest.fem.reduction import factorise, negative_pivots
 
 FloatArray = NDArray[np.float64]
 Wave = tuple[float, float]
 
 _LARGEST_SPACE = 60  # of the Lanczos iteration, in blocks
-_SCAN_TOLERANCE = 1e-9
-_NOISE = 0.1  # in a start vector, relative
+_SCAN_TOLERANCE = 1e-9  # of lambda + s, relative
+_NOISE = 0.2  # in a start vector, relative
 _DIRECTIONS = 36  # over half a turn
 
 
@@ -67,7 +68,7 @@ class BlochWaves:
         # Eigenvalues are looked for from below, so that Γ with its translations is regular.
         scale = np.linalg.norm(state.moduli.ravel()) / (cell.filling * cell.cell.area)
         self._below = 0.02 * float(scale)
-        self._shifted = self.stiffness.plus(self._below, cell.mass)
+        self._condense()
         self._noise = np.random.default_rng(7).standard_normal((2, cell.reduction.size, 8))
 
     def lowest(
@@ -80,7 +81,7 @@ class BlochWaves:
         """The ``count`` lowest eigenpairs, at Γ without the two translations.
 
         Lanczos with the inverse of K + s M; s is so large that this is positive definite, which
-        the factor's inertia proves, so the eigenvalues nearest to -s are the lowest.
+        its factors prove, so the eigenvalues nearest to -s are the lowest.
 
         Parameters
         ----------
@@ -94,15 +95,22 @@ class BlochWaves:
             About the relative error of lambda + s that is allowed.
         """
         mass = self.cell.mass.at(wave)
-        factor, below = self._factor_below(wave)
+        solver, below = self._solver_below(wave)
         start = self._start(mass.dtype, count, near)
         fixed = self._translations(mass) if _is_centre(wave) else start[:, :0]
-        inverse, vectors = _block_lanczos(factor, mass, start, fixed, tolerance)
+        inverse, vectors = _block_lanczos(solver, mass, start, fixed, tolerance)
         return BlochModes(wave, 1.0 / inverse - below, vectors)
 
     def unstable(self, wave: Wave) -> int:
         """Number of negative eigenvalues, by the inertia of one factor; not for Γ itself."""
-        return negative_pivots(self._factorise(self.stiffness.at(wave)))
+        self.factorisations += 1
+        return negative_pivots(factorise(self.stiffness.at(wave)))
+
+    def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
+        """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
+        self.factorisations += 1
+        condensation = Condensation(self.state.stiffness, self.cell.reduction)
+        return tuple(wave for wave in points if condensation.at(wave) is None)
 
     def slope(self, modes: BlochModes) -> FloatArray:
         """(2,) derivatives of the lowest eigenvalue by k . a1 and k . a2 (Hellmann-Feynman)."""
@@ -138,19 +146,19 @@ class BlochWaves:
             return float(found.fun), best + float(found.x)
         return self.acoustic(best), best
 
-    def _factorise(self, matrix: csc_array) -> Any:
-        self.factorisations += 1
-        return factorise(matrix)
-
-    def _factor_below(self, wave: Wave) -> tuple[Any, float]:
-        """The factor of K + s M, and s; both larger than usual where that isn't enough."""
-        below, shifted = self._below, self._shifted
+    def _solver_below(self, wave: Wave) -> tuple[CondensedWave, float]:
+        """The inverse of K + s M, and s; from now on a larger s where that isn't enough."""
         while True:
-            factor = self._factorise(shifted.at(wave))
-            if negative_pivots(factor) == 0:
-                return factor, below
-            below *= 2.0
-            shifted = self.stiffness.plus(below, self.cell.mass)
+            solver = self._condensation.at(wave)
+            if solver is not None:
+                return solver, self._below
+            self._below *= 2.0
+            self._condense()
+
+    def _condense(self) -> None:
+        self.factorisations += 1
+        shifted = self.state.stiffness + self._below * self.cell.nodal_mass
+        self._condensation = Condensation(csr_array(shifted), self.cell.reduction)
 
     def _start(self, dtype: Any, count: int, near: BlochModes | None) -> NDArray[Any]:
         """(size, count) vectors to begin with: those of ``near``, and always some noise.
@@ -175,7 +183,7 @@ class BlochWaves:
 def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArray:
     """(n, count) lowest eigenvalues at wave vectors that follow each other [N/mm^4].
 
-    Each costs one factorisation of the reduced matrix and a few solves.
+    Each costs a few solves with the one factorisation of the cell's interior.
     """
     values = np.empty((len(points), count))
     near: BlochModes | None = None
@@ -191,7 +199,7 @@ def _is_centre(wave: Wave) -> bool:
 
 
 def _block_lanczos(
-    factor: Any,
+    solver: CondensedWave,
     mass: csc_array,
     start: NDArray[Any],
     fixed: NDArray[Any],
@@ -208,7 +216,7 @@ def _block_lanczos(
     block, image, rest = _orthonormal(start - vectors @ (weighted.conj().T @ start), mass)
     for _ in range(_LARGEST_SPACE):
         vectors, weighted = np.hstack([vectors, block]), np.hstack([weighted, image])
-        block = factor.solve(image)
+        block = solver.solve(image)
         column = weighted.conj().T @ block
         projected = _bordered(projected, column[skipped:])
         block, image, rest = _orthonormal(block - vectors @ column, mass)

@@ -9,7 +9,7 @@ variable.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,6 +81,9 @@ class LatticeCritical:
     below, above
         Number of negative eigenvalues at each of ``waves`` a millionth of the load below and
         above the critical one: the proof.
+    earlier
+        Waves of the grid that are unstable already a millionth below: the proof that this is the
+        first critical point, if there are none. Not looked for where one wave was asked for.
     """
 
     load: float
@@ -92,6 +95,7 @@ class LatticeCritical:
     history: tuple[LeastStable, ...]
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
+    earlier: tuple[Wave, ...] = ()
 
 
 def first_critical(
@@ -115,7 +119,7 @@ def first_critical(
     """
     search = search or CriticalSearch()
     zone = Zone(path.cell, search.divisions)
-    return _Search(path, search, zone, zone.least_stable, progress).run()
+    return _Search(path, search, zone, zone.least_stable, progress, zone.grid).run()
 
 
 def critical_at(
@@ -145,6 +149,7 @@ class _Search:
     zone: Zone
     measure: Callable[[CellState], LeastStable]
     progress: Progress
+    everywhere: Sequence[Wave] = ()
     history: dict[float, LeastStable] = field(default_factory=dict)
 
     def run(self) -> LatticeCritical:
@@ -193,13 +198,14 @@ class _Search:
         value(load)
         least, state = self.history[load], self._near(low, load)
         waves = () if least.angle is not None else self._critical_waves(state, least)
-        below, above = (
-            self._unstable(self._near(low, load * (1.0 + side)), waves)
-            for side in (-_BESIDE, _BESIDE)
-        )
+        before, after = (self._near(low, load * (1.0 + side)) for side in (-_BESIDE, _BESIDE))
+        below, above = self._unstable(before, waves), self._unstable(after, waves)
+        earlier = BlochWaves(self.path.cell, before).unstable_among(self.everywhere)
         kind = "long waves" if least.angle is not None else f"{len(waves)} wave vector(s)"
         text = f"critical at {load:.6g} for {kind}"
-        return LatticeCritical(load, True, text, least, waves, state, self._by_load(), below, above)
+        text += f"; but {len(earlier)} others are unstable before" if earlier else ""
+        known = (waves, state, self._by_load(), below, above, earlier)
+        return LatticeCritical(load, True, text, least, *known)
 
     def _near(self, low: float, load: float) -> CellState:
         """The equilibrium at a load near the critical one, reached from the stable side afresh.

@@ -63,8 +63,9 @@ class CellState:
 class PeriodicCell:
     """One cell of a lattice with a material: what its equilibrium equations need.
 
-    ``mass`` is the reduced mass matrix of unit density [mm^2], ``filling`` the share of the cell
-    that is material [-]; ``factorisations`` counts every factorisation of an equilibrium.
+    ``nodal_mass`` and ``mass`` are the mass matrix of unit density [mm^2], unreduced and reduced,
+    ``filling`` is the share of the cell that is material [-]; ``factorisations`` counts every
+    factorisation of an equilibrium.
 
     Parameters
     ----------
@@ -77,10 +78,10 @@ class PeriodicCell:
     def __init__(self, cell: UnitCell, material: Material) -> None:
         self.cell = cell
         self.body = FreeBody(cell.mesh, material)
-        mass = self.body.mass()
-        self.reduction = Reduction(mass, cell.periodicity)
-        self.mass = self.reduction.reduced(mass)
-        self.filling = float(mass.sum()) / (2.0 * cell.area)
+        self.nodal_mass = self.body.mass()
+        self.reduction = Reduction(self.nodal_mass, cell.periodicity)
+        self.mass = self.reduction.reduced(self.nodal_mass)
+        self.filling = float(self.nodal_mass.sum()) / (2.0 * cell.area)
         self.factorisations = 0
         # Displacements of F̄_11, F̄_12, F̄_21, F̄_22 = 1 (the others 0), as columns.
         X, zero = cell.mesh.nodes, np.zeros(len(cell.mesh.nodes))

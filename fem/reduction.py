@@ -80,6 +80,13 @@ class Reduction:
         """The sparse matrix with these entries."""
         return csc_array((data, self._indices, self._indptr), shape=(self.size, self.size))
 
+    @property
+    def places(self) -> IntArray:
+        """(2 n,) the reduced unknown that each component of the mesh's nodes follows."""
+        components = 2 * np.repeat(self.periodicity.master, 2)
+        components[1::2] += 1
+        return np.asarray(np.argsort(self.order)[components])
+
     def phases(self, wave: tuple[float, float]) -> ComplexArray:
         """The factors exp(i k . (R' - R)) of the sorted entries."""
         return np.asarray(np.exp(1j * (self._differences @ np.asarray(wave))))
@@ -118,10 +125,6 @@ class Reduced:
         if np.abs(phases.imag).max() < 1e-12:
             return self._reduction.assembled(phases.real @ self._blocks)
         return self._reduction.assembled(self._combined(phases))
-
-    def plus(self, factor: float, other: Reduced) -> Reduced:
-        """The sum of this matrix and ``factor`` times another of the same reduction."""
-        return Reduced(self._reduction, self._blocks + factor * other._blocks)
 
     def slope(self, wave: tuple[float, float], axis: int) -> csc_array:
         """The Hermitian derivative by k . a1 (axis 0) or k . a2 (axis 1)."""
