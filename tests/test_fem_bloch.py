@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -292,3 +294,13 @@ def test_the_grid_has_every_wave_once() -> None:
     assert len(grid) == (16 - 4) // 2 + 3  # halves of the pairs k, -k, and M, X, Y, without Γ
     assert all(not is_same(a, b) for k, a in enumerate(grid) for b in grid[:k])
     assert folded((3 * math.pi, -math.pi)) == pytest.approx((math.pi, math.pi))
+
+
+def test_the_recipe_works_as_printed() -> None:
+    page = (Path(__file__).parent.parent / "docs/bloch.md").read_text(encoding="utf-8")
+    recipe = page.split("```python\n")[1].split("```")[0]
+    namespace: dict[str, Any] = {}
+    exec(compile(recipe, "docs/bloch.md", "exec", dont_inherit=True), namespace)
+    found = namespace["found"]
+    # The size of the cell is of no account: the same as for a pitch of 1 on a similar mesh.
+    assert found.load == pytest.approx(critical("square", "uniaxial").load, rel=0.01)
