@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.meshing import Block, _divisions, _mesh_block, join, quarter_cell
+from modeharvest.fem.meshing import Block, divisions_of, mesh_block, join, quarter_cell
 from modeharvest.fem.periodicity import Periodicity, find_periodicity
 
 FloatArray = NDArray[np.float64]
@@ -136,7 +136,7 @@ def _wedge(pitch: float, diameter: float, size: float) -> Block:
     arc_end = (radius * math.cos(angle), radius * math.sin(angle))
     corners = [(radius, 0.0), (half, 0.0), (half, half * math.tan(angle)), arc_end]
     lengths = [half - radius, half * math.tan(angle), long - radius, angle * radius]
-    return _mesh_block(corners, [_divisions(length, size) for length in lengths], arc=True)
+    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arc=True)
 
 
 def _check(pitch: float, diameter: float, size: float) -> None:

@@ -60,16 +60,16 @@ def quarter_cell(pitch: float, diameter: float, size: float) -> Block:
             f"mesh size: expected at most {coarsest:.3g} mm (two elements on a quarter of the "
             f"hole's edge), got {size} mm; give a smaller mesh size"
         )
-    on_arc = _divisions(0.5 * math.pi * radius, size)
-    side, ligament = _divisions(half, size), _divisions(half - radius, size)
+    on_arc = divisions_of(0.5 * math.pi * radius, size)
+    side, ligament = divisions_of(half, size), divisions_of(half - radius, size)
     corners = [(radius, 0.0), (half, 0.0), (half, half), (0.0, half), (0.0, radius)]
-    return _mesh_block(corners, [ligament, side, side, ligament, on_arc], arc=True)
+    return mesh_block(corners, [ligament, side, side, ligament, on_arc], arc=True)
 
 
 def rectangle(width: float, height: float, n_width: int, n_height: int) -> Block:
     """The block [0, width] x [0, height] with the given numbers of elements on its sides."""
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
-    return _mesh_block(corners, [n_width, n_height, n_width, n_height], arc=False)
+    return mesh_block(corners, [n_width, n_height, n_width, n_height], arc=False)
 
 
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
@@ -112,21 +112,22 @@ def join(blocks: list[Block], tolerance: float) -> Mesh:
     return Mesh(merged, label[cells].astype(np.int64), "T6")
 
 
-def _divisions(length: float, size: float) -> int:
+def divisions_of(length: float, size: float) -> int:
+    """Number of elements of at most ``size`` [mm] along a side of ``length`` [mm]."""
     return max(1, math.ceil(length / size - 1e-9))
 
 
 def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
     half = 0.5 * specimen.pitch
     a, b = specimen.cellular_half_size
-    n_half = _divisions(half, size)
+    n_half = divisions_of(half, size)
     cell = quarter_cell(specimen.pitch, specimen.diameter, size)
     for x, y in specimen.hole_centres:
         yield from (cell.placed(sign, (x, y)) for sign in _SIGNS)
 
     centres_x = (np.arange(specimen.holes_x) - 0.5 * (specimen.holes_x - 1)) * specimen.pitch
     centres_y = (np.arange(specimen.holes_y) - 0.5 * (specimen.holes_y - 1)) * specimen.pitch
-    n_x, n_y = _divisions(specimen.bulk_x, size), _divisions(specimen.bulk_y, size)
+    n_x, n_y = divisions_of(specimen.bulk_x, size), divisions_of(specimen.bulk_y, size)
     if specimen.bulk_x > 0:
         strip = rectangle(specimen.bulk_x, half, n_x, n_half)
         for y in centres_y:
@@ -140,8 +141,18 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
         yield from (corner.placed(s, (s[0] * a, s[1] * b)) for s in _SIGNS)
 
 
-def _mesh_block(corners: list[tuple[float, float]], divisions: list[int], arc: bool) -> Block:
-    """Let gmsh mesh a polygon whose last side is, with ``arc``, a circle about the origin."""
+def mesh_block(corners: list[tuple[float, float]], divisions: list[int], arc: bool) -> Block:
+    """Let gmsh mesh a polygon with T6 elements.
+
+    Parameters
+    ----------
+    corners
+        The polygon's corners, counter-clockwise [mm].
+    divisions
+        Number of elements on each side, the first from the first corner to the second.
+    arc
+        Whether the last side is an arc of a circle about the origin.
+    """
     gmsh.initialize(interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
