@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.meshing import Block, divisions_of, mesh_block, join, quarter_cell
+from modeharvest.fem.meshing import Block, divisions_of, join, mesh_block, quarter_cell
 from modeharvest.fem.periodicity import Periodicity, find_periodicity
 
 FloatArray = NDArray[np.float64]
