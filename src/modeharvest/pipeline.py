@@ -35,9 +35,10 @@ from modeharvest.validation.study import Measured, validate
 
 STAGES = ("fem", "image", "correlate", "validate")
 _NO_DOLFINX = (
-    "the finite-element stage needs dolfinx >= 0.9 and gmsh: install them with 'conda install -c "
-    "conda-forge fenics-dolfinx python-gmsh' or, on Debian 13, 'apt install python3-dolfinx "
-    "python3-gmsh'; or take a solution made elsewhere: --solution FILE"
+    "the finite-element stage needs dolfinx >= 0.9, slepc4py and gmsh: install them with 'conda "
+    "install -c conda-forge fenics-dolfinx slepc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-slepc4py python3-gmsh python3-h5py-mpi'; or take a solution "
+    "made elsewhere: --solution FILE"
 )
 
 
