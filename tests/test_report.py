@@ -19,8 +19,9 @@ import synthetic_report as made_up
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.validation import words
+from modeharvest.validation.page import fixed, short
 from modeharvest.validation.plots import PANELS, Atlas
-from modeharvest.validation.report import fixed, short, write_report
+from modeharvest.validation.report import write_report
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 

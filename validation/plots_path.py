@@ -36,7 +36,7 @@ def draw_load(path: Mapping[str, Any], critical: float | None) -> Figure:
         Critical strain [-], None if there is none.
     """
     with style():
-        drawn, axes = _curve("nominal strain [%]", "force per thickness [N/mm]")
+        drawn, axes = curve("nominal strain [%]", "force per thickness [N/mm]")
         primary = path.get("primary", {})
         strain, load = _column(primary, "nominal_strain"), _column(primary, _LOAD)
         branching = np.nan
@@ -51,13 +51,13 @@ def draw_load(path: Mapping[str, Any], critical: float | None) -> Figure:
             if above.sum() > 1:
                 axes.plot(100 * strain[above], load[above], color=BLUE, ls=(0, (3, 2)), marker="o",
                           ms=3, mfc="none")  # fmt: skip
-                _say(axes, 100 * strain[-1], load[-1], "primary, unstable", BLUE, (-4, 6), "right")
+                say(axes, 100 * strain[-1], load[-1], "primary, unstable", BLUE, (-4, 6), "right")
         buckled = [name for name in path if name != "primary"]
         for n, name in enumerate(buckled):
             _branch(axes, name, path[name], critical, branching, below=32 + 11 * n)
         if critical is not None and np.isfinite(branching):
             axes.plot([100 * critical], [branching], "o", ms=8, mfc="none", mec=INK, mew=1.2)
-            _say(axes, 100 * critical, branching, f"critical, {100 * critical:.3f} %", INK,
+            say(axes, 100 * critical, branching, f"critical, {100 * critical:.3f} %", INK,
                  (-9, 3), "right")  # fmt: skip
         axes.set(xlim=(0, None), ylim=(0, None))
     return drawn
@@ -75,7 +75,7 @@ def draw_eigenvalues(path: Mapping[str, Any], critical: Mapping[str, Any] | None
         the critical strain was located.
     """
     with style():
-        drawn, axes = _curve("nominal strain [%]", "lowest eigenvalues [10⁻³ N/mm⁴]")
+        drawn, axes = curve("nominal strain [%]", "lowest eigenvalues [10⁻³ N/mm⁴]")
         primary = path.get("primary", {})
         strain = _column(primary, "nominal_strain")
         ladder = _ladder(primary.get(_LOWEST, []))
@@ -89,7 +89,7 @@ def draw_eigenvalues(path: Mapping[str, Any], critical: Mapping[str, Any] | None
         if critical is not None:
             at = 100 * critical["strain"]
             axes.plot([at], [0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
-            _say(axes, at, 0.0, f"critical, {at:.3f} %", INK, (-8, -13), "right")
+            say(axes, at, 0.0, f"critical, {at:.3f} %", INK, (-8, -13), "right")
         for name, branch in path.items():
             if name == "primary":
                 continue
@@ -141,7 +141,7 @@ def draw_density(spectrum: Spectrum, pattern: Pattern, component: int, end: floa
 def draw_convergence(result: Result) -> Figure:
     """Draw the size of each Gauss-Newton step; each level of the pyramid in its colour."""
     with style():
-        drawn, axes = _curve("iteration", "step, rms [px]")
+        drawn, axes = curve("iteration", "step, rms [px]")
         levels: list[list[tuple[int, float]]] = []
         factors: list[int] = []
         for k, step in enumerate(result.history, start=1):
@@ -165,7 +165,8 @@ def draw_convergence(result: Result) -> Figure:
     return drawn
 
 
-def _curve(x: str, y: str) -> tuple[Figure, Axes]:
+def curve(x: str, y: str) -> tuple[Figure, Axes]:
+    """An empty picture for curves, with these labels."""
     width, height = CURVE
     drawn = figure(width, height)
     axes = drawn.add_axes((0.11, 0.14, 0.87, 0.80))
@@ -194,11 +195,12 @@ def _branch(
     is_stable = not _column(branch, "negative_pivots").any()
     sign = name.replace("+", " (+)").replace("-", " (−)")
     words = f"{sign}, {'stable' if is_stable else 'unstable'}"
-    _say(axes, 100 * strain[-1], load[-1], words, RED, (4, -below), "right")
+    say(axes, 100 * strain[-1], load[-1], words, RED, (4, -below), "right")
 
 
-def _say(axes: Axes, x: float, y: float, text: str, colour: str, shift: tuple[float, float],
-         side: str) -> None:  # fmt: skip
+def say(axes: Axes, x: float, y: float, text: str, colour: str, shift: tuple[float, float],
+        side: str) -> None:  # fmt: skip
+    """Write beside a point: shifted [pt], its ``side`` there."""
     axes.annotate(text, (x, y), shift, textcoords="offset points", ha=side, color=colour,
                   fontsize=7.5)  # fmt: skip
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
@@ -19,6 +16,7 @@ from modeharvest.idic.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.progress import Progress, silent
 from modeharvest.validation import words
+from modeharvest.validation.page import render
 from modeharvest.validation.plots import PANELS, Atlas, Panel, draw_hero
 from modeharvest.validation.plots_path import draw_convergence, draw_eigenvalues, draw_load
 from modeharvest.validation.style import to_svg
@@ -87,7 +85,8 @@ def write_report(
     pitch = float(case["experiment"]["specimen"]["pitch"])
     atlas = Atlas(solution, images, comparisons, spectra, pitch)
     headings = [_heading(snapshot, summary) for snapshot in summary["snapshots"]]
-    page = _environment().get_template(TEMPLATE).render(
+    page = render(
+        TEMPLATE,
         title=summary.get("title") or "Validation",
         case=case,
         summary=summary,
@@ -175,35 +174,3 @@ def _picture(
     name = f"{key}-{heading['id']}"
     label = f"{heading['state']} · {heading['strain']}"
     return Picture(name, label, to_svg(drawn, name, f"{title}, {label}", exact=exact), fact)
-
-
-def _environment() -> jinja2.Environment:
-    folder = str(resources.files("modeharvest") / "validation")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"short": short, "fixed": fixed}
-    return environment
-
-
-def short(value: Any) -> str:
-    """A number as a reader wants it: three or four digits, a true minus, powers of ten raised."""
-    if value is None:
-        return "–"
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return str(value)
-    if not isfinite(value):
-        return "∞" if value > 0 else "–"
-    if value == int(value) and abs(value) < 1e9:
-        return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
-    if 1e-3 <= abs(value) < 1e5:
-        return f"{value:.4g}".replace("-", "−")
-    digits, power = f"{value:.1e}".split("e")
-    raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{digits} · 10{raised}".replace("-", "−")
-
-
-def fixed(value: float) -> str:
-    """Five decimals with a true minus, and no minus before a zero."""
-    return f"{round(value, 5) + 0.0:.5f}".replace("-", "−")
