@@ -121,10 +121,8 @@ def hexagonal(pitch: float, diameter: float, size: float) -> UnitCell:
     wedge = _wedge(pitch, diameter, size)
     blocks = []
     for k in range(6):
-        c, s = math.cos(k * math.pi / 3), math.sin(k * math.pi / 3)
         for sign in (1.0, -1.0):
-            half = wedge.placed((1.0, sign), (0.0, 0.0))
-            blocks.append(Block(half.nodes @ np.array([[c, s], [-s, c]]), half.cells))
+            blocks.append(wedge.placed((1.0, sign), (0.0, 0.0)).turned(k * math.pi / 3))
     a2 = [0.5, 0.5 * math.sqrt(3.0)]
     return UnitCell(join(blocks, 1e-7 * pitch), pitch * np.array([[1.0, 0.0], a2]))
 
@@ -136,7 +134,7 @@ def _wedge(pitch: float, diameter: float, size: float) -> Block:
     arc_end = (radius * math.cos(angle), radius * math.sin(angle))
     corners = [(radius, 0.0), (half, 0.0), (half, half * math.tan(angle)), arc_end]
     lengths = [half - radius, half * math.tan(angle), long - radius, angle * radius]
-    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arc=True)
+    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[3])
 
 
 def _check(pitch: float, diameter: float, size: float) -> None:

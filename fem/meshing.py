@@ -9,9 +9,9 @@ reflects and places them. Mid-side nodes of hole edges lie on the circle.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 
 import gmsh
 import numpy as np
@@ -44,6 +44,11 @@ class Block:
         cells = self.cells if sign[0] * sign[1] > 0 else self.cells[:, _REVERSED_T6]
         return Block(np.asarray(origin) + np.asarray(sign) * self.nodes, cells)
 
+    def turned(self, angle: float) -> Block:
+        """The block turned counter-clockwise about the origin by ``angle`` [rad]."""
+        c, s = math.cos(angle), math.sin(angle)
+        return Block(self.nodes @ np.array([[c, s], [-s, c]]), self.cells)
+
 
 def quarter_cell(pitch: float, diameter: float, size: float) -> Block:
     """A quarter of the square unit cell, [0, l/2]^2, with the hole's centre at the origin.
@@ -63,13 +68,13 @@ def quarter_cell(pitch: float, diameter: float, size: float) -> Block:
     on_arc = divisions_of(0.5 * math.pi * radius, size)
     side, ligament = divisions_of(half, size), divisions_of(half - radius, size)
     corners = [(radius, 0.0), (half, 0.0), (half, half), (0.0, half), (0.0, radius)]
-    return mesh_block(corners, [ligament, side, side, ligament, on_arc], arc=True)
+    return mesh_block(corners, [ligament, side, side, ligament, on_arc], arcs=[4])
 
 
 def rectangle(width: float, height: float, n_width: int, n_height: int) -> Block:
     """The block [0, width] x [0, height] with the given numbers of elements on its sides."""
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
-    return mesh_block(corners, [n_width, n_height, n_width, n_height], arc=False)
+    return mesh_block(corners, [n_width, n_height, n_width, n_height])
 
 
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
@@ -141,7 +146,9 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
         yield from (corner.placed(s, (s[0] * a, s[1] * b)) for s in _SIGNS)
 
 
-def mesh_block(corners: list[tuple[float, float]], divisions: list[int], arc: bool) -> Block:
+def mesh_block(
+    corners: list[tuple[float, float]], divisions: list[int], arcs: Collection[int] = ()
+) -> Block:
     """Let gmsh mesh a polygon with T6 elements.
 
     Parameters
@@ -150,31 +157,58 @@ def mesh_block(corners: list[tuple[float, float]], divisions: list[int], arc: bo
         The polygon's corners, counter-clockwise [mm].
     divisions
         Number of elements on each side, the first from the first corner to the second.
-    arc
-        Whether the last side is an arc of a circle about the origin.
+    arcs
+        Numbers of those sides that are arcs of circles about the origin.
     """
-    gmsh.initialize(interruptible=False)
-    try:
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.option.setNumber("General.NumThreads", 1)
-        gmsh.option.setNumber("Mesh.Algorithm", 6)
-        gmsh.option.setNumber("Mesh.SecondOrderLinear", 0)
+    with quiet_gmsh():
         geo = gmsh.model.geo
         points = [geo.addPoint(x, y, 0.0) for x, y in corners]
-        curves = [geo.addLine(p, q) for p, q in pairwise(points)]
-        if arc:
-            curves.append(geo.addCircleArc(points[-1], geo.addPoint(0.0, 0.0, 0.0), points[0]))
-        else:
-            curves.append(geo.addLine(points[-1], points[0]))
+        centre = geo.addPoint(0.0, 0.0, 0.0) if arcs else 0
+        curves = []
+        for k, (p, q) in enumerate(zip(points, points[1:] + points[:1], strict=True)):
+            curves.append(geo.addCircleArc(p, centre, q) if k in arcs else geo.addLine(p, q))
         for curve, n in zip(curves, divisions, strict=True):
             geo.mesh.setTransfiniteCurve(curve, n + 1)
         geo.addPlaneSurface([geo.addCurveLoop(curves)])
         geo.synchronize()
-        gmsh.model.mesh.generate(2)
-        gmsh.model.mesh.setOrder(2)
-        return _current_block()
+        return meshed()
+
+
+@contextmanager
+def quiet_gmsh() -> Iterator[None]:
+    """An empty gmsh model that prints nothing; a model that the caller has open is kept."""
+    ours = not gmsh.isInitialized()
+    if ours:
+        gmsh.initialize(interruptible=False)
+    before = None if ours else gmsh.model.getCurrent()
+    options = {
+        "General.Terminal": 0,
+        "General.NumThreads": 1,
+        "Mesh.Algorithm": 6,
+        "Mesh.SecondOrderLinear": 0,
+    }
+    kept = {name: gmsh.option.getNumber(name) for name in options}
+    for name, value in options.items():
+        gmsh.option.setNumber(name, value)
+    try:
+        gmsh.model.add("modeharvest")
+        yield
     finally:
-        gmsh.finalize()
+        if ours:
+            gmsh.finalize()
+        else:
+            gmsh.model.remove()
+            gmsh.model.setCurrent(before)
+            for name, value in kept.items():
+                gmsh.option.setNumber(name, value)
+
+
+def meshed() -> Block:
+    """The T6 mesh of gmsh's current plane model, made if there is none yet."""
+    if not gmsh.model.mesh.getElementTypes(2).size:
+        gmsh.model.mesh.generate(2)
+    gmsh.model.mesh.setOrder(2)
+    return _current_block()
 
 
 def _current_block() -> Block:

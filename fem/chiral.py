@@ -1,0 +1,192 @@
+"""Chiral lattices: rings joined by ligaments that touch them tangentially.
+
+The paper shows a chiral metamaterial without its measures, so this geometry is this project's
+own choice, never the authors'. It is the one of Prall & Lakes (1997), doi
+10.1016/S0020-7403(96)00025-2 (six ligaments), and its tetrachiral sister with four:
+
+- Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest
+  neighbours by straight ligaments of constant thickness.
+- A ligament's outer edge is tangent to the outer edge of the ring at either end, on opposite
+  sides of the line between the centres. So a ring turns when its ligaments are pushed.
+- No fillets: where a ligament's inner edge meets a ring, the outline has a sharp notch, at
+  which strains are singular. Energies and eigenvalues therefore converge more slowly with the
+  mesh than those of round holes.
+
+One sector of one ring with half a ligament is meshed and turned, so the mesh has the rotational
+symmetry of the lattice, and no mirror symmetry, like the lattice itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeharvest.errors import InputError
+from modeharvest.fem.lattices import UnitCell
+from modeharvest.fem.meshing import Block, divisions_of, join, mesh_block
+
+HANDEDNESS = ("clockwise", "counterclockwise")
+
+# Shares of the pitch. Ligaments are then 18 times as long as thick, so that they bend rather
+# than shorten, and yet thick enough for elements of pitch / 20. Rings of twice that thickness
+# turn rather than being squeezed: their squeezing is what keeps Poisson's ratio from -1.
+RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS = 0.25, 0.1, 0.05
+
+
+def chiral(
+    pitch: float,
+    size: float,
+    ligaments: int = 6,
+    ring_radius: float | None = None,
+    ring_thickness: float | None = None,
+    ligament_thickness: float | None = None,
+    handedness: str = "clockwise",
+) -> UnitCell:
+    """The primitive cell of a ring-and-ligament lattice, a ring's centre at the origin.
+
+    a1 points along x; a2 stands 90 degrees (tetrachiral) or 60 degrees (hexachiral) from it.
+    ``enlarged(2, 2)`` has room for modes that change sign from ring to ring.
+
+    Parameters
+    ----------
+    pitch
+        Distance of neighbouring rings' centres, the lattice constant [mm].
+    size
+        Target edge length of the elements [mm]; where walls are thinner than that, elements
+        are as long as the wall is thick.
+    ligaments
+        Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
+    ring_radius
+        Outer radius of the rings [mm]; 0.25 pitch unless given.
+    ring_thickness
+        Of the rings' walls [mm]; 0.1 pitch unless given.
+    ligament_thickness
+        [mm]; 0.05 pitch unless given.
+    handedness
+        The sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
+        leaves its ring. One lattice is the mirror image of the other.
+
+    Raises
+    ------
+    InputError
+        If rings touch, or ligaments are too thick to leave their ring apart from each other or
+        to have a free length.
+    """
+    shape = _RingAndLigaments(
+        pitch,
+        RING_RADIUS * pitch if ring_radius is None else ring_radius,
+        RING_THICKNESS * pitch if ring_thickness is None else ring_thickness,
+        LIGAMENT_THICKNESS * pitch if ligament_thickness is None else ligament_thickness,
+        ligaments,
+    )
+    if not 0 < size < math.inf:
+        raise InputError(f"mesh size: expected a positive length in mm, got {size}")
+    if handedness not in HANDEDNESS:
+        raise InputError(
+            f"chiral cell: expected handedness {' or '.join(map(repr, HANDEDNESS))}, got "
+            f"{handedness!r}"
+        )
+    sector = shape.sector(min(size, shape.ring_thickness, shape.ligament_thickness))
+    if handedness == "counterclockwise":
+        sector = sector.placed((1.0, -1.0), (0.0, 0.0))
+    angle = 2 * math.pi / ligaments
+    mesh = join([sector.turned(k * angle) for k in range(ligaments)], 1e-7 * pitch)
+    a2 = [0.0, 1.0] if ligaments == 4 else [0.5, 0.5 * math.sqrt(3.0)]
+    return UnitCell(mesh, pitch * np.array([[1.0, 0.0], a2]))
+
+
+@dataclass(frozen=True)
+class _RingAndLigaments:
+    """What the outline is made of [mm].
+
+    In the ligament's own frame the ring is about the origin and the ligament runs along x
+    between y = ring_radius - ligament_thickness and y = ring_radius, up to its middle.
+    """
+
+    pitch: float
+    ring_radius: float
+    ring_thickness: float
+    ligament_thickness: float
+    ligaments: int
+
+    def __post_init__(self) -> None:
+        if self.ligaments not in (4, 6):
+            raise InputError(
+                "chiral cell: expected 4 (tetrachiral) or 6 (hexachiral) ligaments, got "
+                f"{self.ligaments}"
+            )
+        if not 0 < 2 * self.ring_radius < self.pitch < math.inf:
+            raise InputError(
+                "chiral cell: expected 0 < 2 ring_radius < pitch (rings must not touch), got "
+                f"ring_radius = {self.ring_radius} mm, pitch = {self.pitch} mm"
+            )
+        if not 0 < self.ring_thickness < self.ring_radius:
+            raise InputError(
+                "chiral cell: expected 0 < ring_thickness < ring_radius, got "
+                f"ring_thickness = {self.ring_thickness} mm, ring_radius = {self.ring_radius} mm"
+            )
+        thickest = self.ring_radius * (1.0 - math.cos(2 * math.pi / self.ligaments))
+        if not 0 < self.ligament_thickness < thickest:
+            raise InputError(
+                f"chiral cell: expected 0 < ligament_thickness < {thickest:.4g} mm (the ligaments "
+                f"of a ring must not touch), got {self.ligament_thickness} mm; make ligaments "
+                "thinner or rings larger"
+            )
+        if not self.middle > self.foot:
+            raise InputError(
+                "chiral cell: expected ligaments with a free length, got rings "
+                f"{self.pitch - 2 * self.ring_radius:.4g} mm apart with ligaments "
+                f"{self.ligament_thickness} mm thick; make rings smaller or ligaments thinner"
+            )
+
+    @property
+    def middle(self) -> float:
+        """x of the ligament's middle, half its length between tangent points."""
+        across = self.ring_radius - 0.5 * self.ligament_thickness
+        return math.sqrt((0.5 * self.pitch) ** 2 - across**2)
+
+    @property
+    def foot(self) -> float:
+        """x at which the ligament's inner edge leaves the ring."""
+        return math.sqrt((2 * self.ring_radius - self.ligament_thickness) * self.ligament_thickness)
+
+    def sector(self, size: float) -> Block:
+        """Half a ligament with its share of the ring, the ligament's middle at (pitch / 2, 0).
+
+        The ring is cut halfway between the feet of two ligaments, the ligament across its middle;
+        uniform divisions of that cut are their own image under half a turn.
+        """
+        outer, inner = self.ring_radius, self.ring_radius - self.ring_thickness
+        y = outer - self.ligament_thickness
+        leaves, touches = math.atan2(y, self.foot), 0.5 * math.pi
+        free = 2 * math.pi / self.ligaments - (touches - leaves)
+        low, high = leaves - 0.5 * free, touches + 0.5 * free
+        corners = [
+            _polar(inner, low),
+            _polar(outer, low),
+            (self.foot, y),
+            (self.middle, y),
+            (self.middle, outer),
+            (0.0, outer),
+            _polar(outer, high),
+            _polar(inner, high),
+        ]
+        lengths = [
+            self.ring_thickness,
+            0.5 * free * outer,
+            self.middle - self.foot,
+            self.ligament_thickness,
+            self.middle,
+            0.5 * free * outer,
+            self.ring_thickness,
+            2 * math.pi / self.ligaments * inner,
+        ]
+        divisions = [divisions_of(length, size) for length in lengths]
+        block = mesh_block(corners, divisions, arcs=[1, 5, 7])
+        return block.turned(-math.atan2(outer - 0.5 * self.ligament_thickness, self.middle))
+
+
+def _polar(radius: float, angle: float) -> tuple[float, float]:
+    return radius * math.cos(angle), radius * math.sin(angle)
