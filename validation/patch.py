@@ -58,7 +58,8 @@ class Patch:
         _, first, number = np.unique(names, axis=0, return_index=True, return_inverse=True)
         node, copy = first % len(mesh.nodes), copies[first // len(mesh.nodes)]
         numbers = number.reshape(len(copies), -1)
-        joined = Mesh(mesh.nodes[node] + copy @ lattice, np.vstack(numbers[:, mesh.cells]), "T6")
+        cells = numbers[:, mesh.cells].reshape(-1, 6)
+        joined = Mesh(mesh.nodes[node] + copy @ lattice, cells, "T6")
         return cls(joined, Outline.of(joined), lattice, node, copy, _middle(mesh), size)
 
     @property

@@ -1,0 +1,223 @@
+"""On what the pattern of a square lattice depends: hole size, cell size, material, loading.
+
+The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
+variations, and of the material (Section "Graded Microstructures and Size Independence of the
+Modes"). Here that is measured: the numerical mode at (π, π) against Eq. (mode) by their
+normalised overlap, and whether it is what buckles first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.idic.fourier import square_family
+from modeharvest.idic.quadrature import Quadrature
+from modeharvest.progress import Progress, silent
+from modeharvest.validation.mode_table import ModeRow, Wave, read_rows, write_rows
+
+if TYPE_CHECKING:  # these need dolfinx
+    from modeharvest.fem.bloch_critical import LatticeCritical
+
+FloatArray = NDArray[np.float64]
+
+PATTERN: Wave = (math.pi, math.pi)
+"""The wave of the paper's pattern, as phases from cell to cell [rad]."""
+
+RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+LOADINGS: dict[str, MacroLoading] = {
+    "uniaxial": uniaxial(),
+    "uniaxial strain": uniaxial_strain(),
+    "equibiaxial": equibiaxial(),
+}
+
+
+def ogden(exponent: float, poisson: float, shear: float = 0.6) -> Ogden:
+    """One Ogden term with a Poisson's ratio [-] and a shear modulus [MPa]."""
+    kappa = 2.0 * poisson * shear / (1.0 - 2.0 * poisson)
+    return Ogden((2.0 * shear,), (exponent,), kappa)
+
+
+MATERIALS: dict[str, Material] = {
+    "two-term I1": TwoTermI1(),
+    **{f"Ogden m={m:g}, nu={nu:.2f}": ogden(m, nu)
+       for m, nu in ((3, 0.45), (2, 0.45), (4, 0.45), (6, 0.45), (-2, 0.45), (3, 0.40), (3, 0.49))},
+}  # fmt: skip
+"""By name. The first is the reference; exponents and Poisson's ratios vary about (3, 0.45)."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """One lattice of the study: everything that its pattern may depend on.
+
+    Parameters
+    ----------
+    ratio
+        Hole diameter over cell size d/l [-].
+    loading, material
+        What is done to it, and what it is made of.
+    pitch
+        Unit cell size l [mm].
+    divisions
+        Elements along l; the mesh size is l over it.
+    largest
+        Load up to which to look for critical points [-].
+    """
+
+    ratio: float = 0.7895
+    loading: MacroLoading = LOADINGS["uniaxial"]
+    material: Material = MATERIALS["two-term I1"]
+    pitch: float = 1.9
+    divisions: int = 13
+    largest: float = 0.28
+
+    def __post_init__(self) -> None:
+        if not (0 < self.ratio < 1 and self.pitch > 0 and self.divisions > 0 and self.largest > 0):
+            raise InputError(
+                "mode study: expected 0 < d/l < 1 and a positive pitch, number of elements and "
+                f"load, got {self}"
+            )
+
+    @property
+    def key(self) -> tuple[str, str, float, float, int]:
+        """As :attr:`ModeRow.key`."""
+        names = name_of(self.material, MATERIALS), name_of(self.loading, LOADINGS)
+        return (*names, self.pitch, self.ratio, self.divisions)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternMode:
+    """The numerical pattern of a lattice beside the analytic one.
+
+    Parameters
+    ----------
+    row
+        Numbers.
+    mesh
+        The primitive cell, about a hole: a quarter of the pattern's own [mm].
+    shape, analytic
+        (n, 2) both modes at its nodes [-]; the mean of their squared length over the material is
+        1, their product is positive.
+    """
+
+    row: ModeRow
+    mesh: Mesh
+    shape: FloatArray
+    analytic: FloatArray
+
+
+def name_of(thing: object, names: Mapping[str, object]) -> str:
+    """Its name among these; all its values where it has none."""
+    return next((name for name, known in names.items() if known == thing), repr(thing))
+
+
+def analytic_mode(nodes: FloatArray, pitch: float) -> FloatArray:
+    """(n, 2) Eq. (mode) with its ideal parameters [-]; a hole's centre is the origin."""
+    family = square_family("hole")
+    total = np.zeros_like(nodes)
+    for a, b, kx, ky, c in family.waves(family.start):
+        wave = np.sin(math.pi / pitch * (nodes @ [kx, ky] + c))
+        total += wave[:, None] * [a, b]
+    return total
+
+
+def overlap(mesh: Mesh, first: FloatArray, second: FloatArray) -> float:
+    """|<first, second>| / (|first| |second|) of two nodal fields (n, 2) over the material [-]."""
+    rule = Quadrature(mesh)
+    a, b = rule.values(first), rule.values(second)
+    return abs(rule.product(a, b)) / math.sqrt(rule.product(a, a) * rule.product(b, b))
+
+
+def pattern_mode(lattice: Lattice) -> PatternMode:
+    """Find a lattice's first critical point and its lowest mode at (π, π).
+
+    The mode belongs to the first critical state, or without one to the last that was looked at.
+    Where (π, π) is not what is critical there, its eigenvalue says how far off it is.
+    """
+    from modeharvest.fem.bloch import BlochWaves
+    from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
+    from modeharvest.fem.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattices import square
+
+    pitch = lattice.pitch
+    unit = square(pitch, lattice.ratio * pitch, pitch / lattice.divisions)
+    cell = PeriodicCell(unit, lattice.material)
+    path, search = CellPath(cell, lattice.loading), CriticalSearch(largest=lattice.largest)
+    found = first_critical(path, search)
+    kind = kind_of(found)
+    alone = found if kind == "pattern" else critical_at(path, PATTERN, search)
+    modes = BlochWaves(cell, found.state).lowest(PATTERN)
+    shape = np.real(cell.reduction.displacement(modes.vectors[:, 0], PATTERN))
+    shape, analytic = _alike(unit.mesh, shape, analytic_mode(unit.mesh.nodes, pitch))
+    row = ModeRow(
+        *lattice.key, found.found, found.load, kind, alone.load if alone.found else math.nan,
+        found.load, float(modes.eigenvalues[0]), overlap(unit.mesh, shape, analytic),
+    )  # fmt: skip
+    return PatternMode(row, unit.mesh, shape, analytic)
+
+
+def _alike(mesh: Mesh, shape: FloatArray, analytic: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both with a mean square length of 1 over the material, the first with the second's sign."""
+    rule = Quadrature(mesh)
+    a, b = rule.values(shape), rule.values(analytic)
+    sizes = [math.sqrt(rule.product(v, v) / rule.area) for v in (a, b)]
+    sign = math.copysign(1.0, rule.product(a, b))
+    return np.asarray(sign / sizes[0] * shape), np.asarray(analytic / sizes[1])
+
+
+def kind_of(found: LatticeCritical) -> str:
+    """What is critical first, in the words of :class:`ModeRow`."""
+    from modeharvest.fem.zone import is_same
+
+    if not found.found:
+        return "none"
+    if found.least.angle is not None:
+        return "long waves"
+    alone = len(found.waves) == 1 and is_same(found.waves[0], PATTERN)
+    return "pattern" if alone else "other waves"
+
+
+def study_modes(
+    lattices: Sequence[Lattice], table: Path | str | None = None, progress: Progress = silent
+) -> tuple[ModeRow, ...]:
+    """Work through lattices; rows already in the table are not computed again.
+
+    Parameters
+    ----------
+    lattices
+        In any order.
+    table
+        CSV to read from and to add each row to as soon as it is there.
+    progress
+        Listener.
+    """
+    known = {} if table is None else {row.key: row for row in read_rows(table)}
+    for n, lattice in enumerate(lattices):
+        progress(n, len(lattices), "modes")
+        if lattice.key in known:
+            continue
+        known[lattice.key] = pattern_mode(lattice).row
+        if table is not None:
+            write_rows(table, known.values())
+    progress(1, 1, "modes")
+    return tuple(known[lattice.key] for lattice in lattices)
+
+
+def ratio_lattices(
+    ratios: Iterable[float] = RATIOS,
+    loadings: Iterable[str] = tuple(LOADINGS),
+    base: Lattice = Lattice(),
+) -> list[Lattice]:
+    """Every hole size under every loading."""
+    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]
