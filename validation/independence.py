@@ -17,12 +17,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.idic.automatic import mode_family
 from modeharvest.idic.fourier import square_family
+from modeharvest.idic.overlap import best_amplitude, overlap
 from modeharvest.idic.quadrature import Quadrature
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.mode_table import ModeRow, Wave, read_rows, write_rows
@@ -34,6 +37,9 @@ FloatArray = NDArray[np.float64]
 
 PATTERN: Wave = (math.pi, math.pi)
 """The wave of the paper's pattern, as phases from cell to cell [rad]."""
+
+EQ_MODE = square_family("hole")
+"""The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
 
 RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
 LOADINGS: dict[str, MacroLoading] = {
@@ -122,21 +128,10 @@ def name_of(thing: object, names: Mapping[str, object]) -> str:
     return next((name for name, known in names.items() if known == thing), repr(thing))
 
 
-def analytic_mode(nodes: FloatArray, pitch: float) -> FloatArray:
-    """(n, 2) Eq. (mode) with its ideal parameters [-]; a hole's centre is the origin."""
-    family = square_family("hole")
-    total = np.zeros_like(nodes)
-    for a, b, kx, ky, c in family.waves(family.start):
-        wave = np.sin(math.pi / pitch * (nodes @ [kx, ky] + c))
-        total += wave[:, None] * [a, b]
-    return total
-
-
-def overlap(mesh: Mesh, first: FloatArray, second: FloatArray) -> float:
-    """|<first, second>| / (|first| |second|) of two nodal fields (n, 2) over the material [-]."""
+def overlap_of_fields(mesh: Mesh, first: FloatArray, second: FloatArray) -> float:
+    """Normalised overlap of two nodal fields (n, 2) over the material [-]."""
     rule = Quadrature(mesh)
-    a, b = rule.values(first), rule.values(second)
-    return abs(rule.product(a, b)) / math.sqrt(rule.product(a, a) * rule.product(b, b))
+    return math.sqrt(best_amplitude(rule, rule.values(first), rule.values(second))[1])
 
 
 def pattern_mode(lattice: Lattice) -> PatternMode:
@@ -145,9 +140,9 @@ def pattern_mode(lattice: Lattice) -> PatternMode:
     The mode belongs to the first critical state, or without one to the last that was looked at.
     Where (π, π) is not what is critical there, its eigenvalue says how far off it is.
     """
-    from modeharvest.fem.bloch import BlochWaves
     from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
     from modeharvest.fem.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattice_modes import real_modes
     from modeharvest.fem.lattices import square
 
     pitch = lattice.pitch
@@ -157,14 +152,23 @@ def pattern_mode(lattice: Lattice) -> PatternMode:
     found = first_critical(path, search)
     kind = kind_of(found)
     alone = found if kind == "pattern" else critical_at(path, PATTERN, search)
-    modes = BlochWaves(cell, found.state).lowest(PATTERN)
-    shape = np.real(cell.reduction.displacement(modes.vectors[:, 0], PATTERN))
-    shape, analytic = _alike(unit.mesh, shape, analytic_mode(unit.mesh.nodes, pitch))
+    modes = real_modes(cell, found.state, (PATTERN,))
+    automatic = mode_family(modes.mesh, modes.lattice, modes.shapes[0], pitch)
     row = ModeRow(
         *lattice.key, found.found, found.load, kind, alone.load if alone.found else math.nan,
-        found.load, float(modes.eigenvalues[0]), overlap(unit.mesh, shape, analytic),
+        found.load, float(modes.eigenvalues[0]),
+        overlap(modes.mesh, modes.shapes[0], EQ_MODE, pitch), automatic.captured,
+        automatic.family.wave_count,
     )  # fmt: skip
-    return PatternMode(row, unit.mesh, shape, analytic)
+    quarter = cKDTree(modes.mesh.nodes).query(unit.mesh.nodes)[1]
+    analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), unit.mesh.nodes, pitch)
+    return PatternMode(row, unit.mesh, *_alike(unit.mesh, modes.shapes[0][quarter], analytic))
+
+
+def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArray:
+    """(n, 2) sum of waves (w, 5) at positions (n, 2) [mm], without scale and support [-]."""
+    phases = math.pi / pitch * (positions @ waves[:, 2:4].T + waves[:, 4])
+    return np.asarray(np.sin(phases) @ waves[:, :2])
 
 
 def _alike(mesh: Mesh, shape: FloatArray, analytic: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -42,8 +41,9 @@ class ModeRow:
     overlap
         |<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both of unit norm
         over the material [-].
-    captured
-        Share of its energy that the automatic family holds [-]; NaN if not asked for.
+    captured, waves
+        Share of its energy that the automatically found family holds [-], and how many waves
+        that has.
     """
 
     material: str
@@ -58,7 +58,8 @@ class ModeRow:
     state: float
     eigenvalue: float
     overlap: float
-    captured: float = math.nan
+    captured: float
+    waves: int
 
     @property
     def key(self) -> Key:
@@ -85,6 +86,7 @@ _HEADS = {
     "eigenvalue": "eigenvalue at (pi, pi) [N/mm^4]",
     "overlap": "overlap with Eq. (mode) [-]",
     "captured": "energy captured by the automatic family [-]",
+    "waves": "its waves [-]",
 }
 
 
@@ -130,5 +132,5 @@ def _parsed(line: list[str]) -> ModeRow:
         a["material"], a["loading"], float(a["pitch"]), float(a["ratio"]), int(a["divisions"]),
         {"True": True, "False": False}[a["found"]], float(a["first"]), a["kind"],
         float(a["pattern"]), float(a["state"]), float(a["eigenvalue"]), float(a["overlap"]),
-        float(a["captured"]),
+        float(a["captured"]), int(a["waves"]),
     )  # fmt: skip
