@@ -1,16 +1,19 @@
 """The kinematics that IDIC looks for: u(x) = v0(x) + sum_i v_i(x) phi_i(x).
 
+And, if asked for, how the images' brightness differs.
+
 Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x right, y up).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box, ChebyshevField
 from modeharvest.idic.fourier import FourierMode, square_family
 from modeharvest.idic.support import Taper
@@ -23,7 +26,7 @@ class Ansatz:
     """Slow field v0, amplitudes v_i and modes phi_i, and the order of their unknowns.
 
     The unknowns are, in this order: v0 along x, v0 along y [mm], v_1 ... v_n [mm], then the
-    parameters of phi_1 ... phi_n.
+    parameters of phi_1 ... phi_n, then those of the brightness.
 
     Parameters
     ----------
@@ -33,12 +36,15 @@ class Ansatz:
         phi_1 ... phi_n; none gives a plain global DIC with v0 alone.
     v0_degree, v_degree
         Total degrees of v0 (5 in the paper) and of every v_i (6).
+    brightness
+        Whether gain and offset of the grey levels are unknowns, too; by default not.
     """
 
     domain: Box
     modes: tuple[FourierMode, ...] = ()
     v0_degree: int = 5
     v_degree: int = 6
+    brightness: Brightness = field(default_factory=Brightness)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "modes", tuple(self.modes))
@@ -82,7 +88,7 @@ class Ansatz:
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self.phi_offset(len(self.modes))
+        return self.phi_offset(len(self.modes)) + self.brightness.size
 
     def v0_slice(self, component: int) -> slice:
         """Where v0 along x (0) or y (1) is among the unknowns."""
@@ -105,17 +111,18 @@ class Ansatz:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """A name for each unknown: ``v0x[2,1]``, ``v1[0,3]``, ``phi1.a4``."""
+        """A name for each unknown: ``v0x[2,1]``, ``v1[0,3]``, ``phi1.a4``, ``gain[0,0]``."""
         v0 = [f"v0{c}[{i},{j}]" for c in "xy" for i, j in self.v0_space.orders]
         v = [f"v{k + 1}[{i},{j}]" for k in range(len(self.modes)) for i, j in self.v_space.orders]
         phi = [f"phi{k + 1}.{name}" for k, m in enumerate(self.modes) for name in m.family.names]
-        return tuple(v0 + v + phi)
+        return (*v0, *v, *phi, *self.brightness.names)
 
     @property
     def units(self) -> tuple[str, ...]:
         """The unit of each unknown."""
         slow = ("mm",) * self.phi_offset(0)
-        return slow + tuple(unit for mode in self.modes for unit in mode.family.units)
+        modes = tuple(unit for mode in self.modes for unit in mode.family.units)
+        return slow + modes + self.brightness.units
 
     def checked(self, a: ArrayLike) -> FloatArray:
         """Return the unknowns as (size,) floats; raises InputError if the size is wrong."""
@@ -191,8 +198,17 @@ class Ansatz:
         at = self.displacement(a, points[..., None, 0], points[..., None, 1])
         return np.asarray(at[..., 0, :])
 
+    def gain_and_offset(
+        self, a: ArrayLike, x: ArrayLike, y: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """1 + b [-] and c [grey levels]: f = (1 + b) g(x + u) + c; 1 and 0 if not unknown."""
+        a, (x, y) = self.checked(a), _positions(x, y)
+        return self.brightness.evaluate(self.domain, a[self.phi_offset(len(self.modes)) :], x, y)
+
     def sensitivities(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2, size): derivatives of the displacement with respect to the unknowns.
+
+        Zero for gain and offset.
 
         Meant for tests and for few points; the correlation itself never forms it.
         """

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -22,7 +23,8 @@ from modeharvest.idic.gauss_newton import (
     StepLength,
     minimise,
 )
-from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen, where
+from modeharvest.idic.normal_equations import Assembly, NormalEquations
 from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, Pair, prepare
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
@@ -108,29 +110,38 @@ def correlate(
     """
     options = options or CorrelationOptions()
     clock = _Clock()
-    f, g = _image(reference, "reference", grid), _image(deformed, "deformed", grid)
-    f_mask, g_mask = _mask(mask, "mask", grid), _mask(deformed_mask, "deformed mask", grid)
-    _check_grey_levels(f, f_mask, "reference")
-    _check_grey_levels(g, g_mask, "deformed")
-    a = before = ansatz.checked(start)
+    f, g = checked_image(reference, "reference", grid), checked_image(deformed, "deformed", grid)
+    f_mask, g_mask = (
+        checked_mask(mask, "mask", grid),
+        checked_mask(deformed_mask, "deformed mask", grid),
+    )
+    require_contrast(seen(f, f_mask), "reference")
+    require_contrast(seen(g, g_mask), "deformed")
+    a = before = _lit_alike(ansatz, ansatz.checked(start), seen(f, f_mask), seen(g, g_mask))
+    kinematics = replace(ansatz, brightness=Brightness())
+    has_brightness = ansatz.brightness.size > 0
     levels = _useful(options.levels, ansatz, grid)
     history: tuple[Iteration, ...] = ()
     for k, level in enumerate(levels):
-        pair = prepare(f, g, grid, f_mask, g_mask, level, options.edge_px, options.order)
-        clock.lap(f"prepare level {level.factor}")
         finest = k == len(levels) - 1
-        before = _better(pair, ansatz, a, before)
+        # Coarse levels see images that are lit alike: what the brightness could absorb there is
+        # much of the blurred speckle itself.
+        levelled = has_brightness and not finest
+        pair = prepare(f, g, grid, f_mask, g_mask, level, options.edge_px, options.order, levelled)
+        clock.lap(f"prepare level {level.factor}")
+        model = ansatz if finest else kinematics
+        before = _better(pair, model, a[: model.size], before[: model.size])
         found = _minimise_pair(
-            pair, ansatz, before, level.factor, finest, options.gauss_newton,
+            pair, model, before, level.factor, finest, options.gauss_newton,
             _reporter(progress, k, len(levels), options.gauss_newton),
         )  # fmt: skip
         clock.lap(f"iterate level {level.factor}")
         history += found.history
-        a = found.unknowns
+        a, before = (np.concatenate([x, a[x.size :]]) for x in (found.unknowns, before))
         if found.outcome in (Outcome.LEFT_IMAGE, Outcome.SINGULAR):
             break
     progress(len(levels), len(levels), "correlate")
-    return _result(ansatz, grid, found, history, clock.laps)
+    return _result(model, grid, found, history, clock.laps)
 
 
 def fit_displacement(
@@ -173,21 +184,23 @@ def fit_displacement(
     """
     options = options or GaussNewtonOptions()
     clock = _Clock()
+    start = ansatz.checked(start)
+    ansatz = replace(ansatz, brightness=Brightness())  # of which a displacement says nothing
     target = np.asarray(displacement, dtype=np.float64)
     if target.shape != (*grid.shape, 2):
         raise InputError(
             f"expected a displacement of shape {(*grid.shape, 2)} like the grid, got {target.shape}"
         )
-    inside = _mask(mask, "mask", grid)
+    inside = checked_mask(mask, "mask", grid)
     inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
     bad = inside & ~np.isfinite(target).all(axis=-1)
     if bad.any():
-        raise InputError(f"expected a finite displacement inside the mask, got {_first(bad)}")
+        raise InputError(f"expected a finite displacement inside the mask, got {where(bad)}")
     assembly = Assembly(ansatz, grid, inside)
     found = minimise(
-        partial(assembly.displacement, target=target),
+        lambda a, with_matrix: assembly.displacement(a, target, with_matrix),
         _step_length(ansatz, grid, inside, 1),
-        ansatz.checked(start),
+        start[: ansatz.size],
         options,
         options.tolerance_px,
         on_iteration=_reporter(progress, 0, 1, options),
@@ -211,7 +224,7 @@ def _minimise_pair(
     for _ in range(_ROUNDS):
         assembly = Assembly(ansatz, pair.grid, landed)
         found = minimise(
-            partial(assembly.images, reference=pair.reference, deformed=pair.deformed),
+            partial(_images, assembly, pair),
             _step_length(ansatz, pair.grid, landed, factor),
             start,
             options,
@@ -233,11 +246,15 @@ def _better(pair: Pair, ansatz: Ansatz, a: FloatArray, before: FloatArray) -> Fl
     A speckle that is too fine for a coarse blur leaves no information there, and the level
     leads astray; this takes its steps back.
     """
-    if a is before:
+    if np.array_equal(a, before):
         return a
     assembly = Assembly(ansatz, pair.grid, pair.mask)
-    fit = partial(assembly.images, reference=pair.reference, deformed=pair.deformed)
-    return a if fit(a).mean_square <= fit(before).mean_square else before
+    costs = [_images(assembly, pair, x, False).mean_square for x in (a, before)]
+    return a if costs[0] <= costs[1] else before
+
+
+def _images(assembly: Assembly, pair: Pair, a: FloatArray, with_matrix: bool) -> NormalEquations:
+    return assembly.images(a, pair.reference, pair.deformed, with_matrix)
 
 
 def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
@@ -321,49 +338,24 @@ def _reporter(
     return report
 
 
-def _image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
-    pixels = np.asarray(image)
-    if pixels.shape != grid.shape:
-        raise InputError(
-            f"expected a {what} image of {grid.rows} x {grid.cols} px like the grid, got shape "
-            f"{pixels.shape}; give two images and a grid of one size"
-        )
-    pixels = pixels.astype(np.float32, copy=False)
-    bad = ~np.isfinite(pixels)
-    if bad.any():
-        raise InputError(
-            f"expected finite grey levels in the {what} image, got NaN or infinity in "
-            f"{_first(bad)}; fill or crop them"
-        )
-    return pixels
+def _lit_alike(ansatz: Ansatz, start: FloatArray, f: NDArray[Any], g: NDArray[Any]) -> FloatArray:
+    """Start with a gain and an offset that give both images one mean and one contrast.
 
-
-def _mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
-    if mask is None:
-        return None
-    inside = np.ascontiguousarray(mask, dtype=np.bool_)
-    if inside.shape != grid.shape:
-        raise InputError(
-            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
-            f"{inside.shape}"
-        )
-    if not inside.any():
-        raise InputError(f"expected material in the {what}, got one that is False everywhere")
-    return inside
-
-
-def _check_grey_levels(image: NDArray[Any], mask: BoolArray | None, what: str) -> None:
-    seen = image if mask is None else image[mask]
-    if seen.min() == seen.max():
-        raise InputError(
-            f"expected a speckle in the {what} image, got the constant grey level {seen.flat[0]}"
-        )
-
-
-def _first(bad: BoolArray) -> str:
-    """How many pixels are bad, and where the first one is."""
-    row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    return f"{int(bad.sum())} px, the first at row {row}, column {col}"
+    Far from the solution, where the images don't match yet, a fit would sooner wipe out the
+    contrast than find the displacement. A start that has gain or offset already is kept.
+    """
+    first = ansatz.phi_offset(len(ansatz.modes))
+    if start[first:].any():
+        return start
+    start, names = start.copy(), ansatz.names
+    gain = 1.0
+    if "gain[0,0]" in names:
+        gain = float(f.std(dtype=np.float64) / g.std(dtype=np.float64))
+        start[names.index("gain[0,0]")] = gain - 1.0
+    if "offset[0,0]" in names:
+        difference = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
+        start[names.index("offset[0,0]")] = float(difference)
+    return start
 
 
 class _Clock:

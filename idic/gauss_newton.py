@@ -4,6 +4,11 @@ A full Gauss-Newton step is tried first. One that raises the cost is solved agai
 stored matrix with more damping, until the cost falls. The matrix is scaled to a unit diagonal
 and decomposed into eigenvectors; directions the images can't tell anything about (the mode's
 parameters where v is zero) get no step instead of an enormous one.
+
+Once steps are short, J'J hardly changes, and what it lacks of the Hessian makes convergence
+linear. So it is no longer assembled but corrected by what each step does to the gradient
+(Broyden, Fletcher, Goldfarb & Shanno): cheaper iterations, and fewer. J'J itself is assembled
+again where the iteration ends.
 """
 
 from __future__ import annotations
@@ -63,10 +68,9 @@ class GaussNewtonOptions:
     Parameters
     ----------
     tolerance_px
-        Converged once a step changes the displacement by less than this, rms [px]. What the
-        ansatz can't describe makes convergence linear, at a factor of 0.2 to 0.6; the error
-        left is then about as large as the last step. 1e-4 px is a thousandth of the best
-        noise floor of DIC.
+        Converged once a step changes the displacement by less than this, rms [px]. The error
+        left is no larger than about the last step. 1e-4 px is a hundredth of the best noise
+        floor of DIC.
     coarse_tolerance_px
         The same in *binned* px on the coarse levels, which only have to lead to the next.
     max_iterations
@@ -202,10 +206,19 @@ class Minimum:
     history: tuple[Iteration, ...]
 
 
-Evaluate = Callable[[FloatArray], NormalEquations]
+Evaluate = Callable[[FloatArray, bool], NormalEquations]
 StepLength = Callable[[FloatArray, FloatArray], float]
 
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e4
+
+_SHORT = 0.1
+"""Steps shorter than this [binned px] leave J'J nearly as it was: speckles are 3 px or more."""
+
+_FALLING = 0.9
+"""Ratio of the costs after and before a step below which the cost is said to fall a lot."""
+
+_LEAST_CURVATURE = 0.05
+"""Share of J'J's curvature along a step that the gradient's change must show at least."""
 
 
 def minimise(
@@ -222,7 +235,7 @@ def minimise(
     Parameters
     ----------
     evaluate
-        The normal equations at some unknowns.
+        The normal equations at some unknowns, and whether with the matrix.
     step_length
         Rms difference of the displacement between two sets of unknowns [px].
     start
@@ -230,34 +243,42 @@ def minimise(
     options, tolerance_px
         When to stop.
     factor
-        Binning, for the history.
+        Binning.
     on_iteration
         Called with the number of each finished iteration.
     """
-    a, equations = start, evaluate(start)
+    a, equations = start, evaluate(start, True)
+    matrix, is_assembled = equations.matrix, True
     history: list[Iteration] = []
-    damping = 0.0
+    damping, previous = 0.0, np.inf
 
     def ended(outcome: Outcome) -> Minimum:
-        return Minimum(a, equations, outcome, tuple(history))
+        there = equations if is_assembled else evaluate(a, True)
+        return Minimum(a, there, outcome, tuple(history))
 
     if _left(equations) > options.max_left:
         return ended(Outcome.LEFT_IMAGE)
     for number in range(1, options.max_iterations + 1):
-        if not np.any(equations.matrix):
+        if not np.any(matrix):
             return ended(Outcome.SINGULAR)
-        eigen = ScaledEigen.of(equations.matrix)
+        eigen = ScaledEigen.of(matrix)
         while True:
             candidate = a - eigen.solve(equations.gradient, damping)
             step = step_length(a, candidate)
-            trial = evaluate(candidate)
+            # While the cost still falls a lot, Gauss-Newton's own matrix is the best.
+            has_fallen = equations.mean_square < _FALLING * previous
+            is_settling = damping == 0.0 and step < _SHORT * factor and not has_fallen
+            trial = evaluate(candidate, not is_settling)
             descends = trial.mean_square <= equations.mean_square
             accepted = descends and _left(trial) <= options.max_left
             if accepted or step <= tolerance_px or damping >= _LARGEST_DAMPING:
                 break
             damping = max(_FIRST_DAMPING, 10.0 * damping)
         if accepted:
-            a, equations = candidate, trial
+            change = trial.gradient - equations.gradient
+            matrix = _corrected(matrix, candidate - a, change) if is_settling else trial.matrix
+            previous = equations.mean_square
+            a, equations, is_assembled = candidate, trial, not is_settling
         history.append(
             Iteration(factor, number, equations.mean_square, step, damping, equations.pixels)
         )
@@ -268,6 +289,19 @@ def minimise(
             return ended(Outcome.STAGNATED)
         damping = 0.0 if damping <= _FIRST_DAMPING else 0.1 * damping
     return ended(Outcome.MAX_ITERATIONS)
+
+
+def _corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+    """The matrix with the curvature seen along a step: matrix . step = change of the gradient.
+
+    As it was where the gradient tells of no positive curvature.
+    """
+    pushed = matrix @ step
+    curvature, seen = float(step @ pushed), float(step @ change)
+    if not seen > _LEAST_CURVATURE * curvature > 0:
+        return matrix
+    lost, gained = np.outer(pushed, pushed) / curvature, np.outer(change, change) / seen
+    return np.asarray(matrix - lost + gained)
 
 
 def _left(equations: NormalEquations) -> float:

@@ -4,24 +4,27 @@ Every column of the Jacobian is a *base field* e(x) times a product T_i(xi) T_j(
 J'J, J'r and r'r need nothing but the moments sum_x e e' T_a(xi) T_b(eta) of pairs of base
 fields. The base fields, D being the total degree of the products that multiply each of them:
 
-    gx, gy                      gradient of the deformed image at x + u         D = degree of v0
+    gx, gy                      (1 + b) times the deformed image's gradient     D = degree of v0
     p_i = phi_i . (gx, gy)      one for each mode                               D = degree of v
     S gx sin, S gy sin          for each wave, S = s tau v_i                    D = 0
     S (A gx + B gy) cos pi/l    for each wave; its 1, x, y parts are c, kx, ky  D = 1
+    g                           only with a gain 1 + b among the unknowns       D = degree of b
+    1                           only with an offset among the unknowns          D = its degree
     r                           the residual                                    D = 0
 
-About 250 multiply-adds a pixel for 77 unknowns, where the Jacobian's product needs 3 000. The
-pixels of a row that hold material are gathered in blocks that stay in the first cache; the
-rows are dealt to a fixed number of bands whose sums are added in order, so the result does not
-depend on the number of threads.
+The deformed image is taken at x + u. About 250 multiply-adds a pixel for 77 unknowns, where the
+Jacobian's product needs 3 000; J'r alone needs 60. The pixels of a row that hold material are
+gathered in blocks that stay in the first cache; the rows are dealt to a fixed number of bands
+whose sums are added in order, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.interpolation import sample_points
@@ -29,8 +32,80 @@ from modeharvest.imaging.interpolation import sample_points
 BLOCK = 256
 """Pixels gathered at a time."""
 
-IMAGE = -1
-"""``component`` of :func:`accumulate` for a pair of images; 0 and 1 are displacements."""
+
+class Target(NamedTuple):
+    """What the ansatz is fitted to: a pair of images, or one component of a displacement.
+
+    Parameters
+    ----------
+    component
+        IMAGES: residual f - (1 + b) g(x + u) - c. 0 or 1: residual ``displacement`` - u_x or
+        u_y, and (1, 0) or (0, 1) in place of the gradient.
+    reference
+        (rows, cols) f; of no account for a displacement.
+    coefficients, order
+        Spline of g.
+    displacement
+        (rows, cols) [mm]; of no account for images.
+    pixel_size
+        [mm/px].
+    """
+
+    component: int
+    reference: NDArray[Any]
+    coefficients: NDArray[Any]
+    order: int
+    displacement: NDArray[Any]
+    pixel_size: float
+
+
+IMAGES = -1
+"""``component`` of a pair of images."""
+
+
+class Pixels(NamedTuple):
+    """Columns of the pixels that count, row after row, and (rows + 1,) where each row starts."""
+
+    columns: NDArray[Any]
+    row_start: NDArray[Any]
+
+
+class Tables(NamedTuple):
+    """The ansatz at some unknowns, as one-dimensional tables along the rows and columns.
+
+    Parameters
+    ----------
+    xi, eta
+        (cols,), (rows,): normalised coordinates.
+    v0, v
+        (2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm].
+    brightness
+        (2, D + 1, D + 1): those of the gain b [-] and of the offset c [grey levels].
+    gain_field, offset_field
+        Numbers of their base fields; 0 where they are no unknowns.
+    waves, mode_of_wave
+        (w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to.
+    sin_x, cos_x, sin_y, cos_y
+        (w, cols) of pi/l kx x, (w, rows) of pi/l (ky y + c).
+    taper_x, taper_y
+        (n, cols) s tau_x and (n, rows) tau_y.
+    """
+
+    xi: NDArray[Any]
+    eta: NDArray[Any]
+    v0: NDArray[Any]
+    v: NDArray[Any]
+    brightness: NDArray[Any]
+    gain_field: int
+    offset_field: int
+    waves: NDArray[Any]
+    mode_of_wave: NDArray[Any]
+    sin_x: NDArray[Any]
+    cos_x: NDArray[Any]
+    sin_y: NDArray[Any]
+    cos_y: NDArray[Any]
+    taper_x: NDArray[Any]
+    taper_y: NDArray[Any]
 
 
 @compiled(relaxed=True)
@@ -60,81 +135,62 @@ def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
 
 @compiled(relaxed=True)
 def _modes_block(
-    row: int,
-    columns: Any,
-    n: int,
-    waves: Any,
-    mode_of_wave: Any,
-    sin_x: Any,
-    cos_x: Any,
-    sin_y: Any,
-    cos_y: Any,
-    taper_x: Any,
-    taper_y: Any,
-    v: Any,
-    phi: Any,
-    sines: Any,
-    cosines: Any,
+    row: int, columns: Any, n: int, tables: Any, v: Any, phi: Any, sines: Any, cosines: Any
 ) -> None:
     """phi_i, S sin theta_w and S cos theta_w pi/l along the block, from one-dimensional tables."""
     for i in range(phi.shape[0]):
         for m in range(n):
             phi[i, 0, m] = phi[i, 1, m] = 0.0
-    for w in range(waves.shape[0]):
-        i = mode_of_wave[w]
-        A, B, per_mm = waves[w, 0], waves[w, 1], waves[w, 5]
-        sy, cy = sin_y[w, row], cos_y[w, row]
+    for w in range(tables.waves.shape[0]):
+        i = tables.mode_of_wave[w]
+        A, B, per_mm = tables.waves[w, 0], tables.waves[w, 1], tables.waves[w, 5]
+        sy, cy = tables.sin_y[w, row], tables.cos_y[w, row]
+        sin_x, cos_x = tables.sin_x[w], tables.cos_x[w]
+        taper_x, tau_y = tables.taper_x[i], tables.taper_y[i, row]
         for m in range(n):
             k = columns[m]
-            tau = taper_x[i, k] * taper_y[i, row]
-            sine = tau * (sin_x[w, k] * cy + cos_x[w, k] * sy)
+            tau = taper_x[k] * tau_y
+            sine = tau * (sin_x[k] * cy + cos_x[k] * sy)
             phi[i, 0, m] += A * sine
             phi[i, 1, m] += B * sine
             sines[w, m] = v[i, m] * sine
-            cosines[w, m] = per_mm * v[i, m] * tau * (cos_x[w, k] * cy - sin_x[w, k] * sy)
+            cosines[w, m] = per_mm * v[i, m] * tau * (cos_x[k] * cy - sin_x[k] * sy)
 
 
 @compiled(relaxed=True)
 def _model_block(
-    component: int,
-    f: Any,
-    row: int,
-    columns: Any,
-    n: int,
-    ux: Any,
-    uy: Any,
-    coefficients: Any,
-    order: int,
-    pixel_size: float,
-    work: Any,
-    E: Any,
+    target: Any, row: int, columns: Any, n: int, u: Any, b: Any, c: Any, work: Any, E: Any
 ) -> int:
-    """Gradient into E[0], E[1] and residual into E[-1]; returns how many left the image.
+    """Gradient into E[0], E[1], residual into E[-1], g into work[2]; returns how many left.
 
-    A pixel that leaves the image gets zeros: it takes no part in any sum.
+    A pixel that leaves the image gets zeros, in work[5], too: it takes no part in any sum.
     """
     last = E.shape[0] - 1
+    component = target.component
     if component >= 0:
         for m in range(n):
             E[0, m] = 1.0 - component
             E[1, m] = component
-            E[last, m] = f[row, columns[m]] - (uy[m] if component else ux[m])
+            work[2, m] = work[5, m] = 0.0
+            E[last, m] = target.displacement[row, columns[m]] - u[component, m]
         return 0
-    per_px = 1.0 / pixel_size
-    r, c, value, d_row, d_col = work[0], work[1], work[2], work[3], work[4]
+    per_px = 1.0 / target.pixel_size
+    at_row, at_col, value, d_row, d_col = work[0], work[1], work[2], work[3], work[4]
     for m in range(n):
-        r[m] = row - uy[m] * per_px
-        c[m] = columns[m] + ux[m] * per_px
-    sample_points(coefficients, order, r, c, n, value, d_row, d_col)
+        at_row[m] = row - u[1, m] * per_px
+        at_col[m] = columns[m] + u[0, m] * per_px
+    sample_points(target.coefficients, target.order, at_row, at_col, n, value, d_row, d_col)
     off = 0
     for m in range(n):
         if np.isnan(value[m]):
             off += 1
-            E[0, m] = E[1, m] = E[last, m] = 0.0
+            E[0, m] = E[1, m] = E[last, m] = value[m] = work[5, m] = 0.0
         else:
-            E[0, m] = d_col[m] * per_px
-            E[1, m] = -d_row[m] * per_px
-            E[last, m] = f[row, columns[m]] - value[m]
+            work[5, m] = 1.0
+            gain = 1.0 + b[m]
+            E[0, m] = gain * d_col[m] * per_px
+            E[1, m] = -gain * d_row[m] * per_px
+            E[last, m] = target.reference[row, columns[m]] - gain * value[m] - c[m]
     return off
 
 
@@ -199,105 +255,68 @@ def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
                 moments[p, a, b] += value * eta_T[b]
 
 
+@compiled(relaxed=True)
+def _brightness_block(n: int, tables: Any, work: Any, E: Any) -> None:
+    """Fill the base fields of gain and offset, g and 1, where they are unknowns."""
+    for k, field in ((2, tables.gain_field), (5, tables.offset_field)):
+        if field:
+            for m in range(n):
+                E[field, m] = work[k, m]
+
+
 @compiled(parallel=True, relaxed=True)
 def accumulate(
-    component: int,
-    f: Any,
-    coefficients: Any,
-    order: int,
-    pixel_size: float,
-    columns: Any,
-    row_start: Any,
-    xi: Any,
-    eta: Any,
-    v0_series: Any,
-    v_series: Any,
-    waves: Any,
-    mode_of_wave: Any,
-    sin_x: Any,
-    cos_x: Any,
-    sin_y: Any,
-    cos_y: Any,
-    taper_x: Any,
-    taper_y: Any,
-    pairs: Any,
-    bands: int,
-    moments: Any,
-    left: Any,
+    target: Any, pixels: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any
 ) -> None:
-    """Sum the moments of all pairs of base fields over the pixels.
+    """Sum the moments of pairs of base fields over the pixels.
 
     Parameters
     ----------
-    component
-        IMAGE: residual f - g(x + u). 0 or 1: residual f - u_x or f - u_y, gradient (1, 0) or
-        (0, 1), which fits the ansatz to a displacement.
-    f
-        (rows, cols): reference image, or the displacement's component [mm].
-    coefficients, order
-        Spline of the deformed image.
-    pixel_size
-        [mm/px].
-    columns, row_start
-        Columns of the pixels that count, row after row, and (rows + 1,) where each row starts.
-    xi, eta
-        (cols,), (rows,): normalised coordinates.
-    v0_series, v_series
-        (2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): coefficients [i, j] [mm].
-    waves, mode_of_wave
-        (w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to.
-    sin_x, cos_x, sin_y, cos_y
-        (w, cols) of pi/l kx x, (w, rows) of pi/l (ky y + c).
-    taper_x, taper_y
-        (n, cols) s tau_x and (n, rows) tau_y.
+    target, pixels, tables
+        :class:`Target`, :class:`Pixels` and :class:`Tables`.
     pairs
         (pairs, 3): numbers of two base fields and the sum of their degrees.
-    bands
-        Number of bands that the rows are dealt to.
+    fields
+        Number of base fields.
     moments
-        (bands, pairs, K + 1, K + 1), zero on entry: the sums of each band.
+        (bands, pairs, K + 1, K + 1), zero on entry: the sums of each band of rows.
     left
         (bands,), zero on entry: how many pixels are mapped outside the image.
     """
-    rows = row_start.size - 1
-    n_modes, n_waves = v_series.shape[0], waves.shape[0]
-    n_fields = 3 + n_modes + 3 * n_waves
+    rows, bands = pixels.row_start.size - 1, moments.shape[0]
+    modes, waves = tables.v.shape[0], tables.waves.shape[0]
     for band in prange(bands):
         T = np.empty((max(2, moments.shape[2]), BLOCK))
         eta_T = np.empty(T.shape[0])
-        E = np.empty((n_fields, BLOCK))
-        u, v = np.empty((2, BLOCK)), np.empty((n_modes, BLOCK))
-        phi = np.empty((n_modes, 2, BLOCK))
-        sines, cosines = np.empty((n_waves, BLOCK)), np.empty((n_waves, BLOCK))
-        work, product = np.empty((5, BLOCK)), np.empty(BLOCK)
+        E = np.empty((fields, BLOCK))
+        u, v, bc = np.empty((2, BLOCK)), np.empty((modes, BLOCK)), np.empty((2, BLOCK))
+        phi = np.empty((modes, 2, BLOCK))
+        sines, cosines = np.empty((waves, BLOCK)), np.empty((waves, BLOCK))
+        work, product = np.empty((6, BLOCK)), np.empty(BLOCK)
         row_moments = np.zeros((pairs.shape[0], T.shape[0]))
         for row in range(band * rows // bands, (band + 1) * rows // bands):
-            first, last = row_start[row], row_start[row + 1]
+            first, last = pixels.row_start[row], pixels.row_start[row + 1]
             if first == last:
                 continue
-            eta_T[0], eta_T[1] = 1.0, eta[row]
+            eta_T[0], eta_T[1] = 1.0, tables.eta[row]
             for b in range(2, eta_T.size):
-                eta_T[b] = 2.0 * eta[row] * eta_T[b - 1] - eta_T[b - 2]
+                eta_T[b] = 2.0 * eta_T[1] * eta_T[b - 1] - eta_T[b - 2]
             for begin in range(first, last, BLOCK):
                 n = min(BLOCK, last - begin)
-                block = columns[begin : begin + n]
-                _chebyshev_block(xi, block, n, T)
-                for c in range(2):
-                    _series_block(v0_series[c], eta_T, T, n, u[c])
-                for i in range(n_modes):
-                    _series_block(v_series[i], eta_T, T, n, v[i])
-                _modes_block(
-                    row, block, n, waves, mode_of_wave, sin_x, cos_x, sin_y, cos_y,
-                    taper_x, taper_y, v, phi, sines, cosines,
-                )  # fmt: skip
-                for i in range(n_modes):
+                block = pixels.columns[begin : begin + n]
+                _chebyshev_block(tables.xi, block, n, T)
+                for k in range(2):
+                    _series_block(tables.v0[k], eta_T, T, n, u[k])
+                    _series_block(tables.brightness[k], eta_T, T, n, bc[k])
+                for i in range(modes):
+                    _series_block(tables.v[i], eta_T, T, n, v[i])
+                _modes_block(row, block, n, tables, v, phi, sines, cosines)
+                for i in range(modes):
                     for m in range(n):
                         u[0, m] += v[i, m] * phi[i, 0, m]
                         u[1, m] += v[i, m] * phi[i, 1, m]
-                left[band] += _model_block(
-                    component, f, row, block, n, u[0], u[1], coefficients, order, pixel_size,
-                    work, E,
-                )  # fmt: skip
-                _base_fields_block(n, waves, phi, sines, cosines, E)
+                left[band] += _model_block(target, row, block, n, u, bc[0], bc[1], work, E)
+                _base_fields_block(n, tables.waves, phi, sines, cosines, E)
+                _brightness_block(n, tables, work, E)
                 _moments_block(n, pairs, T, E, product, row_moments)
             _add_row(pairs, row_moments, eta_T, moments[band])

@@ -21,7 +21,7 @@ from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.fourier import PER_WAVE
-from modeharvest.idic.moments import IMAGE, accumulate
+from modeharvest.idic.moments import IMAGES, Pixels, Tables, Target, accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -39,7 +39,7 @@ class NormalEquations:
     Parameters
     ----------
     matrix
-        (n, n): J'J, where J is minus the derivative of the residual.
+        (n, n): J'J, where J is minus the derivative of the residual; zero if not asked for.
     gradient
         (n,): -J'r, the derivative of the cost.
     cost
@@ -96,23 +96,29 @@ class Assembly:
             )
 
     @cached_property
-    def _columns(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    def _pixels(self) -> Pixels:
         row_start = np.concatenate([[0], np.cumsum(self.mask.sum(axis=1, dtype=np.int64))])
-        return np.nonzero(self.mask)[1].astype(np.int32), row_start
+        columns = np.empty(row_start[-1], dtype=np.int32)
+        for row, (first, last) in enumerate(pairwise(row_start)):
+            columns[first:last] = np.flatnonzero(self.mask[row])
+        return Pixels(columns, row_start)
 
     @cached_property
     def _degrees(self) -> list[int]:
         """Total degree of the products that multiply each base field."""
-        d = [self.ansatz.v0_degree] * 2
-        d += [self.ansatz.v_degree] * len(self.ansatz.modes)
-        for mode in self.ansatz.modes:
+        ansatz = self.ansatz
+        d = [ansatz.v0_degree] * 2
+        d += [ansatz.v_degree] * len(ansatz.modes)
+        for mode in ansatz.modes:
             d += [0, 0, 1] * mode.family.wave_count
-        return [*d, 0]
+        return [*d, *ansatz.brightness.degrees, 0]
 
-    @cached_property
-    def _pairs(self) -> NDArray[np.int64]:
+    def _pairs(self, with_matrix: bool) -> NDArray[np.int64]:
+        """All pairs of base fields; without the matrix those with the residual alone."""
         d = self._degrees
-        return np.array([(e, k, d[e] + d[k]) for e in range(len(d)) for k in range(e, len(d))])
+        last = len(d) - 1
+        pairs = [(e, k) for e in range(len(d)) for k in range(e if with_matrix else last, len(d))]
+        return np.array([(e, k, d[e] + d[k]) for e, k in pairs])
 
     @cached_property
     def _primitive_slices(self) -> list[slice]:
@@ -139,6 +145,8 @@ class Assembly:
                 family = mode.family.matrix[PER_WAVE * w : PER_WAVE * (w + 1)]
                 result[rows, ansatz.phi_slice(i)] = wave @ family
                 k += 3
+        kinematic = ansatz.phi_offset(len(ansatz.modes))
+        result[parts[k].start :, kinematic:] = np.eye(ansatz.size - kinematic)
         return result
 
     def images(
@@ -146,21 +154,33 @@ class Assembly:
         a: FloatArray,
         reference: NDArray[Any],
         deformed: SplineImage,
+        with_matrix: bool = True,
     ) -> NormalEquations:
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
+
+        With brightness among the unknowns r = f - (1 + b) g(x + u) - c.
 
         Parameters
         ----------
         a
             (size,) unknowns.
         reference
-            (rows, cols): f.
+            (rows, cols): f, float32 or float64.
         deformed
             g.
+        with_matrix
+            Without the matrix the pass costs about half as much.
         """
-        return self._assemble(a, IMAGE, reference, deformed.coefficients, deformed.order)
+        nothing = np.zeros((0, 0))
+        spline = deformed.coefficients, deformed.order
+        target = Target(
+            IMAGES, np.ascontiguousarray(reference), *spline, nothing, self.grid.pixel_size
+        )
+        return self._assemble(a, target, with_matrix)
 
-    def displacement(self, a: FloatArray, target: NDArray[Any]) -> NormalEquations:
+    def displacement(
+        self, a: FloatArray, target: NDArray[Any], with_matrix: bool = True
+    ) -> NormalEquations:
         """Assemble the normal equations of r = target - u(a), both components.
 
         Parameters
@@ -169,40 +189,37 @@ class Assembly:
             (size,) unknowns.
         target
             (rows, cols, 2) displacement [mm].
+        with_matrix
+            Whether the matrix is wanted.
         """
-        nothing = np.zeros((8, 8), dtype=np.float32)
-        x, y = (self._assemble(a, c, target[..., c], nothing, 5) for c in (0, 1))
-        return x + y
+        nothing = np.zeros((0, 0), dtype=np.float32)
 
-    def _assemble(
-        self,
-        a: FloatArray,
-        component: int,
-        f: NDArray[Any],
-        coefficients: NDArray[Any],
-        order: int,
-    ) -> NormalEquations:
-        ansatz, grid = self.ansatz, self.grid
-        a = ansatz.checked(a)
-        xi, eta = ansatz.domain.normalised(grid.x, grid.y)
-        columns, row_start = self._columns
-        top = int(self._pairs[:, 2].max()) + 1
-        moments = np.zeros((BANDS, len(self._pairs), top, top))
+        def along(component: int) -> NormalEquations:
+            known = np.ascontiguousarray(target[..., component], dtype=np.float64)
+            pixel_size = self.grid.pixel_size
+            return self._assemble(
+                a, Target(component, nothing, nothing, 5, known, pixel_size), with_matrix
+            )
+
+        return along(0) + along(1)
+
+    def _assemble(self, a: FloatArray, target: Target, with_matrix: bool) -> NormalEquations:
+        pairs, degrees, pixels = self._pairs(with_matrix), self._degrees, self._pixels
+        top = max(int(pairs[:, 2].max()), *degrees) + 1
+        moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
-        # One type of f for images and displacements means one compilation.
-        f = np.ascontiguousarray(f, dtype=np.float64)
-        pixels: tuple[Any, ...] = (f, coefficients, order, grid.pixel_size, columns, row_start)
-        tables: tuple[Any, ...] = (xi, eta, *_tables(ansatz, grid, a))
-        sums: tuple[Any, ...] = (self._pairs, BANDS, moments, left)
+        tables = _tables(self.ansatz, self.grid, self.ansatz.checked(a))
         kernel: Callable[..., None] = accumulate
-        kernel(component, *pixels, *tables, *sums)
+        kernel(target, pixels, tables, pairs, len(degrees), moments, left)
         off = int(left.sum())
-        return self._from_moments(moments.sum(axis=0), columns.size - off, off)
+        return self._from_moments(pairs, moments.sum(axis=0), pixels.columns.size - off, off)
 
-    def _from_moments(self, moments: FloatArray, used: int, off: int) -> NormalEquations:
+    def _from_moments(
+        self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int
+    ) -> NormalEquations:
         parts, degrees = self._primitive_slices, self._degrees
         matrix = np.zeros((parts[-1].stop, parts[-1].stop))
-        for (e, k, _), moment in zip(self._pairs, moments, strict=True):
+        for (e, k, _), moment in zip(pairs, moments, strict=True):
             matrix[parts[e], parts[k]] = _products(moment, degrees[e], degrees[k])
             matrix[parts[k], parts[e]] = matrix[parts[e], parts[k]].T
         to = self._to_unknowns
@@ -219,8 +236,8 @@ def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
     return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
 
 
-def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> tuple[NDArray[Any], ...]:
-    """Make the one-dimensional tables that the kernel combines; see ``accumulate``."""
+def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:
+    """Make the one-dimensional tables that the kernel combines."""
     v0 = np.stack([ansatz.v0_space.square(a[ansatz.v0_slice(c)]) for c in (0, 1)])
     n, d = len(ansatz.modes), ansatz.v_degree + 1
     v, waves, mode_of_wave = np.zeros((n, d, d)), np.zeros((0, 6)), []
@@ -235,6 +252,16 @@ def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> tuple[NDArray[Any
         taper_y[i] = mode.taper.along_y(grid.y)
     tx = waves[:, 5:] * waves[:, 2:3] * grid.x
     ty = waves[:, 5:] * (waves[:, 3:4] * grid.y + waves[:, 4:5])
-    owner = np.array(mode_of_wave, dtype=np.int64)
-    trig = (np.sin(tx), np.cos(tx), np.sin(ty), np.cos(ty))
-    return (v0, v, waves, owner, *trig, taper_x, taper_y)
+    first = 2 + n + 3 * len(waves)
+    return Tables(
+        *ansatz.domain.normalised(grid.x, grid.y),
+        v0,
+        v,
+        ansatz.brightness.squares(a[ansatz.phi_offset(n) :]),
+        *ansatz.brightness.fields(first),
+        waves,
+        np.array(mode_of_wave, dtype=np.int64),
+        *(np.sin(tx), np.cos(tx), np.sin(ty), np.cos(ty)),
+        taper_x,
+        taper_y,
+    )

@@ -47,6 +47,9 @@ class Level:
 COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), Level(1, 0.0))
 """Blurs of 24, 12, 6 and 0 px."""
 
+_AROUND = 3.0
+"""How far the local mean and contrast reach, in blurs: nothing finer than the blur is lost."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -57,7 +60,7 @@ class Pair:
     grid
         The pixels of both images.
     reference
-        (rows, cols) float64: f.
+        (rows, cols) float32: f.
     deformed
         g, ready to be sampled.
     mask
@@ -82,6 +85,7 @@ def prepare(
     level: Level,
     edge_px: int,
     order: int,
+    levelled: bool = False,
 ) -> Pair:
     """Make one level of a pair of images.
 
@@ -100,10 +104,15 @@ def prepare(
         Pixels closer than this to the mask's edge are left out on the finest level [px].
     order
         Of the spline, 3 or 5.
+    levelled
+        Give both images a local mean of 0 and a local contrast of 1, so that differences of
+        brightness that vary slowly are gone; for blurred levels only.
     """
     f_weight = mask if deformed_mask is not None else None
     f = _smooth(reference, f_weight, level)
     g = _smooth(deformed, deformed_mask, level)
+    if levelled and level.blur > 0:
+        f, g = _levelled(f, level.blur), _levelled(g, level.blur)
     inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
     if level.factor > 1 or level.blur > 0:
         inside = _bin(inside, level.factor) >= 0.5
@@ -113,9 +122,7 @@ def prepare(
         # The reference's eroded edge lands near edge_px from the edge of g, give or take the
         # local strain; one pixel less leaves those pixels in.
         allowed = None if deformed_mask is None else eroded(deformed_mask, max(0, edge_px - 1))
-    return Pair(
-        grid.binned(level.factor), f.astype(np.float64), SplineImage.of(g, order), inside, allowed
-    )
+    return Pair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, allowed)
 
 
 def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
@@ -147,6 +154,14 @@ def _continued(mean: Image, share: Image, blur: float) -> Image:
     overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
     far = np.float32(1e-4)
     return np.asarray((mean + far * np.float32(overall)) / (share + far))
+
+
+def _levelled(image: Image, blur: float) -> Image:
+    """The image less its local mean, over its local standard deviation."""
+    around = _AROUND * blur
+    image = image - _blur(image, around)
+    contrast = np.sqrt(_blur(image**2, around))
+    return np.asarray(image / (contrast + 1e-3 * contrast.max()))
 
 
 def _bin(image: Image, factor: int) -> Image:

@@ -156,6 +156,8 @@ class Result:
     ) -> FloatArray:
         """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN off the image.
 
+        Gain and offset are applied to g if they were unknowns.
+
         Parameters
         ----------
         reference, deformed
@@ -171,7 +173,8 @@ class Result:
         u = self.displacement() / self.grid.pixel_size
         row, col = np.indices(self.grid.shape)
         value, _, _ = SplineImage.of(deformed, order).sample(row - u[..., 1], col + u[..., 0])
-        return np.asarray(reference - value)
+        gain, offset = self.ansatz.gain_and_offset(self.unknowns, *_axes(self.grid))
+        return np.asarray(reference - gain * value - offset)
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""

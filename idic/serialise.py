@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.fourier import FourierMode, ModeFamily
 from modeharvest.idic.support import Taper
@@ -21,6 +22,7 @@ def ansatz_to_dict(ansatz: Ansatz) -> dict[str, Any]:
         "v0_degree": ansatz.v0_degree,
         "v_degree": ansatz.v_degree,
         "modes": [_mode_to_dict(mode) for mode in ansatz.modes],
+        "brightness": asdict(ansatz.brightness),
     }
 
 
@@ -31,6 +33,7 @@ def ansatz_from_dict(content: Mapping[str, Any]) -> Ansatz:
         modes=tuple(_mode_from_dict(mode) for mode in content["modes"]),
         v0_degree=content["v0_degree"],
         v_degree=content["v_degree"],
+        brightness=Brightness(**content.get("brightness", {})),
     )
 
 

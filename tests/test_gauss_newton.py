@@ -27,10 +27,11 @@ Residual = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 def run(residual: Residual, start: list[float], left: float = 0.0, **options: float) -> Minimum:
     """Minimise 1/2 sum r^2 given r and J = -dr/da; beyond |a| = 10 a share ``left`` is lost."""
 
-    def evaluate(a: FloatArray) -> NormalEquations:
+    def evaluate(a: FloatArray, with_matrix: bool) -> NormalEquations:
         r, J = residual(a)
         off = round(100 * left) if np.linalg.norm(a) > 10 else 0
-        return NormalEquations(J.T @ J, -J.T @ r, 0.5 * float(r @ r), 100 - off, off)
+        matrix = J.T @ J if with_matrix else np.zeros((len(a), len(a)))
+        return NormalEquations(matrix, -J.T @ r, 0.5 * float(r @ r), 100 - off, off)
 
     chosen = GaussNewtonOptions(**options)  # type: ignore[arg-type]
     return minimise(

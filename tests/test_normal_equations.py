@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import manufactured
 import numba
@@ -13,6 +14,8 @@ from scipy import ndimage
 
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
+from modeharvest.idic.chebyshev import ChebyshevField
 from modeharvest.idic.normal_equations import Assembly, NormalEquations
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
@@ -25,6 +28,10 @@ ANSATZES = {
     "no mode": lambda: Ansatz(manufactured.DOMAIN, v0_degree=2),
     "one mode": manufactured.one_mode,
     "two modes": manufactured.two_modes,
+    "gain and offset": lambda: replace(manufactured.one_mode(), brightness=Brightness(1, 2)),
+    "offset alone": lambda: Ansatz(
+        manufactured.DOMAIN, v0_degree=2, brightness=Brightness(offset_degree=0)
+    ),
 }
 
 
@@ -38,15 +45,15 @@ def perforated() -> NDArray[np.bool_]:
     return mask
 
 
-def images(seed: int = 0) -> tuple[FloatArray, FloatArray]:
+def images(seed: int = 0) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Two unrelated smooth random images, so that the residual is as large as the images."""
     noise = np.random.default_rng(seed).normal(size=(2, *GRID.shape))
-    f, g = (5 * ndimage.gaussian_filter(n, 2.0) for n in noise)
+    f, g = (np.float32(5 * ndimage.gaussian_filter(n, 2.0)) for n in noise)
     return f, g
 
 
 def dense(
-    ansatz: Ansatz, a: FloatArray, mask: NDArray[np.bool_], f: FloatArray, g: SplineImage
+    ansatz: Ansatz, a: FloatArray, mask: NDArray[np.bool_], f: NDArray[np.float32], g: SplineImage
 ) -> tuple[FloatArray, FloatArray]:
     """(pixels, n) J and (pixels,) r, in the obvious way; pixels off the image left out."""
     u = ansatz.displacement(a, GRID.x, GRID.y)[mask] / GRID.pixel_size
@@ -55,8 +62,20 @@ def dense(
     gradient = np.stack([d_col, -d_row], axis=-1) / GRID.pixel_size
     on = np.isfinite(value)
     sensitivities = ansatz.sensitivities(a, GRID.x[None, :], GRID.y[:, None])[mask]
-    J = np.einsum("pc,pcn->pn", gradient, sensitivities)
-    return J[on], (f[mask] - value)[on]
+    gain, offset = (b[mask] for b in ansatz.gain_and_offset(a, GRID.x, GRID.y))
+    J = gain[:, None] * np.einsum("pc,pcn->pn", gradient, sensitivities)
+    x, y = (at[mask] for at in np.meshgrid(GRID.x, GRID.y))
+    spaces = [
+        (value, ansatz.brightness.gain_degree),
+        (1.0 + 0 * value, ansatz.brightness.offset_degree),
+    ]
+    columns = [
+        field[:, None] * ChebyshevField(ansatz.domain, degree).basis(x, y)
+        for field, degree in spaces
+        if degree is not None
+    ]
+    J[:, ansatz.size - ansatz.brightness.size :] = np.hstack([*columns, J[:, :0]])
+    return J[on], (f[mask] - gain * value - offset)[on]
 
 
 def assert_same(got: NormalEquations, J: FloatArray, r: FloatArray) -> None:
@@ -98,7 +117,7 @@ def test_pixels_that_leave_the_image_are_counted_and_take_no_part() -> None:
     assert_same(got, J, r)
 
 
-@pytest.mark.parametrize("name", ANSATZES)
+@pytest.mark.parametrize("name", ["no mode", "one mode", "two modes"])
 def test_displacement_against_the_explicit_jacobian(name: str) -> None:
     ansatz, mask = ANSATZES[name](), perforated()
     a = manufactured.random_unknowns(ansatz, 2, 0.1)
@@ -129,8 +148,16 @@ def displacement_cost(ansatz: Ansatz) -> Evaluate:
     return lambda a: assembly.displacement(a, target)
 
 
-@pytest.mark.parametrize("make", [image_cost, displacement_cost])
-@pytest.mark.parametrize("name", ["one mode", "two modes"])
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("one mode", image_cost),
+        ("two modes", image_cost),
+        ("gain and offset", image_cost),
+        ("one mode", displacement_cost),
+        ("two modes", displacement_cost),
+    ],
+)
 def test_gradient_against_differences_of_the_cost(
     name: str, make: Callable[[Ansatz], Evaluate]
 ) -> None:
@@ -171,6 +198,17 @@ def test_result_does_not_depend_on_the_number_of_threads(threads: int) -> None:
         np.testing.assert_array_equal(other.matrix, found[0].matrix)
         np.testing.assert_array_equal(other.gradient, found[0].gradient)
         assert other.cost == found[0].cost
+
+
+@pytest.mark.parametrize("name", ANSATZES)
+def test_without_the_matrix_the_rest_is_the_same(name: str) -> None:
+    ansatz = ANSATZES[name]()
+    assembly, a = Assembly(ansatz, GRID, perforated()), manufactured.random_unknowns(ansatz, 1)
+    f, g = images()
+    whole, part = (assembly.images(a, f, SplineImage.of(g), with_matrix=w) for w in (True, False))
+    np.testing.assert_array_equal(part.gradient, whole.gradient)
+    assert part.cost == whole.cost
+    assert not part.matrix.any()
 
 
 def test_two_halves_add_up_to_the_whole() -> None:

@@ -1,0 +1,65 @@
+"""Images and masks as a correlation takes them, or a line that says what is wrong with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.imaging.grid import PixelGrid
+
+BoolArray = NDArray[np.bool_]
+
+
+def seen(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
+    """The grey levels that a mask leaves."""
+    return image if mask is None else image[mask]
+
+
+def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
+    """The image as float32; raises InputError unless it has the grid's shape and is finite."""
+    pixels = np.asarray(image)
+    if pixels.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} image of {grid.rows} x {grid.cols} px like the grid, got shape "
+            f"{pixels.shape}; give two images and a grid of one size"
+        )
+    pixels = pixels.astype(np.float32, copy=False)
+    bad = ~np.isfinite(pixels)
+    if bad.any():
+        raise InputError(
+            f"expected finite grey levels in the {what} image, got NaN or infinity in "
+            f"{where(bad)}; fill or crop them"
+        )
+    return pixels
+
+
+def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
+    """The mask as booleans; raises InputError unless it has the grid's shape and some material."""
+    if mask is None:
+        return None
+    inside = np.ascontiguousarray(mask, dtype=np.bool_)
+    if inside.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
+            f"{inside.shape}"
+        )
+    if not inside.any():
+        raise InputError(f"expected material in the {what}, got one that is False everywhere")
+    return inside
+
+
+def require_contrast(grey: NDArray[Any], what: str) -> None:
+    """Raise InputError for a blank image."""
+    if grey.min() == grey.max():
+        raise InputError(
+            f"expected a speckle in the {what} image, got the constant grey level {grey.flat[0]}"
+        )
+
+
+def where(bad: BoolArray) -> str:
+    """How many pixels are bad, and where the first one is."""
+    row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return f"{int(bad.sum())} px, the first at row {row}, column {col}"
