@@ -33,6 +33,8 @@ from modeharvest.progress import Progress, silent
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+_BAND = 64
+"""Rows that are looked at in one go."""
 _ROUNDS, _SETTLED = 5, 1e-2
 """The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 
@@ -265,15 +267,17 @@ def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
     """
     if pair.allowed is None:
         return pair.mask
-    u = ansatz.displacement(a, pair.grid.x, pair.grid.y) / pair.grid.pixel_size
-    row, col = np.nonzero(pair.mask)
-    u = u[row, col]
-    to_row, to_col = np.rint(row - u[:, 1]).astype(int), np.rint(col + u[:, 0]).astype(int)
-    rows, cols = pair.grid.shape
-    inside = (to_row >= 0) & (to_row < rows) & (to_col >= 0) & (to_col < cols)
-    landed = pair.mask.copy()
-    # A pixel off the image stays in: the iteration counts those and says so.
-    landed[row[inside], col[inside]] = pair.allowed[to_row[inside], to_col[inside]]
+    grid, landed = pair.grid, pair.mask.copy()
+    for first in range(0, grid.rows, _BAND):  # in bands: whole images of u would be large
+        band = slice(first, first + _BAND)
+        row, col = np.nonzero(pair.mask[band])
+        u = (ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size)[row, col]
+        to_row = np.rint(first + row - u[:, 1]).astype(int)
+        to_col = np.rint(col + u[:, 0]).astype(int)
+        inside = (to_row >= 0) & (to_row < grid.rows) & (to_col >= 0) & (to_col < grid.cols)
+        # A pixel off the image stays in: the iteration counts those and says so.
+        to = pair.allowed[to_row[inside], to_col[inside]]
+        landed[first + row[inside], col[inside]] = to
     return landed
 
 

@@ -47,6 +47,9 @@ class Level:
 COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), Level(1, 0.0))
 """Blurs of 24, 12, 6 and 0 px."""
 
+_CONTINUED = 1.5
+"""Blur that continues the material into holes on a level without blur of its own [binned px]."""
+
 _AROUND = 3.0
 """How far the local mean and contrast reach, in blurs: nothing finer than the blur is lost."""
 
@@ -139,21 +142,35 @@ def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
     """Binned and blurred; where there is no material, a smooth continuation of the material."""
     image = np.asarray(image, dtype=np.float32)
     if weight is None or weight.all():
-        binned = _bin(image, level.factor)
-        return _blur(binned, level.blur)
+        return _blur(_bin(image, level.factor), level.blur)
     share = _bin(weight, level.factor)
     mean = _bin(np.where(weight, image, np.float32(0.0)), level.factor)
     if level.blur > 0:
-        return _continued(_blur(mean, level.blur), _blur(share, level.blur), level.blur)
-    filled = _continued(_blur(mean, 1.5), _blur(share, 1.5), 1.5)
-    return np.where(weight, image, filled) if level.factor == 1 else filled
+        return _continued(mean, share, level.blur)
+    filled = _continued(mean, share, _CONTINUED)
+    if level.factor == 1:
+        filled[weight] = image[weight]
+    return filled
 
 
 def _continued(mean: Image, share: Image, blur: float) -> Image:
-    """Divide mean by share; far from any material, the mean grey level of all material."""
+    """Blur both in place, and divide; far from any material, its mean grey level.
+
+    Parameters
+    ----------
+    mean, share
+        (rows, cols) grey level times share of material, and that share; their memory is reused.
+    blur
+        Standard deviation [binned px].
+    """
+    for image in (mean, share):
+        ndimage.gaussian_filter(image, blur, mode="nearest", output=image)
     overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
     far = np.float32(1e-4)
-    return np.asarray((mean + far * np.float32(overall)) / (share + far))
+    mean += far * np.float32(overall)
+    share += far
+    mean /= share
+    return mean
 
 
 def _levelled(image: Image, blur: float) -> Image:
