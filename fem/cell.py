@@ -3,12 +3,15 @@
 The displacement is u = (F̄ - I) X + w with a periodic fluctuation w. Unknown are the masters'
 fluctuations and those components of F̄ whose mean stress is prescribed; one master is held,
 because translations cost nothing. The fluctuation's factor serves the few macroscopic unknowns
-by block elimination, which gives the lattice's effective tangent moduli as a by-product.
+by block elimination, which gives the lattice's effective tangent moduli as a by-product. With an
+amplitude prescribed, the load is one more of them: such systems are regular on a branch however
+near to the point where it leaves the primary path.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -19,7 +22,7 @@ from modeharvest.fem.body import FreeBody
 from modeharvest.fem.lattices import UnitCell
 from modeharvest.fem.macroscopic import MacroLoading
 from modeharvest.fem.materials import Material
-from modeharvest.fem.reduction import Reduction, factorise
+from modeharvest.fem.reduction import Reduction, factorise, negative_pivots
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +30,7 @@ _ITERATIONS = 12
 _SMALLEST_STEP = 1e-6  # of the load
 # Forces must be smaller than what a change of the load by this would make.
 _LOAD_TOLERANCE = 1e-11
+_AMPLITUDE_TOLERANCE = 1e-11  # relative
 _AT_REST = (0.0, 0.0)
 
 
@@ -58,6 +62,29 @@ class CellState:
     stress: FloatArray
     stiffness: csr_array
     moduli: FloatArray
+
+
+class Failure(Enum):
+    """Why there is no equilibrium, in words."""
+
+    NOT_CONVERGED = "Newton's method did not converge"
+    REVERSED = "an element is turned inside out (det F <= 0)"
+
+
+@dataclass(frozen=True, eq=False)
+class Amplitude:
+    """A linear measure of the fluctuation w that is prescribed, while the load is found.
+
+    Parameters
+    ----------
+    weights
+        (2 count,) in the order of ``Reduction``; not those of a translation.
+    value
+        What ``weights . w`` must be [mm].
+    """
+
+    weights: FloatArray
+    value: float
 
 
 class PeriodicCell:
@@ -100,22 +127,58 @@ class PeriodicCell:
 
         None where Newton's method does not arrive, or arrives at a reversed element.
         """
-        F: FloatArray = np.eye(2).ravel()
+        F: FloatArray = np.eye(2)
         w: FloatArray = np.zeros(self.reduction.size)
         if near is not None:
-            F = (near.gradient + (load - near.load) * near.gradient_rate).ravel()
+            F = near.gradient + (load - near.load) * near.gradient_rate
             w = near.fluctuation + (load - near.load) * near.fluctuation_rate
-        F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
+        found = self.corrected(loading, load, F, w)
+        return found if isinstance(found, CellState) else None
+
+    def corrected(
+        self,
+        loading: MacroLoading,
+        load: float,
+        gradient: FloatArray,
+        fluctuation: FloatArray,
+        amplitude: Amplitude | None = None,
+    ) -> CellState | Failure:
+        """The equilibrium that Newton's method finds from a guess of F̄ (2, 2) and w.
+
+        With an ``amplitude`` prescribed the load is a guess, too. A reversed element is a
+        failure.
+        """
+        F: FloatArray = gradient.ravel()
+        w = fluctuation
         for _ in range(_ITERATIONS):
-            system = _System(self, loading, load, F, w)
+            F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
+            system = _System(self, loading, load, F, w, amplitude)
             if not system.is_regular:
-                return None
+                return Failure.NOT_CONVERGED
             if system.is_solved:
                 u = self._displacement(F, w)
-                return system.state() if self.body.smallest_jacobian(u) > 0 else None
-            dF, dw = system.step()
-            F, w = F + dF, w + dw
-        return None
+                sound = self.body.smallest_jacobian(u) > 0
+                return system.state() if sound else Failure.REVERSED
+            try:
+                change, dF, dw = system.step()
+            except np.linalg.LinAlgError:  # exactly singular
+                return Failure.NOT_CONVERGED
+            load, F, w = load + change, F + dF, w + dw
+        return Failure.NOT_CONVERGED
+
+    def negative_eigenvalues(self, loading: MacroLoading, state: CellState) -> int:
+        """Number of negative eigenvalues of the tangent in w and the free components of F̄.
+
+        Those of w with F̄ held, and of the moduli of the free components (Haynsworth, Linear
+        Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
+        """
+        moving = np.flatnonzero(self._moving)
+        inner = self.reduction.reduced(state.stiffness).at(_AT_REST)[moving][:, moving]
+        self.factorisations += 1
+        free = loading.free
+        moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
+        outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
+        return negative_pivots(factorise(csc_array(inner))) + int(np.sum(outer < 0))
 
     def _displacement(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
         affine = (self._affine @ (gradient - np.eye(2).ravel())).reshape(-1, 2)
@@ -132,8 +195,10 @@ class _System:
         load: float,
         gradient: FloatArray,
         fluctuation: FloatArray,
+        amplitude: Amplitude | None = None,
     ) -> None:
         self.cell, self.loading, self.load = cell, loading, load
+        self.amplitude = amplitude
         self.gradient, self.fluctuation = gradient, fluctuation
         self.area = cell.cell.area
         u = cell._displacement(gradient, fluctuation)
@@ -177,18 +242,42 @@ class _System:
         inner = _LOAD_TOLERANCE * np.linalg.norm(self.on_affine @ self.rate)
         outer = _LOAD_TOLERANCE * np.linalg.norm(self.condensed) * np.linalg.norm(self.rate)
         return bool(
-            np.linalg.norm(self.forces) <= inner and np.linalg.norm(self._unbalanced) <= outer
+            np.linalg.norm(self.forces) <= inner
+            and np.linalg.norm(self._unbalanced) <= outer
+            and abs(self._excess) <= _AMPLITUDE_TOLERANCE * abs(self._wanted)
         )
 
-    def step(self) -> tuple[FloatArray, FloatArray]:
-        """Newton's changes of F̄ (4,) and of the fluctuation."""
-        free, relaxed = self.loading.free, -self._factor.solve(self.forces)
-        dF = np.zeros(4)
-        dF[free] = np.linalg.solve(
-            self.condensed[np.ix_(free, free)],
-            -(self._unbalanced + self.coupling.T @ relaxed)[free],
-        )
-        return dF, self._full(relaxed + self.response @ dF)
+    @property
+    def _wanted(self) -> float:
+        return 0.0 if self.amplitude is None else self.amplitude.value
+
+    @property
+    def _excess(self) -> float:
+        """The amplitude in excess of what is prescribed [mm]."""
+        if self.amplitude is None:
+            return 0.0
+        return float(self.amplitude.weights @ self.fluctuation) - self._wanted
+
+    def step(self) -> tuple[float, FloatArray, FloatArray]:
+        """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
+        free, relaxed = np.flatnonzero(self.loading.free), -self._factor.solve(self.forces)
+        # Unknown are the free components of F̄ and, if an amplitude is prescribed, the load.
+        along = np.zeros((4, len(free) + 1))
+        along[free, np.arange(len(free))] = 1.0
+        along[:, -1] = self.loading.rate
+        matrix: FloatArray = self.condensed[free] @ along
+        matrix[:, -1] -= self.area * self.loading.dead[free]
+        rest = (self._unbalanced + self.coupling.T @ relaxed)[free]
+        if self.amplitude is None:
+            along, matrix = along[:, :-1], matrix[:, :-1]
+        else:
+            weights = self.amplitude.weights[self.cell._moving]
+            matrix = np.vstack([matrix, weights @ self.response @ along])
+            rest = np.append(rest, self._excess + weights @ relaxed)
+        unknown = np.linalg.solve(matrix, -rest)
+        dF = along @ unknown
+        change = 0.0 if self.amplitude is None else float(unknown[-1])
+        return change, dF, self._full(relaxed + self.response @ dF)
 
     def state(self) -> CellState:
         """The state reached, with its rates and moduli."""

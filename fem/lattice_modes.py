@@ -172,7 +172,7 @@ def _real_fields(
         @ np.linalg.inv(cell.cell.lattice)
     )
     phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
-    fields = []
+    fields: list[FloatArray] = []
     for vector in modes.vectors.T:
         at_nodes = math.sqrt(material) * cell.reduction.displacement(vector, modes.wave)
         whole = np.empty((len(enlarged.mesh.nodes), 2), dtype=np.complex128)

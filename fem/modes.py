@@ -106,8 +106,12 @@ class Branch:
         By load; empty if it could not be followed.
     outcome
         In words.
+    curve
+        (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
+        the critical one first.
     """
 
     combination: tuple[float, ...]
     states: tuple[BranchState, ...]
     outcome: str
+    curve: FloatArray = field(default_factory=lambda: np.empty((0, 2)))

@@ -1,0 +1,315 @@
+"""The buckled branches of a periodic cell, from the critical load on.
+
+A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
+load is an unknown, which is regular where the branch leaves the primary path and where its load
+has a maximum or minimum; so branches along which the load falls are followed as well. The states
+at the loads asked for are then met exactly. Bodies that come into contact pass through each
+other: contact isn't modelled, and not noticed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from modeharvest.errors import InputError
+from modeharvest.fem.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
+from modeharvest.fem.continuation import hermite_weights
+from modeharvest.fem.modes import Branch, BranchState, ModeSet
+from modeharvest.progress import Progress, silent
+
+FloatArray = NDArray[np.float64]
+
+_BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
+_CRITICAL = 1e-3  # of the eigenvalues' scale: what a critical mode may have
+_REFINEMENTS = 6
+
+
+@dataclass(frozen=True)
+class BranchOptions:
+    """How a branch is followed; lengths are shares of the primitive cell's shorter vector.
+
+    Parameters
+    ----------
+    first, longest
+        First and largest step of the amplitude, which is the rms displacement in the mode [-].
+    growth
+        Of the step from one point to the next.
+    farthest
+        The amplitude where to give up [-].
+    """
+
+    first: float = 0.002
+    longest: float = 0.02
+    growth: float = 1.6
+    farthest: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.first <= self.longest <= self.farthest < math.inf or self.growth < 1:
+            raise InputError(
+                f"branch: expected 0 < first <= longest <= farthest and growth >= 1, got {self}"
+            )
+
+
+def follow(
+    path: CellPath,
+    modes: ModeSet,
+    combination: Sequence[float],
+    loads: Sequence[float],
+    options: BranchOptions | None = None,
+    progress: Progress = silent,
+) -> Branch:
+    """Follow the branch that starts along a combination of critical modes.
+
+    Only the amplitude of the combination is prescribed; all else, other modes included, is free
+    to follow, and ``BranchState.amplitudes`` tell what became of it.
+
+    Parameters
+    ----------
+    path
+        Primary path of the commensurate cell: that of ``modes.mesh``, such as
+        ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``.
+    modes
+        Modes of a critical state.
+    combination
+        (m,) coefficients; only their ratios and signs count. The opposite is the other half of
+        the branch.
+    loads
+        At which to report states [-]. One that the branch meets twice is reported twice.
+    options, progress
+        Step lengths; called with the load reached.
+
+    Raises
+    ------
+    InputError
+        If the cell isn't that of the modes, or the combination doesn't fit them. A branch that
+        can't be followed is an outcome, not an exception.
+    """
+    _check(path.cell, modes, combination, loads)
+    mix = np.asarray(combination, dtype=np.float64)
+    return _Tracing(path, modes, mix / np.linalg.norm(mix), options or BranchOptions()).run(
+        sorted(loads), progress
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A point of the branch, seen as a function of the amplitude [mm].
+
+    ``values`` and ``rates`` (their derivatives by the amplitude) are flat: load, F̄, fluctuation.
+    """
+
+    amplitude: float
+    values: FloatArray
+    rates: FloatArray
+
+    @property
+    def load(self) -> float:
+        return float(self.values[0])
+
+
+class _Tracing:
+    """One branch of one cell; ``points`` are those passed, ``stopped`` is why there are no more."""
+
+    def __init__(
+        self, path: CellPath, modes: ModeSet, mix: FloatArray, options: BranchOptions
+    ) -> None:
+        self.cell, self.loading = path.cell, path.loading
+        self.modes, self.mix, self.options = modes, mix, options
+        self.pitch = float(np.linalg.norm(modes.primitive, axis=1).min())
+        reduction, mass = self.cell.reduction, self.cell.nodal_mass
+        flat, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
+        # (m, size): times the fluctuation they are the amplitudes of the modes.
+        self.weights = reduction.gathered(np.asarray(mass @ flat.T)).T / material
+        self.mass = self.cell.mass.at((0.0, 0.0)) / material
+        below = path.at((1.0 - _BEFORE) * modes.load)
+        self.primary = CellPath(self.cell, self.loading, [] if below is None else [below])
+        self.points: list[_Point] = []
+        self.stopped = ""
+
+    def run(self, loads: list[float], progress: Progress) -> Branch:
+        """March along the branch, and report the loads asked for."""
+        states: list[BranchState] = []
+        for here, there in pairwise(self._march()):
+            progress(there.load, loads[-1], "buckled branch")
+            for load in loads:
+                if load != here.load and min(here.load, there.load) <= load <= max(
+                    here.load, there.load
+                ):
+                    found = self._at_load(here, there, load)
+                    states += [] if found is None else [self._report(found)]
+            if {s.load for s in states}.issuperset(loads) or (
+                there.load > loads[-1] and there.rates[0] > 0
+            ):
+                break
+        states.sort(key=lambda state: state.load)
+        curve = np.array([(p.amplitude, p.load) for p in self.points]).reshape(-1, 2)
+        mix = tuple(float(c) for c in self.mix)
+        return Branch(mix, tuple(states), self._in_words(states, loads), curve)
+
+    def _in_words(self, states: list[BranchState], loads: list[float]) -> str:
+        if len(self.points) < 2:
+            return f"not followed: {self.stopped}"
+        start, first, last = self.points[0], self.points[1], self.points[-1]
+        way = "rises" if first.load > start.load else "falls"
+        text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
+        text += f"amplitude {last.amplitude:.4g} mm"
+        text += f"; {self.stopped}" if self.stopped else ""
+        met = {state.load for state in states}
+        missing = ", ".join(f"{load:.6g}" for load in loads if load not in met)
+        return text + (f"; not met: {missing}" if missing else "")
+
+    def _march(self) -> Iterator[_Point]:
+        """Points of the branch by growing amplitude, the critical one first."""
+        start = self._start()
+        if start is None:
+            return
+        self.points.append(start)
+        yield start
+        options, step = self.options, self.options.first * self.pitch
+        while self.points[-1].amplitude + step <= options.farthest * self.pitch:
+            found = self._at_amplitude(self.points[-2:], self.points[-1].amplitude + step)
+            if isinstance(found, str):
+                step *= 0.5
+                if step < 0.05 * options.first * self.pitch:
+                    self.stopped = f"{found} beyond"
+                    return
+                continue
+            self.points.append(found)
+            yield found
+            step = min(options.growth * step, options.longest * self.pitch)
+        self.stopped = f"the largest amplitude asked for is {options.farthest} of the pitch"
+
+    def _start(self) -> _Point | None:
+        """The critical point, extrapolated from where the tangent is regular, and the mode."""
+        load = self.modes.load
+        if not self.primary.states:
+            self.stopped = f"no equilibrium of the primary path near the load {load:.6g}"
+            return None
+        below = self.primary.states[0]
+        scale = np.linalg.norm(below.moduli) / (self.cell.filling * self.cell.cell.area)
+        largest = float(np.abs(self.modes.eigenvalues[self.mix != 0]).max())
+        if largest > _CRITICAL * scale:
+            self.stopped = (
+                f"the modes are not critical at the load {load:.6g}, their largest eigenvalue is "
+                f"{largest:.3g} N/mm^4"
+            )
+            return None
+        values = _flat(below.load, below.gradient, below.fluctuation)
+        values += (load - below.load) * _flat(1.0, below.gradient_rate, below.fluctuation_rate)
+        self.origin = values[5:]
+        return _Point(0.0, values, _flat(0.0, np.zeros((2, 2)), self._direction()))
+
+    def _direction(self) -> FloatArray:
+        """The combination as a fluctuation; one master is held by a translation."""
+        periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
+        at_masters = np.empty((periodicity.count, 2))
+        at_masters[periodicity.master] = np.tensordot(self.mix, self.modes.shapes, 1)
+        return np.asarray((at_masters - at_masters[0]).ravel()[order])
+
+    def _at_amplitude(self, points: Sequence[_Point], amplitude: float) -> _Point | str:
+        """The point of the branch at an amplitude, from one or two before it; or why not."""
+        weights, guess = self.mix @ self.weights, _predicted(points, amplitude)
+        wanted = Amplitude(weights, amplitude + float(weights @ self.origin))
+        found = self._corrected(guess, wanted)
+        if isinstance(found, Failure):
+            return found.value
+        off = found.fluctuation - guess[5:]
+        if off @ (self.mass @ off) > (amplitude - points[-1].amplitude) ** 2:
+            return "another branch is nearer"
+        rates = _flat(1.0, found.gradient_rate, found.fluctuation_rate)
+        rates /= weights @ found.fluctuation_rate
+        return _Point(amplitude, _flat(found.load, found.gradient, found.fluctuation), rates)
+
+    def _corrected(
+        self, guess: FloatArray, amplitude: Amplitude | None = None
+    ) -> CellState | Failure:
+        load, F, w = float(guess[0]), guess[1:5].reshape(2, 2), guess[5:]
+        return self.cell.corrected(self.loading, load, F, w, amplitude)
+
+    def _at_load(self, here: _Point, there: _Point, load: float) -> CellState | None:
+        """The state between two points at a load, which one of them is below and one above."""
+        for _ in range(_REFINEMENTS):
+            between = (here, there)
+            amplitude = _amplitude_at(load, between)
+            guess = _predicted(between, amplitude)
+            guess[0] = load
+            found = self._corrected(guess)
+            if isinstance(found, CellState):
+                got = float(self.mix @ self.weights @ (found.fluctuation - self.origin))
+                # Under a prescribed load Newton may fall back to the primary path.
+                if abs(got - amplitude) < 0.5 * min(amplitude, there.amplitude - here.amplitude):
+                    return found
+            middle = self._at_amplitude(between, amplitude)
+            if isinstance(middle, str):
+                return None
+            is_beyond = (middle.load - load) * (here.load - load) <= 0
+            here, there = (here, middle) if is_beyond else (middle, there)
+        return None
+
+    def _report(self, state: CellState) -> BranchState:
+        """The state as plain numpy, beside the primary path at the same load."""
+        cell, primary = self.cell, self.primary.at(state.load)
+        before = self.origin if primary is None else primary.fluctuation
+        u = cell.displacement(state)
+        return BranchState(
+            load=state.load,
+            gradient=state.gradient,
+            stress=state.stress,
+            energy=cell.body.energy(u) / cell.cell.area,
+            primary_energy=(
+                math.nan
+                if primary is None
+                else cell.body.energy(cell.displacement(primary)) / cell.cell.area
+            ),
+            negative_eigenvalues=cell.negative_eigenvalues(self.loading, state),
+            displacement=u,
+            amplitudes=self.weights @ (state.fluctuation - before),
+        )
+
+
+def _flat(load: float, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
+    return np.concatenate([[load], gradient.ravel(), fluctuation])
+
+
+def _predicted(points: Sequence[_Point], amplitude: float) -> FloatArray:
+    """Values at an amplitude, by the tangent of one point or the cubic through two."""
+    if len(points) == 1:
+        return points[0].values + (amplitude - points[0].amplitude) * points[0].rates
+    p, q = points
+    a, b, c, d = hermite_weights(p.amplitude, q.amplitude, amplitude)
+    return a * p.values + b * p.rates + c * q.values + d * q.rates
+
+
+def _amplitude_at(load: float, between: tuple[_Point, _Point]) -> float:
+    """Where the cubic through two points, one below the load and one above, meets it."""
+
+    def excess(amplitude: float) -> float:
+        return float(_predicted(between, amplitude)[0]) - load
+
+    return float(brentq(excess, between[0].amplitude, between[1].amplitude))
+
+
+def _check(
+    cell: PeriodicCell, modes: ModeSet, combination: Sequence[float], loads: Sequence[float]
+) -> None:
+    if cell.cell.mesh.nodes.shape != modes.mesh.nodes.shape or not np.allclose(
+        cell.cell.mesh.nodes, modes.mesh.nodes, atol=1e-9 * np.abs(modes.lattice).max()
+    ):
+        raise InputError(
+            "branch: expected the path of the cell the modes live on, got another mesh; make it "
+            f"with cell.enlarged{tuple(modes.info.get('copies', ('m', 'n')))}"
+        )
+    if len(combination) != len(modes.waves) or not 0 < np.linalg.norm(combination) < math.inf:
+        raise InputError(
+            f"branch: expected {len(modes.waves)} coefficients of modes, not all 0, got "
+            f"{tuple(combination)}"
+        )
+    if not len(loads) or not np.isfinite(loads).all():
+        raise InputError(f"branch: expected one finite load or more, got {tuple(loads)}")
