@@ -28,13 +28,15 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 SAME_AMPLITUDE = 0.02
-"""Difference of two amplitudes that are called equal, or from zero, of the star's strongest. On
-meshes of 12 elements a pitch without any symmetry, equal ones were found to differ by far less."""
+"""Difference of two amplitudes that are called equal, or from zero, of the star's strongest: the
+smallest that a correlation would notice; a mesh without symmetry makes less (a test)."""
 IN_PHASE = 0.02
 """Share of a wave that may be out of phase between x and y. A real mode at a wave vector on the
 zone's boundary is in phase to rounding where the cell has an inversion centre."""
 SAME_PHASE = 0.01
-"""Difference of phases [l] that are called equal."""
+"""Difference of phases [l] that are called equal: a hundredth of a cell."""
+POLARISED = 0.1
+"""Sine of the angle up to which a wave is called transverse or longitudinal."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,9 @@ class RealWave:
         a, b = self.amplitude
         along = (a * self.k[0] + b * self.k[1]) / (self.strength * np.hypot(*self.k))
         across = (a * self.k[1] - b * self.k[0]) / (self.strength * np.hypot(*self.k))
-        if abs(along) <= 5 * SAME_AMPLITUDE:
+        if abs(along) <= POLARISED:
             return "transverse"
-        return "longitudinal" if abs(across) <= 5 * SAME_AMPLITUDE else "mixed"
+        return "longitudinal" if abs(across) <= POLARISED else "mixed"
 
 
 @dataclass(frozen=True)

@@ -109,11 +109,7 @@ class LatticeSpectrum:
         """Wave vectors that carry energy, one of each pair ± ξ, by density, largest first."""
         density, shares = self.S_xx + self.S_yy, self.shares
         listed = np.flatnonzero(upward(self.xi) & (2.0 * shares >= LEAST_SHARE))
-        # Densities that symmetry makes equal differ by rounding: order those by direction.
-        angle = np.arctan2(self.xi[:, 1], self.xi[:, 0])
-        order = sorted(
-            listed, key=lambda k: (float(f"{-density[k]:.6e}"), round(float(angle[k]), 9))
-        )
+        order = listed[np.argsort(-density[listed], kind="stable")]
         return tuple(
             LatticePeak(_pair(self.xi[k]), float(density[k]), 2.0 * float(shares[k])) for k in order
         )

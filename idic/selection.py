@@ -31,9 +31,9 @@ what a fit over the holes' gaps can't tell from others only makes it ill-conditi
 SAME_DENSITY = 0.02
 """Relative difference of densities that are called equal, 1 % of the amplitude. Symmetric meshes
 reach 1e-7."""
-GROWTH = 0.02
-"""A star of waves is worth its parameters if it explains this much more of the energy. What is
-left out then is at most about 14 % of the field's amplitude, star by star."""
+GROWTH = 0.04
+"""A star of waves is worth its parameters if it explains this much more of the energy: it moves
+the material by a fifth of the field's amplitude."""
 LARGEST_CONDITION = 1e3
 """Of the least-squares matrix of unit waves over the material. Beyond, two waves differ mostly in
 the holes, and their amplitudes grow and cancel each other in the material."""
@@ -149,7 +149,7 @@ def select_waves(
 
 
 def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
-    """Peaks worth considering, those of equal density together, largest first."""
+    """Peaks worth considering, those of equal density together and from right to left."""
     stars: list[list[tuple[float, float]]] = []
     density = np.inf
     for peak in spectrum.peaks:
@@ -159,7 +159,7 @@ def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
             stars.append([])
             density = peak.density
         stars[-1].append(peak.xi)
-    return stars
+    return [sorted(star, key=lambda xi: np.arctan2(xi[1], xi[0])) for star in stars]
 
 
 def _pursued(

@@ -1,0 +1,135 @@
+"""A found family as a file: the same to the last bit when read again, and no other file for it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from perforated import PITCH, SQUARE, holed_cell
+
+from modeharvest.errors import InputError
+from modeharvest.idic.automatic import FoundFamily, mode_family
+from modeharvest.idic.equivalents import square_mode
+from modeharvest.idic.family_file import FORMAT, read_family, read_spectrum, write_family
+from modeharvest.idic.lattice_spectrum import LatticeSpectrum, lattice_spectrum
+
+MESH, LATTICE = holed_cell(SQUARE, 4, (2, 2)), 2 * SQUARE
+FIELD = square_mode([0.987654321, 1, 1, 1, -1, 0.1, -0.07], PITCH, *MESH.nodes.T)
+INFO = {"critical_strain": 0.1 + 0.2, "loading": {"name": "uniaxial", "axis": "x"}, "ν": None}
+
+
+@pytest.fixture(scope="module")
+def found() -> FoundFamily:
+    return mode_family(MESH, LATTICE, FIELD, PITCH, info={"lattice": "square"})
+
+
+@pytest.fixture(scope="module")
+def spectrum() -> LatticeSpectrum:
+    return lattice_spectrum(MESH, LATTICE, FIELD, PITCH)
+
+
+def assert_same(ours: Any, theirs: Any) -> None:
+    """Every field of a dataclass equal, arrays to the last bit."""
+    for f in fields(ours):
+        a, b = getattr(ours, f.name), getattr(theirs, f.name)
+        if f.name == "family":
+            assert_same(a, b)
+        elif isinstance(a, np.ndarray):
+            assert np.array_equal(a, b), f.name
+            assert a.dtype == b.dtype
+        elif f.name != "info":
+            assert a == b, f.name
+
+
+def test_round_trip_is_exact(tmp_path: Path, found: FoundFamily, spectrum: LatticeSpectrum) -> None:
+    path = tmp_path / "new" / "family.json"
+    write_family(path, found, INFO, spectrum)
+    again, coefficients = read_family(path), read_spectrum(path)
+    assert_same(found, again)
+    assert again.info == {"lattice": "square", **INFO}
+    assert coefficients is not None
+    assert_same(spectrum, coefficients)
+    write_family(path, again, spectrum=coefficients)
+    assert_same(read_family(path), found)
+    assert [p.name for p in path.parent.iterdir()] == ["family.json"]
+
+
+def test_file_is_readable_without_this_project(tmp_path: Path, found: FoundFamily) -> None:
+    """The formula under "conventions" gives the field, and the spectrum is optional."""
+    path = tmp_path / "family.json"
+    write_family(path, found)
+    content = json.loads(path.read_text("utf-8"))
+    x, y = MESH.nodes.T
+    u = np.zeros_like(FIELD)
+    for A, B, kx, ky, c in content["waves"]:
+        sine = np.sin(np.pi / content["pitch"] * (kx * x + ky * y + c))
+        u += content["amplitude"] * np.outer(sine, [A, B])
+    # Six-node elements of a quarter pitch follow the waves to about 1 %.
+    np.testing.assert_allclose(u, FIELD, atol=0.03)
+    parameters = np.array(content["matrix"]) @ content["start"] + content["offset"]
+    assert np.array_equal(parameters.reshape(-1, 5), content["waves"])
+    assert read_spectrum(path) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "modeharvest-solution-1"}, FORMAT),
+        ({"matrix": [[1.0]]}, "matrix"),
+        ({"matrix": [[1.0], [1.0, 2.0]]}, "matrix|inhomogeneous"),
+        ({"start": "a"}, "float"),
+        ({"start": None}, "start"),
+        ({"pitch": -1.0}, "pitch"),
+        ({"captured": float("nan")}, "finite"),
+        ({"growth": [1]}, "whole"),
+        ({"names": ["a1"]}, "names"),
+        ({"info": 3}, "whole"),
+    ],
+)
+def test_damaged_files_are_refused(
+    tmp_path: Path, found: FoundFamily, change: dict[str, Any], words: str
+) -> None:
+    path = tmp_path / "family.json"
+    write_family(path, found)
+    content = {**json.loads(path.read_text("utf-8")), **change}
+    path.write_text(json.dumps(content), "utf-8")
+    with pytest.raises(InputError, match=words) as caught:
+        read_family(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_foreign_files_are_refused(
+    tmp_path: Path, found: FoundFamily, spectrum: LatticeSpectrum
+) -> None:
+    path = tmp_path / "family.json"
+    write_family(path, found, spectrum=spectrum)
+    whole = path.read_text("utf-8")
+    for text in (whole[: len(whole) // 2], "[1, 2]", "3", ""):
+        path.write_text(text, "utf-8")
+        for read in (read_family, read_spectrum):
+            with pytest.raises(InputError, match=r"family\.json") as caught:
+                read(path)
+            assert "\n" not in str(caught.value)
+    content = json.loads(whole)
+    for key in ("name", "matrix", "sentences"):
+        path.write_text(json.dumps({k: v for k, v in content.items() if k != key}), "utf-8")
+        with pytest.raises(InputError, match=f"no '{key}'"):
+            read_family(path)
+    content["spectrum"]["coefficients"] = [[1.0, 2.0]]
+    path.write_text(json.dumps(content), "utf-8")
+    with pytest.raises(InputError, match="whole"):
+        read_spectrum(path)
+    with pytest.raises(InputError, match="absent"):
+        read_family(tmp_path / "absent.json")
+
+
+def test_what_json_cannot_hold_is_refused(tmp_path: Path, found: FoundFamily) -> None:
+    for value in (float("inf"), np.zeros(2), {1, 2}):
+        with pytest.raises(InputError, match="plain, finite JSON") as caught:
+            write_family(tmp_path / "family.json", found, {"value": value})
+        assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
