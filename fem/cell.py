@@ -262,19 +262,19 @@ class _System:
         """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
         free, relaxed = np.flatnonzero(self.loading.free), -self._factor.solve(self.forces)
         # Unknown are the free components of F̄ and, if an amplitude is prescribed, the load.
-        along = np.zeros((4, len(free) + 1))
+        along: FloatArray = np.zeros((4, len(free) + 1))
         along[free, np.arange(len(free))] = 1.0
         along[:, -1] = self.loading.rate
-        matrix: FloatArray = self.condensed[free] @ along
-        matrix[:, -1] -= self.area * self.loading.dead[free]
+        stiffness: FloatArray = self.condensed[free] @ along
+        stiffness[:, -1] -= self.area * self.loading.dead[free]
         rest = (self._unbalanced + self.coupling.T @ relaxed)[free]
         if self.amplitude is None:
-            along, matrix = along[:, :-1], matrix[:, :-1]
+            along, stiffness = along[:, :-1], stiffness[:, :-1]
         else:
             weights = self.amplitude.weights[self.cell._moving]
-            matrix = np.vstack([matrix, weights @ self.response @ along])
+            stiffness = np.vstack([stiffness, weights @ self.response @ along])
             rest = np.append(rest, self._excess + weights @ relaxed)
-        unknown = np.linalg.solve(matrix, -rest)
+        unknown = np.linalg.solve(stiffness, -rest)
         dF = along @ unknown
         change = 0.0 if self.amplitude is None else float(unknown[-1])
         return change, dF, self._full(relaxed + self.response @ dF)

@@ -3,8 +3,8 @@
 A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
 load is an unknown, which is regular where the branch leaves the primary path and where its load
 has a maximum or minimum; so branches along which the load falls are followed as well. The states
-at the loads asked for are then met exactly. Bodies that come into contact pass through each
-other: contact isn't modelled, and not noticed.
+at the loads asked for are then met exactly. Contact isn't
+modelled: a branch ends where the material would run into itself.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy.optimize import brentq
 
 from modeharvest.errors import InputError
 from modeharvest.fem.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
+from modeharvest.fem.contact import overlaps
 from modeharvest.fem.continuation import hermite_weights
 from modeharvest.fem.modes import Branch, BranchState, ModeSet
 from modeharvest.progress import Progress, silent
@@ -138,15 +139,12 @@ class _Tracing:
         states: list[BranchState] = []
         for here, there in pairwise(self._march()):
             progress(there.load, loads[-1], "buckled branch")
-            for load in loads:
-                if load != here.load and min(here.load, there.load) <= load <= max(
-                    here.load, there.load
-                ):
-                    found = self._at_load(here, there, load)
-                    states += [] if found is None else [self._report(found)]
-            if {s.load for s in states}.issuperset(loads) or (
-                there.load > loads[-1] and there.rates[0] > 0
-            ):
+            low, high = sorted((here.load, there.load))
+            met = [load for load in loads if low <= load <= high and load != here.load]
+            found = [self._at_load(here, there, load) for load in met]
+            states += [self._report(state) for state in found if state is not None]
+            is_past = there.load > loads[-1] and there.rates[0] > 0
+            if is_past or {state.load for state in states}.issuperset(loads):
                 break
         states.sort(key=lambda state: state.load)
         curve = np.array([(p.amplitude, p.load) for p in self.points]).reshape(-1, 2)
@@ -178,7 +176,7 @@ class _Tracing:
             if isinstance(found, str):
                 step *= 0.5
                 if step < 0.05 * options.first * self.pitch:
-                    self.stopped = f"{found} beyond"
+                    self.stopped = f"there {found}"
                     return
                 continue
             self.points.append(found)
@@ -220,6 +218,8 @@ class _Tracing:
         found = self._corrected(guess, wanted)
         if isinstance(found, Failure):
             return found.value
+        if self._overlaps(found):
+            return "the material would run into itself (contact is not modelled)"
         off = found.fluctuation - guess[5:]
         if off @ (self.mass @ off) > (amplitude - points[-1].amplitude) ** 2:
             return "another branch is nearer"
@@ -245,13 +245,17 @@ class _Tracing:
                 got = float(self.mix @ self.weights @ (found.fluctuation - self.origin))
                 # Under a prescribed load Newton may fall back to the primary path.
                 if abs(got - amplitude) < 0.5 * min(amplitude, there.amplitude - here.amplitude):
-                    return found
+                    return None if self._overlaps(found) else found
             middle = self._at_amplitude(between, amplitude)
             if isinstance(middle, str):
                 return None
             is_beyond = (middle.load - load) * (here.load - load) <= 0
             here, there = (here, middle) if is_beyond else (middle, there)
         return None
+
+    def _overlaps(self, state: CellState) -> bool:
+        cell = self.cell.cell
+        return overlaps(cell.mesh, cell.lattice, state.gradient, self.cell.displacement(state))
 
     def _report(self, state: CellState) -> BranchState:
         """The state as plain numpy, beside the primary path at the same load."""
