@@ -1,18 +1,16 @@
-"""On what the pattern of a square lattice depends: hole size, cell size, material, loading.
+"""The pattern of one square lattice, numerical and analytic, and whether it is what comes first.
 
 The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
 variations, and of the material (Section "Graded Microstructures and Size Independence of the
-Modes"). Here that is measured: the numerical mode at (π, π) against Eq. (mode) by their
-normalised overlap, and whether it is what buckles first.
+Modes"). Here that is measured for one lattice: its numerical mode at (π, π) against Eq. (mode)
+by their normalised overlap. :mod:`modeharvest.validation.mode_study` varies the lattice.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,8 +25,7 @@ from modeharvest.idic.automatic import mode_family
 from modeharvest.idic.fourier import square_family
 from modeharvest.idic.overlap import best_amplitude, overlap
 from modeharvest.idic.quadrature import Quadrature
-from modeharvest.progress import Progress, silent
-from modeharvest.validation.mode_table import ModeRow, Wave, read_rows, write_rows
+from modeharvest.validation.mode_table import ModeRow, Wave
 
 if TYPE_CHECKING:  # these need dolfinx
     from modeharvest.fem.bloch_critical import LatticeCritical
@@ -41,7 +38,8 @@ PATTERN: Wave = (math.pi, math.pi)
 EQ_MODE = square_family("hole")
 """The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
 
-RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+_CLOSE = 0.002  # step of the load [-]
+
 LOADINGS: dict[str, MacroLoading] = {
     "uniaxial": uniaxial(),
     "uniaxial strain": uniaxial_strain(),
@@ -134,6 +132,23 @@ def overlap_of_fields(mesh: Mesh, first: FloatArray, second: FloatArray) -> floa
     return math.sqrt(best_amplitude(rule, rule.values(first), rule.values(second))[1])
 
 
+def mode_likeness(reference: PatternMode, other: PatternMode) -> float:
+    """Overlap of two lattices' modes whose meshes differ by no more than a factor [-].
+
+    Raises
+    ------
+    InputError
+        If they aren't the same but for a factor.
+    """
+    nodes = other.mesh.nodes / other.row.pitch, reference.mesh.nodes / reference.row.pitch
+    if nodes[0].shape != nodes[1].shape or not np.allclose(*nodes, rtol=0, atol=1e-9):
+        raise InputError(
+            "mode study: expected two lattices of the same d/l and divisions, got "
+            f"{reference.row.key} and {other.row.key}"
+        )
+    return overlap_of_fields(reference.mesh, reference.shape, other.shape)
+
+
 def pattern_mode(lattice: Lattice) -> PatternMode:
     """Find a lattice's first critical point and its lowest mode at (π, π).
 
@@ -150,7 +165,11 @@ def pattern_mode(lattice: Lattice) -> PatternMode:
     cell = PeriodicCell(unit, lattice.material)
     path, search = CellPath(cell, lattice.loading), CriticalSearch(largest=lattice.largest)
     found = first_critical(path, search)
-    kind = kind_of(found)
+    if not found.found and found.load < lattice.largest:
+        # The path ends within the next step, perhaps behind a critical point: look closely.
+        search = CriticalSearch(largest=lattice.largest, largest_step=_CLOSE)
+        found = first_critical(path, search)
+    kind = kind_of(found, lattice.largest)
     alone = found if kind == "pattern" else critical_at(path, PATTERN, search)
     modes = real_modes(cell, found.state, (PATTERN,))
     automatic = mode_family(modes.mesh, modes.lattice, modes.shapes[0], pitch)
@@ -180,48 +199,13 @@ def _alike(mesh: Mesh, shape: FloatArray, analytic: FloatArray) -> tuple[FloatAr
     return np.asarray(sign / sizes[0] * shape), np.asarray(analytic / sizes[1])
 
 
-def kind_of(found: LatticeCritical) -> str:
-    """What is critical first, in the words of :class:`ModeRow`."""
+def kind_of(found: LatticeCritical, largest: float) -> str:
+    """What is critical first up to the largest load, in the words of :class:`ModeRow`."""
     from modeharvest.fem.zone import is_same
 
     if not found.found:
-        return "none"
+        return "none" if found.load >= largest else "path ends"
     if found.least.angle is not None:
         return "long waves"
     alone = len(found.waves) == 1 and is_same(found.waves[0], PATTERN)
     return "pattern" if alone else "other waves"
-
-
-def study_modes(
-    lattices: Sequence[Lattice], table: Path | str | None = None, progress: Progress = silent
-) -> tuple[ModeRow, ...]:
-    """Work through lattices; rows already in the table are not computed again.
-
-    Parameters
-    ----------
-    lattices
-        In any order.
-    table
-        CSV to read from and to add each row to as soon as it is there.
-    progress
-        Listener.
-    """
-    known = {} if table is None else {row.key: row for row in read_rows(table)}
-    for n, lattice in enumerate(lattices):
-        progress(n, len(lattices), "modes")
-        if lattice.key in known:
-            continue
-        known[lattice.key] = pattern_mode(lattice).row
-        if table is not None:
-            write_rows(table, known.values())
-    progress(1, 1, "modes")
-    return tuple(known[lattice.key] for lattice in lattices)
-
-
-def ratio_lattices(
-    ratios: Iterable[float] = RATIOS,
-    loadings: Iterable[str] = tuple(LOADINGS),
-    base: Lattice = Lattice(),
-) -> list[Lattice]:
-    """Every hole size under every loading."""
-    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -31,7 +32,8 @@ class ModeRow:
     first
         Its first critical load; without one, the largest load at which it was stable [-].
     kind
-        What is critical first: "pattern" for (π, π) alone, "long waves", "other waves", "none".
+        What is critical first: "pattern" for (π, π) alone, "long waves", "other waves"; "none" up
+        to the largest load asked for; "path ends" where no equilibrium was found beyond.
     pattern
         First load at which (π, π) is critical, whatever else is; NaN if none in the range [-].
     state
@@ -44,6 +46,9 @@ class ModeRow:
     captured, waves
         Share of its energy that the automatically found family holds [-], and how many waves
         that has.
+    likeness
+        |<mode, mode of the reference>| of unit norm, on the same mesh but for its size [-]; NaN
+        where it wasn't compared.
     """
 
     material: str
@@ -60,6 +65,7 @@ class ModeRow:
     overlap: float
     captured: float
     waves: int
+    likeness: float = math.nan
 
     @property
     def key(self) -> Key:
@@ -87,6 +93,7 @@ _HEADS = {
     "overlap": "overlap with Eq. (mode) [-]",
     "captured": "energy captured by the automatic family [-]",
     "waves": "its waves [-]",
+    "likeness": "overlap with the reference's mode [-]",
 }
 
 
@@ -132,5 +139,5 @@ def _parsed(line: list[str]) -> ModeRow:
         a["material"], a["loading"], float(a["pitch"]), float(a["ratio"]), int(a["divisions"]),
         {"True": True, "False": False}[a["found"]], float(a["first"]), a["kind"],
         float(a["pattern"]), float(a["state"]), float(a["eigenvalue"]), float(a["overlap"]),
-        float(a["captured"]), int(a["waves"]),
+        float(a["captured"]), int(a["waves"]), float(a["likeness"]),
     )  # fmt: skip

@@ -1,0 +1,235 @@
+"""On what the pattern of a square lattice depends: hole size, cell size, material, loading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+from modeharvest.errors import InputError
+from modeharvest.fem.materials import Material
+from modeharvest.progress import Progress, silent
+from modeharvest.validation.independence import (
+    LOADINGS,
+    MATERIALS,
+    Lattice,
+    PatternMode,
+    mode_likeness,
+    pattern_mode,
+)
+from modeharvest.validation.mode_table import ModeRow, read_rows, write_rows
+
+RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+"""Of d/l [-]: 0.7895 is the paper's, 0.8696 and 0.95 have independent values."""
+SHOWN = (0.95, 0.7895, 0.25)
+"""Of d/l in the paper's Fig. "graded", from left to right."""
+SCALES = (2.0, 10.0)
+"""Of l, relative to the reference's."""
+
+
+@dataclass(frozen=True)
+class FirstModeLimit:
+    """Between which d/l the pattern stops being what buckles first under one loading.
+
+    Parameters
+    ----------
+    loading
+        Its name.
+    without, with_
+        The largest d/l found at which something else comes first, and the smallest at which
+        the pattern does [-].
+    instead
+        What comes first below, in the words of :class:`ModeRow`.
+    """
+
+    loading: str
+    without: float
+    with_: float
+    instead: str
+
+
+@dataclass(frozen=True, eq=False)
+class ModeStudy:
+    """What came out of a study.
+
+    Parameters
+    ----------
+    ratios
+        Every hole size under every loading.
+    scales, materials
+        The reference at other l, and of other materials; each ``likeness`` is the overlap with
+        the reference's own mode.
+    limits
+        Where the pattern stops being the first mode, for each loading where it does.
+    overlays
+        Modes to be laid over the analytic one.
+    """
+
+    ratios: tuple[ModeRow, ...] = ()
+    scales: tuple[ModeRow, ...] = ()
+    materials: tuple[ModeRow, ...] = ()
+    limits: tuple[FirstModeLimit, ...] = ()
+    overlays: tuple[PatternMode, ...] = ()
+
+
+class Table:
+    """A CSV of rows that grows as they are computed; what it has isn't computed again.
+
+    Parameters
+    ----------
+    path
+        The file; None to keep the rows in memory.
+    """
+
+    def __init__(self, path: Path | str | None = None) -> None:
+        self.path = path
+        rows = () if path is None else read_rows(path)
+        self.rows: dict[object, ModeRow] = {row.key: row for row in rows}
+
+    def row(self, lattice: Lattice, work: Callable[[Lattice], ModeRow]) -> ModeRow:
+        """The row of a lattice, from the table or by ``work``."""
+        if lattice.key not in self.rows:
+            self.rows[lattice.key] = work(lattice)
+            if self.path is not None:
+                write_rows(self.path, self.rows.values())
+        return self.rows[lattice.key]
+
+
+def study_modes(
+    lattices: Sequence[Lattice], table: Table | None = None, progress: Progress = silent
+) -> tuple[ModeRow, ...]:
+    """The rows of some lattices, in their order."""
+    table, rows = table or Table(), []
+    for n, lattice in enumerate(lattices):
+        progress(n, len(lattices), "mode study")
+        rows.append(table.row(lattice, lambda it: pattern_mode(it).row))
+    progress(1, 1, "mode study")
+    return tuple(rows)
+
+
+def study_likeness(
+    reference: Lattice,
+    others: Sequence[Lattice],
+    table: Table | None = None,
+    progress: Progress = silent,
+) -> tuple[ModeRow, ...]:
+    """The rows of lattices of the reference's d/l, their modes compared with its mode."""
+    table = table or Table()
+    made: list[PatternMode] = []
+
+    def work(lattice: Lattice) -> ModeRow:
+        if not made:
+            made.append(pattern_mode(reference))
+        mode = pattern_mode(lattice)
+        return replace(mode.row, likeness=mode_likeness(made[0], mode))
+
+    rows = []
+    for n, lattice in enumerate(others):
+        progress(n, len(others), "mode study")
+        rows.append(table.row(lattice, work))
+    progress(1, 1, "mode study")
+    return tuple(rows)
+
+
+def ratio_lattices(
+    base: Lattice, ratios: Iterable[float] = RATIOS, loadings: Iterable[str] = tuple(LOADINGS)
+) -> list[Lattice]:
+    """Every hole size under every loading."""
+    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]
+
+
+def scale_lattices(base: Lattice, factors: Iterable[float] = SCALES) -> list[Lattice]:
+    """The same lattice with all lengths multiplied."""
+    return [replace(base, pitch=factor * base.pitch) for factor in factors]
+
+
+def material_lattices(
+    base: Lattice, materials: Iterable[Material] = tuple(MATERIALS.values())
+) -> list[Lattice]:
+    """The same lattice of other materials."""
+    return [replace(base, material=material) for material in materials if material != base.material]
+
+
+def first_mode_limit(
+    base: Lattice,
+    loading: str,
+    rows: Sequence[ModeRow],
+    tolerance: float = 0.005,
+    table: Table | None = None,
+) -> FirstModeLimit | None:
+    """Bisect d/l to where the pattern stops being the first mode of a loading.
+
+    Parameters
+    ----------
+    base
+        All else about the lattice.
+    loading
+        Name of the loading.
+    rows
+        Known ones, to begin with.
+    tolerance
+        Of d/l [-].
+
+    Returns
+    -------
+    None if among the rows there is none with the pattern first and one below with something else.
+
+    Raises
+    ------
+    InputError
+        If the tolerance is not positive.
+    """
+    if not tolerance > 0:
+        raise InputError(f"mode study: expected a positive tolerance of d/l, got {tolerance}")
+    table = table or Table()
+    known = sorted((row for row in rows if row.loading == loading), key=lambda row: row.ratio)
+    below = [row for row in known if not row.is_first]
+    above = [row for row in known if row.is_first and (not below or row.ratio > below[-1].ratio)]
+    if not below or not above:
+        return None
+    low, high = below[-1], above[0]
+    if low.kind == "path ends":
+        return None
+    while high.ratio - low.ratio > tolerance:
+        ratio = round(0.5 * (low.ratio + high.ratio), 6)
+        lattice = replace(base, ratio=ratio, loading=LOADINGS[loading])
+        middle = table.row(lattice, lambda it: pattern_mode(it).row)
+        low, high = (low, middle) if middle.is_first else (middle, high)
+    return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
+
+
+def run_study(
+    base: Lattice,
+    table: Path | str | None = None,
+    *,
+    ratios: Sequence[float] = RATIOS,
+    loadings: Sequence[str] = tuple(LOADINGS),
+    shown: Sequence[float] = SHOWN,
+    progress: Progress = silent,
+) -> ModeStudy:
+    """The whole study about one lattice: hole sizes, scales, materials, limits, overlays.
+
+    Parameters
+    ----------
+    base
+        The reference.
+    table
+        CSV that keeps the rows, and that a study which was broken off goes on from.
+    ratios, loadings
+        Of the lattices.
+    shown
+        d/l of the overlays [-], under the reference's loading.
+    progress
+        Listener.
+    """
+    kept = Table(table)
+    rows = study_modes(ratio_lattices(base, ratios, loadings), kept, progress)
+    limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
+    return ModeStudy(
+        rows,
+        study_likeness(base, scale_lattices(base), kept, progress),
+        study_likeness(base, material_lattices(base), kept, progress),
+        tuple(limit for limit in limits if limit is not None),
+        tuple(pattern_mode(replace(base, ratio=ratio)) for ratio in shown),
+    )
