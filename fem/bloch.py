@@ -7,6 +7,7 @@ from cell to cell, (k . a1, k . a2) in rad: M of the square lattice is (pi, pi).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,17 +15,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
+from modeharvest.errors import InputError
 from modeharvest.fem.cell import CellState, PeriodicCell
-from modeharvest.fem.condensation import Condensation, CondensedWave
+from modeharvest.fem.condensation import Condensation, CondensedWaves
+from modeharvest.fem.copies import Batch, applied
+from modeharvest.fem.lanczos import largest
 from modeharvest.fem.reduction import factorise, negative_pivots
 
 FloatArray = NDArray[np.float64]
 Wave = tuple[float, float]
 
-_LARGEST_SPACE = 60  # of the Lanczos iteration, in blocks
-_SCAN_TOLERANCE = 1e-9  # of lambda + s, relative
+_SCAN_TOLERANCE = 1e-10  # of lambda + s, relative
+_TOGETHER = 30  # waves iterated at once: more would only take more memory
 _NOISE = 0.2  # in a start vector, relative
 _DIRECTIONS = 36  # over half a turn
 
@@ -69,7 +73,6 @@ class BlochWaves:
         scale = np.linalg.norm(state.moduli.ravel()) / (cell.filling * cell.cell.area)
         self._below = 0.02 * float(scale)
         self._condense()
-        self._noise = np.random.default_rng(7).standard_normal((2, cell.reduction.size, 8))
 
     def lowest(
         self,
@@ -94,23 +97,51 @@ class BlochWaves:
         tolerance
             About the relative error of lambda + s that is allowed.
         """
-        mass = self.cell.mass.at(wave)
-        solver, below = self._solver_below(wave)
-        start = self._start(mass.dtype, count, near)
-        fixed = self._translations(mass) if _is_centre(wave) else start[:, :0]
-        inverse, vectors = _block_lanczos(solver, mass, start, fixed, tolerance)
-        return BlochModes(wave, 1.0 / inverse - below, vectors)
+        values, vectors = self.iterated(phases_of([wave]), count, near, tolerance)
+        return BlochModes(wave, values[0], vectors[:, 0])
+
+    def iterated(
+        self, waves: FloatArray, count: int, near: BlochModes | None, tolerance: float
+    ) -> tuple[FloatArray, Batch]:
+        """What ``lowest`` does, for several waves that are alike: see ``scan``.
+
+        Parameters
+        ----------
+        waves
+            (w, 2) phases [rad]: all of them Γ, all where T(k) is real, or all elsewhere.
+        count, near, tolerance
+            As in ``lowest``.
+
+        Returns
+        -------
+        values, vectors
+            (w, count) and (size, w, count).
+        """
+        solver, below = self._solver_below(waves)
+        T = self.cell.reduction.copies.at(waves)
+
+        def weigh(block: Batch) -> Batch:
+            return T.gather(applied(self.cell.nodal_mass.__matmul__, T.spread(block)))
+
+        start = self._start(T.dtype, count, near)[:, None]
+        fixed = self._translations() if _are_centre(waves).all() else start[:, :, :0]
+        start, fixed = (np.repeat(vectors, len(waves), axis=1) for vectors in (start, fixed))
+        inverse, vectors = largest(solver.solve, weigh, start, fixed, tolerance)
+        return 1.0 / inverse - below, vectors
 
     def unstable(self, wave: Wave) -> int:
         """Number of negative eigenvalues, by the inertia of one factor; not for Γ itself."""
+        phases_of([wave])
         self.factorisations += 1
         return negative_pivots(factorise(self.stiffness.at(wave)))
 
     def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
         """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
         self.factorisations += 1
-        condensation = Condensation(self.state.stiffness, self.cell.reduction)
-        return tuple(wave for wave in points if condensation.at(wave) is None)
+        condensation = Condensation(self.state.stiffness, self.cell.reduction.outline)
+        waves = phases_of(points)
+        bad = [condensation.at(wave[None]) is None for wave in waves]
+        return tuple(wave for wave, is_bad in zip(points, bad, strict=True) if is_bad)
 
     def slope(self, modes: BlochModes) -> FloatArray:
         """(2,) derivatives of the lowest eigenvalue by k . a1 and k . a2 (Hellmann-Feynman)."""
@@ -146,10 +177,10 @@ class BlochWaves:
             return float(found.fun), best + float(found.x)
         return self.acoustic(best), best
 
-    def _solver_below(self, wave: Wave) -> tuple[CondensedWave, float]:
-        """The inverse of K + s M, and s; from now on a larger s where that isn't enough."""
+    def _solver_below(self, waves: FloatArray) -> tuple[CondensedWaves, float]:
+        """The inverses of K + s M, and s; from now on a larger s where that isn't enough."""
         while True:
-            solver = self._condensation.at(wave)
+            solver = self._condensation.at(waves)
             if solver is not None:
                 return solver, self._below
             self._below *= 2.0
@@ -157,92 +188,71 @@ class BlochWaves:
 
     def _condense(self) -> None:
         self.factorisations += 1
-        shifted = self.state.stiffness + self._below * self.cell.nodal_mass
-        self._condensation = Condensation(csr_array(shifted), self.cell.reduction)
+        shifted = csr_array(self.state.stiffness + self._below * self.cell.nodal_mass)
+        self._condensation = Condensation(shifted, self.cell.reduction.outline)
 
-    def _start(self, dtype: Any, count: int, near: BlochModes | None) -> NDArray[Any]:
+    def _start(self, dtype: Any, count: int, near: BlochModes | None) -> Batch:
         """(size, count) vectors to begin with: those of ``near``, and always some noise.
 
         Eigenvectors of one wave vector may all lack the symmetry of a mode that comes down at
         the next; without noise the iteration would never find it.
         """
-        real, imaginary = self._noise[:, :, :count]
+        shape = 2, self.cell.reduction.size, count
+        real, imaginary = np.random.default_rng(7).standard_normal(shape)
         noise = real if dtype.kind == "f" else real + 1j * imaginary
         if near is None or near.vectors.dtype != dtype or near.vectors.shape != noise.shape:
             return np.asarray(noise)
         sizes = np.linalg.norm(near.vectors, axis=0) / np.linalg.norm(noise, axis=0)
         return np.asarray(near.vectors + _NOISE * sizes * noise)
 
-    def _translations(self, mass: csc_array) -> FloatArray:
-        """(size, 2) orthonormal translations along x and y."""
+    def _translations(self) -> FloatArray:
+        """(size, 1, 2) orthonormal translations along x and y."""
         axis = self.cell.reduction.order % 2
-        moves = np.stack([axis == 0, axis == 1], axis=1).astype(np.float64)
-        return np.asarray(moves / np.sqrt(np.sum(moves * (mass @ moves), axis=0)))
+        moves = np.stack([axis == 0, axis == 1], axis=1)[:, None]
+        return np.asarray(moves / math.sqrt(self.cell.filling * self.cell.cell.area))
 
 
 def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArray:
-    """(n, count) lowest eigenvalues at wave vectors that follow each other [N/mm^4].
+    """(n, count) lowest eigenvalues at many wave vectors [N/mm^4].
 
-    Each costs a few solves with the one factorisation of the cell's interior.
+    All of them are iterated together, and each factorises but a small dense matrix.
     """
+    phases = phases_of(points)
     values = np.empty((len(points), count))
-    near: BlochModes | None = None
-    for row, wave in zip(values, points, strict=True):
-        near = waves.lowest(wave, count, near, _SCAN_TOLERANCE)
-        row[:] = near.eigenvalues
+    for group in _alike(phases):
+        values[group], _ = waves.iterated(phases[group], count, None, _SCAN_TOLERANCE)
     return values
 
 
-def _is_centre(wave: Wave) -> bool:
-    turns = np.asarray(wave) / (2.0 * np.pi)
-    return bool(np.all(np.abs(turns - np.rint(turns)) < 1e-12))
+def phases_of(points: Sequence[Wave]) -> FloatArray:
+    """(n, 2) phases [rad] of wave vectors, checked.
 
-
-def _block_lanczos(
-    solver: CondensedWave,
-    mass: csc_array,
-    start: NDArray[Any],
-    fixed: NDArray[Any],
-    tolerance: float,
-) -> tuple[FloatArray, NDArray[Any]]:
-    """The largest eigenvalues of A^-1 M, as many as ``start`` has columns, descending.
-
-    Every new block is made orthogonal to all others: there are few. ``fixed`` are M-orthonormal
-    vectors to be left out of the space.
+    Raises
+    ------
+    InputError
+        If one is not two finite real numbers.
     """
-    count, skipped = start.shape[1], fixed.shape[1]
-    vectors, weighted = fixed, mass @ fixed
-    projected: NDArray[Any] = np.zeros((0, 0))
-    block, image, rest = _orthonormal(start - vectors @ (weighted.conj().T @ start), mass)
-    for _ in range(_LARGEST_SPACE):
-        vectors, weighted = np.hstack([vectors, block]), np.hstack([weighted, image])
-        block = solver.solve(image)
-        column = weighted.conj().T @ block
-        projected = _bordered(projected, column[skipped:])
-        block, image, rest = _orthonormal(block - vectors @ column, mass)
-        values, mix = np.linalg.eigh(projected)
-        values, mix = values[::-1][:count], mix[:, ::-1][:, :count]
-        residual = np.linalg.norm(rest @ mix[-count:], axis=0)
-        if len(values) == count and np.all(residual**2 <= tolerance * values**2):
-            break
-    return values, vectors[:, skipped:] @ mix
+    waves = []
+    for point in points:
+        wave = np.asarray(point)
+        if wave.shape != (2,) or wave.dtype.kind not in "iuf" or not np.isfinite(wave).all():
+            raise InputError(
+                "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers "
+                f"[rad] (the wave lies in the plane), got {point}"
+            )
+        waves.append(wave)
+    return np.array(waves, dtype=np.float64).reshape(-1, 2)
 
 
-def _orthonormal(
-    block: NDArray[Any], mass: csc_array
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The block made M-orthonormal, its image by M, and R with block = orthonormal . R."""
-    image = mass @ block
-    R = np.linalg.cholesky(block.conj().T @ image).conj().T
-    inverse = np.linalg.inv(R)
-    return block @ inverse, image @ inverse, R
+def _alike(waves: FloatArray) -> list[NDArray[np.int64]]:
+    """Numbers of the waves that can be iterated together: Γ, other real ones, and some others."""
+    is_real, is_centre = _are_centre(2.0 * waves), _are_centre(waves)
+    others = np.flatnonzero(~is_real)
+    parts = np.array_split(others, math.ceil(len(others) / _TOGETHER) or 1)
+    groups = [np.flatnonzero(is_centre), np.flatnonzero(is_real & ~is_centre), *parts]
+    return [group for group in groups if len(group)]
 
 
-def _bordered(projected: NDArray[Any], column: NDArray[Any]) -> NDArray[Any]:
-    """The projected matrix with one block column more, Hermitian."""
-    old, new = len(projected), len(column)
-    result = np.zeros((new, new), dtype=column.dtype)
-    result[:old, :old] = projected
-    result[:, old:] = column
-    result[old:, :old] = column[:old].conj().T
-    return result
+def _are_centre(waves: FloatArray) -> NDArray[np.bool_]:
+    turns = waves / (2.0 * np.pi)
+    return np.asarray(np.all(np.abs(turns - np.rint(turns)) < 1e-12, axis=1))

@@ -9,7 +9,6 @@ Appl. 1 (1968) 73-81).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 
-from modeharvest.fem.reduction import Reduction, factorise, negative_pivots
+from modeharvest.fem.copies import Batch, applied
+from modeharvest.fem.outline import Outline
+from modeharvest.fem.reduction import factorise, negative_pivots
 
 FloatArray = NDArray[np.float64]
 
@@ -29,70 +30,55 @@ class Condensation:
     ----------
     matrix
         (2 n, 2 n), the two components of a node side by side.
-    reduction
-        Which nodes are copies, and the order of the reduced unknowns.
+    outline
+        The nodes that have copies.
     """
 
-    def __init__(self, matrix: csr_array, reduction: Reduction) -> None:
-        self.reduction = reduction
-        place = reduction.places
-        master = reduction.periodicity.master
-        is_inner = np.repeat(np.bincount(master)[master] == 1, 2)
-        inner, outline = np.flatnonzero(is_inner), np.flatnonzero(~is_inner)
-        inner = inner[np.argsort(place[inner])]  # the order of little fill-in
+    def __init__(self, matrix: csr_array, outline: Outline) -> None:
         self.outline = outline
-        self.inner_places = place[inner]
-        self.outline_places, self._column = np.unique(place[outline], return_inverse=True)
-        rows = matrix[inner]
-        self.factor: Any = factorise(csc_array(rows[:, inner]))
-        self.coupling = rows[:, outline]
-        self.response = np.ascontiguousarray(self.factor.solve(self.coupling.toarray()))
-        self.complement = matrix[outline][:, outline].toarray() - self.coupling.T @ self.response
+        rows = matrix[outline.inner]
+        self.factor: Any = factorise(csc_array(rows[:, outline.inner]))
         self.is_definite = negative_pivots(self.factor) == 0
+        self.coupling = rows[:, outline.rim]
+        self.transposed = csr_array(self.coupling.T)
+        self.response = np.ascontiguousarray(self.factor.solve(self.coupling.toarray()))
+        corner = matrix[outline.rim][:, outline.rim].toarray()
+        self._blocks = outline.sorted(corner - self.transposed @ self.response)
 
-    def at(self, wave: tuple[float, float]) -> CondensedWave | None:
-        """The solver for one wave vector; None where the matrix isn't positive definite."""
+    def at(self, waves: FloatArray) -> CondensedWaves | None:
+        """The solvers for phases (w, 2) [rad]; None if one matrix isn't positive definite."""
         if not self.is_definite:
             return None
-        shift = self.reduction.periodicity.shift[self.outline // 2]
-        phases = np.exp(1j * (shift @ np.asarray(wave)))
-        if np.abs(phases.imag).max() < 1e-12:
-            phases = phases.real
-        size = len(self.outline), len(self.outline_places)
-        T = csr_array((phases, (np.arange(size[0]), self._column)), shape=size)
         try:
-            return CondensedWave(self, T)
+            # LAPACK has matrices by columns, and A(-k)^T = A(k).
+            transposed = self.outline.reduced(self._blocks, -waves)
+            return CondensedWaves(self, transposed.transpose(0, 2, 1), waves)
         except np.linalg.LinAlgError:
             return None
 
 
-class CondensedWave:
-    """The inverse of T(k)^H A T(k), in the order of the reduced unknowns."""
+class CondensedWaves:
+    """The inverses of T(k)^H A T(k), in the order of the reduced unknowns."""
 
-    def __init__(self, whole: Condensation, transformation: csr_array) -> None:
-        self._whole, self._T = whole, transformation
-        self._adjoint = csr_array(transformation.conj().T)
-        reduced = self._adjoint @ (self._adjoint @ whole.complement.T).conj().T
-        self._complement = cho_factor(0.5 * (reduced + reduced.conj().T), lower=True)
+    def __init__(self, whole: Condensation, complements: Batch, waves: FloatArray) -> None:
+        self._whole = whole
+        self._T = whole.outline.copies.at(waves)
+        options = {"lower": True, "check_finite": False, "overwrite_a": True}
+        self._factors = [cho_factor(complement, **options) for complement in complements]
 
-    def solve(self, block: NDArray[Any]) -> NDArray[Any]:
-        """The solutions for right-hand sides (size, m)."""
-        whole = self._whole
-        relaxed = _by_parts(whole.factor.solve, block[whole.inner_places])
-        forces = block[whole.outline_places] - self._adjoint @ (whole.coupling.T @ relaxed)
-        outline = cho_solve(self._complement, forces)
-        result = np.empty(block.shape, dtype=np.result_type(block, outline))
-        result[whole.outline_places] = outline
-        result[whole.inner_places] = relaxed - _by_parts(
-            whole.response.__matmul__, self._T @ outline
-        )
+    def solve(self, forces: Batch) -> Batch:
+        """The solutions for a batch of right-hand sides (size, w, m)."""
+        whole, outline = self._whole, self._whole.outline
+        relaxed = applied(whole.factor.solve, forces[outline.inner_places])
+        reaction = self._T.gather(applied(whole.transposed.__matmul__, relaxed))
+        complement = self._solved(forces[outline.rim_places] - reaction)
+        result = np.empty_like(forces)
+        result[outline.rim_places] = complement
+        moved = applied(whole.response.__matmul__, self._T.spread(complement))
+        result[outline.inner_places] = relaxed - moved
         return result
 
-
-def _by_parts(operator: Callable[[FloatArray], FloatArray], block: NDArray[Any]) -> NDArray[Any]:
-    """A real linear operator applied to a block that may be complex, without a complex copy."""
-    if block.dtype.kind == "f":
-        return operator(block)
-    parts = operator(np.asfortranarray(np.hstack([block.real, block.imag])))
-    count = block.shape[1]
-    return np.asarray(parts[:, :count] + 1j * parts[:, count:])
+    def _solved(self, forces: Batch) -> Batch:
+        for k, factor in enumerate(self._factors):
+            forces[:, k] = cho_solve(factor, forces[:, k], check_finite=False)
+        return forces

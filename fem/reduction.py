@@ -9,6 +9,7 @@ of a few arrays over one sparsity pattern.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from modeharvest.fem.copies import Copies
+from modeharvest.fem.outline import Outline
 from modeharvest.fem.periodicity import Periodicity
 
 FloatArray = NDArray[np.float64]
@@ -80,12 +83,18 @@ class Reduction:
         """The sparse matrix with these entries."""
         return csc_array((data, self._indices, self._indptr), shape=(self.size, self.size))
 
-    @property
-    def places(self) -> IntArray:
-        """(2 n,) the reduced unknown that each component of the mesh's nodes follows."""
+    @cached_property
+    def copies(self) -> Copies:
+        """The components of the mesh's nodes as copies of the reduced unknowns."""
         components = 2 * np.repeat(self.periodicity.master, 2)
         components[1::2] += 1
-        return np.asarray(np.argsort(self.order)[components])
+        places = np.argsort(self.order)[components]
+        return Copies(places, np.repeat(self.periodicity.shift, 2, axis=0))
+
+    @cached_property
+    def outline(self) -> Outline:
+        """Those of them that have copies in other cells."""
+        return Outline(self.copies)
 
     def phases(self, wave: tuple[float, float]) -> ComplexArray:
         """The factors exp(i k . (R' - R)) of the sorted entries."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from modeharvest.errors import InputError
-from modeharvest.fem.bloch import BlochModes, BlochWaves, Wave
+from modeharvest.fem.bloch import BlochModes, BlochWaves, Wave, phases_of, scan
 from modeharvest.fem.cell import CellState, PeriodicCell
 
 FloatArray = NDArray[np.float64]
@@ -82,22 +82,20 @@ class Zone:
 
     def at(self, waves: BlochWaves, wave: Wave) -> LeastStable:
         """The measure at one wave vector."""
-        return LeastStable(waves.state.load, self._value(waves.lowest(wave)), wave)
+        value = float(waves.lowest(wave).eigenvalues[0])
+        return LeastStable(waves.state.load, self._value(wave, value), wave)
 
     def on_grid(self, waves: BlochWaves) -> FloatArray:
         """The measure at every point of ``grid`` [MPa]."""
-        values = np.empty(len(self.grid))
-        near: BlochModes | None = None
-        for k, wave in enumerate(self.grid):
-            near = waves.lowest(wave, near=near, tolerance=1e-10)
-            values[k] = self._value(near)
-        return values
+        lowest = scan(waves, self.grid)[:, 0]
+        pairs = zip(self.grid, lowest, strict=True)
+        return np.array([self._value(wave, float(value)) for wave, value in pairs])
 
-    def _value(self, modes: BlochModes) -> float:
+    def _value(self, wave: Wave, eigenvalue: float) -> float:
         """filling * lambda / |k|^2 [MPa]; for modes with the cell's period over 4 / area."""
-        squared = self._squared(modes.wave)[0]
+        squared = self._squared(wave)[0]
         squared = squared if squared > 1e-12 else 4.0 / self.cell.cell.area
-        return float(self.cell.filling * modes.eigenvalues[0] / squared)
+        return self.cell.filling * eigenvalue / squared
 
     def _squared(self, wave: Wave) -> tuple[float, FloatArray]:
         """|k|^2 made periodic, k_i k_j being turned into cosines; and its gradient."""
@@ -119,7 +117,9 @@ class Zone:
             near[:] = [modes]
             squared, slope_of_squared = self._squared(wave)
             slope = waves.slope(modes) - modes.eigenvalues[0] * slope_of_squared / squared
-            return self._value(modes), self.cell.filling * slope / squared
+            return self._value(
+                wave, float(modes.eigenvalues[0])
+            ), self.cell.filling * slope / squared
 
         # Off the grid, where symmetry may make a saddle look like a minimum; not as far as the
         # next points, one of which may be Γ.
@@ -158,7 +158,7 @@ def zone_path(
             "zone path: expected two corners or more and at least as many points, got "
             f"{len(corners)} and {count}"
         )
-    ends = np.array([wave for _, wave in corners])
+    ends = phases_of([wave for _, wave in corners])
     vectors = ends @ np.linalg.inv(lattice).T
     lengths = np.linalg.norm(np.diff(vectors, axis=0), axis=1)
     reached = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()

@@ -118,11 +118,11 @@ def test_lowest_eigenvalues_and_their_signs_are_those_of_the_dense_matrix(
 @pytest.mark.parametrize("wave", [M, GENERAL])
 def test_condensing_the_interior_leaves_the_inverse_as_it_is(kind: str, wave: Wave) -> None:
     waves = waves_of(kind, 0.01)
-    solver = Condensation(waves.state.stiffness, waves.cell.reduction).at(wave)
+    solver = Condensation(waves.state.stiffness, waves.cell.reduction.outline).at(np.array([wave]))
     assert solver is not None
     K = waves.stiffness.at(wave)
     x = np.random.default_rng(2).standard_normal((K.shape[0], 3)).astype(K.dtype)
-    assert np.allclose(solver.solve(K @ x), x, atol=1e-9)
+    assert np.allclose(solver.solve((K @ x)[:, None])[:, 0], x, atol=1e-9)
 
 
 def test_cholesky_finds_the_unstable_waves() -> None:
@@ -177,11 +177,31 @@ def test_a_scan_finds_modes_that_the_wave_before_has_no_part_of() -> None:
     points, stops = zone_path(SQUARE_ZONE, waves.cell.cell.lattice, 21)
     assert [points[k] for k in stops] == [wave for _, wave in SQUARE_ZONE]
     waves.factorisations = 0
-    values = scan(waves, points[1:-1])[:, 0]
+    values = scan(waves, points)[:, 0]
+    assert values[0] == values[-1] == pytest.approx(dense(waves, points[0])[2], rel=1e-6)
     exact = [dense(waves, wave)[0] for wave in points[1:-1]]
-    assert np.allclose(values, exact, rtol=1e-6, atol=1e-8)
+    assert np.allclose(values[1:-1], exact, rtol=1e-6, atol=1e-8)
     assert min(values) < 0  # buckled at 0.030
     assert waves.factorisations <= 3  # of the interior: one for each shift that was too small
+
+
+@pytest.mark.parametrize(
+    "wave", [(0.1,), (0.1, 0.2, 0.3), (0.1, math.nan), (0.1 + 0.2j, 0.0), ("Γ", "M")]
+)
+def test_wave_vectors_out_of_the_plane_are_refused(wave: Any) -> None:
+    waves = waves_of("square", 0.02)
+    path = CellPath(waves.cell, uniaxial())
+    corners = [("Γ", (0.0, 0.0)), ("?", wave)]
+    for asked in (
+        lambda: waves.lowest(wave),
+        lambda: waves.unstable(wave),
+        lambda: waves.unstable_among([wave]),
+        lambda: scan(waves, [M, wave]),
+        lambda: critical_at(path, wave),
+        lambda: zone_path(corners, np.eye(2), 10),
+    ):
+        with pytest.raises(InputError, match="wave vector: expected its phases"):
+            asked()
 
 
 def test_the_corners_of_the_hexagonal_zone_are_where_geometry_has_them() -> None:
