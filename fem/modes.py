@@ -18,6 +18,8 @@ from modeharvest.fem.field import Mesh
 FloatArray = NDArray[np.float64]
 Wave = tuple[float, float]
 
+NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i = j, otherwise 0"
+
 
 @dataclass(frozen=True, eq=False)
 class ModeSet:
@@ -35,7 +37,8 @@ class ModeSet:
         (m,) of K x = lambda M x, M of unit density [N/mm^4]; near zero at a critical point.
     shapes
         (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
-        delta_ij. The sign is such that the first large component is positive.
+        delta_ij. The sign is such that the first large component is positive. Waves with phases
+        other than 0 and pi have their modes in pairs, which are the real and imaginary part.
     load
         Load parameter of the state whose tangent they belong to [-].
     gradient
@@ -55,9 +58,20 @@ class ModeSet:
     info: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        expected = (len(self.waves), len(self.mesh.nodes), 2)
-        if self.shapes.shape != expected:
-            raise InputError(f"modes: expected shapes of {expected}, got {self.shapes.shape}")
+        count = len(self.waves)
+        expected = {
+            "shapes": (count, len(self.mesh.nodes), 2),
+            "eigenvalues": (count,),
+            "lattice": (2, 2),
+            "primitive": (2, 2),
+            "gradient": (2, 2),
+        }
+        for name, shape in expected.items():
+            values = getattr(self, name)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise InputError(
+                    f"modes: expected finite {name} of shape {shape}, got {values.shape}"
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +85,9 @@ class BranchState:
     gradient, stress
         (2, 2) F̄ [-] and P̄ [MPa].
     energy, primary_energy
-        Stored energy per area of the cell, here and on the primary path at the same load [MPa].
+        Stored energy per area of the cell, here and on the primary path at the same load [MPa];
+        NaN where that path ends before. Under a stress other than 0 the lower energy minus
+        P̄ : F̄ is what is preferred.
     negative_eigenvalues
         Of the cell's tangent with F̄'s free components; 0: stable against its own period.
     displacement
@@ -103,7 +119,8 @@ class Branch:
     combination
         (m,) coefficients of the modes at the start, of unit length [-].
     states
-        By load; empty if it could not be followed.
+        By load; empty if it could not be followed. A load that the branch meets twice is there
+        twice.
     outcome
         In words.
     curve
