@@ -9,8 +9,9 @@ by their normalised overlap. :mod:`modeharvest.validation.mode_study` varies the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,6 +39,9 @@ PATTERN: Wave = (math.pi, math.pi)
 EQ_MODE = square_family("hole")
 """The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
 
+RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+"""Of d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
+
 _CLOSE = 0.002  # step of the load [-]
 
 LOADINGS: dict[str, MacroLoading] = {
@@ -49,7 +53,7 @@ LOADINGS: dict[str, MacroLoading] = {
 
 def ogden(exponent: float, poisson: float, shear: float = 0.6) -> Ogden:
     """One Ogden term with a Poisson's ratio [-] and a shear modulus [MPa]."""
-    kappa = 2.0 * poisson * shear / (1.0 - 2.0 * poisson)
+    kappa = round(2.0 * poisson * shear / (1.0 - 2.0 * poisson), 9)
     return Ogden((2.0 * shear,), (exponent,), kappa)
 
 
@@ -209,3 +213,12 @@ def kind_of(found: LatticeCritical, largest: float) -> str:
         return "long waves"
     alone = len(found.waves) == 1 and is_same(found.waves[0], PATTERN)
     return "pattern" if alone else "other waves"
+
+
+def ratio_lattices(
+    ratios: Iterable[float] = RATIOS,
+    loadings: Iterable[str] = tuple(LOADINGS),
+    base: Lattice = Lattice(),
+) -> list[Lattice]:
+    """Every hole size under every loading, all else as the base has it."""
+    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]

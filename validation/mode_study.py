@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 
 from modeharvest.errors import InputError
-from modeharvest.fem.materials import Material
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.independence import (
     LOADINGS,
     MATERIALS,
+    RATIOS,
     Lattice,
     PatternMode,
     mode_likeness,
     pattern_mode,
+    ratio_lattices,
 )
 from modeharvest.validation.mode_table import ModeRow, read_rows, write_rows
 
-RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
-"""Of d/l [-]: 0.7895 is the paper's, 0.8696 and 0.95 have independent values."""
 SHOWN = (0.95, 0.7895, 0.25)
 """Of d/l in the paper's Fig. "graded", from left to right."""
-SCALES = (2.0, 10.0)
-"""Of l, relative to the reference's."""
 
 
 @dataclass(frozen=True)
@@ -132,25 +128,6 @@ def study_likeness(
     return tuple(rows)
 
 
-def ratio_lattices(
-    base: Lattice, ratios: Iterable[float] = RATIOS, loadings: Iterable[str] = tuple(LOADINGS)
-) -> list[Lattice]:
-    """Every hole size under every loading."""
-    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]
-
-
-def scale_lattices(base: Lattice, factors: Iterable[float] = SCALES) -> list[Lattice]:
-    """The same lattice with all lengths multiplied."""
-    return [replace(base, pitch=factor * base.pitch) for factor in factors]
-
-
-def material_lattices(
-    base: Lattice, materials: Iterable[Material] = tuple(MATERIALS.values())
-) -> list[Lattice]:
-    """The same lattice of other materials."""
-    return [replace(base, material=material) for material in materials if material != base.material]
-
-
 def first_mode_limit(
     base: Lattice,
     loading: str,
@@ -205,6 +182,8 @@ def run_study(
     *,
     ratios: Sequence[float] = RATIOS,
     loadings: Sequence[str] = tuple(LOADINGS),
+    pitches: Sequence[float] = (),
+    materials: Sequence[str] = (),
     shown: Sequence[float] = SHOWN,
     progress: Progress = silent,
 ) -> ModeStudy:
@@ -217,19 +196,25 @@ def run_study(
     table
         CSV that keeps the rows, and that a study which was broken off goes on from.
     ratios, loadings
-        Of the lattices.
+        d/l [-] and names of loadings: every combination.
+    pitches
+        Other l [mm]; the mesh is scaled, too.
+    materials
+        Names of other materials, among ``independence.MATERIALS``.
     shown
         d/l of the overlays [-], under the reference's loading.
     progress
         Listener.
     """
     kept = Table(table)
-    rows = study_modes(ratio_lattices(base, ratios, loadings), kept, progress)
+    rows = study_modes(ratio_lattices(ratios, loadings, base), kept, progress)
     limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
+    scaled = [replace(base, pitch=pitch) for pitch in pitches]
+    others = [replace(base, material=MATERIALS[name]) for name in materials]
     return ModeStudy(
         rows,
-        study_likeness(base, scale_lattices(base), kept, progress),
-        study_likeness(base, material_lattices(base), kept, progress),
+        study_likeness(base, scaled, kept, progress),
+        study_likeness(base, others, kept, progress),
         tuple(limit for limit in limits if limit is not None),
         tuple(pattern_mode(replace(base, ratio=ratio)) for ratio in shown),
     )
