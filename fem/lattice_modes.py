@@ -136,10 +136,10 @@ def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
     scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
     values = found.eigenvalues
     count = int(np.sum(values - values[0] < _DEGENERATE * scale))
-    return BlochModes(wave, values[:count], _canonical(found.vectors[:, :count]))
+    return BlochModes(wave, values[:count], canonical(found.vectors[:, :count]))
 
 
-def _canonical(vectors: NDArray[Any]) -> NDArray[Any]:
+def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
     """The basis of a space (size, m) that depends on nothing but the space.
 
     The first vector has the largest possible value, real and positive, at the first component
@@ -151,7 +151,7 @@ def _canonical(vectors: NDArray[Any]) -> NDArray[Any]:
     first = vectors @ (row.conj() / np.linalg.norm(row))
     if len(row) == 1:
         return np.asarray(first[:, None])
-    return np.column_stack([first, _canonical(vectors @ Q[:, 1 : len(row)])])
+    return np.column_stack([first, canonical(vectors @ Q[:, 1 : len(row)])])
 
 
 def _copies(cell: UnitCell, enlarged: UnitCell, copies: tuple[int, int]) -> NDArray[np.int64]:

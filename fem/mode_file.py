@@ -146,10 +146,9 @@ def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
 
 
 def _read_state(group: h5py.Group) -> BranchState:
-    numbers = {name: float(group.attrs[name]) for name in _NUMBERS}
-    arrays = {name: group[name][:] for name in _ARRAYS}
-    count = int(numbers.pop("negative_eigenvalues"))
-    return BranchState(**numbers, **arrays, negative_eigenvalues=count)
+    values: dict[str, Any] = {name: float(group.attrs[name]) for name in _NUMBERS}
+    values["negative_eigenvalues"] = int(values["negative_eigenvalues"])
+    return BranchState(**values, **{name: group[name][:] for name in _ARRAYS})
 
 
 def _write_meshio(
