@@ -9,7 +9,7 @@ reflects and places them. Mid-side nodes of hole edges lie on the circle.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.
-_REVERSED_T6 = [0, 2, 1, 5, 4, 3]
+REVERSED_T6 = [0, 2, 1, 5, 4, 3]
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
@@ -41,7 +41,7 @@ class Block:
 
     def placed(self, sign: tuple[float, float], origin: tuple[float, float]) -> Block:
         """The block reflected about its own axes by ``sign`` and moved to ``origin`` [mm]."""
-        cells = self.cells if sign[0] * sign[1] > 0 else self.cells[:, _REVERSED_T6]
+        cells = self.cells if sign[0] * sign[1] > 0 else self.cells[:, REVERSED_T6]
         return Block(np.asarray(origin) + np.asarray(sign) * self.nodes, cells)
 
     def turned(self, angle: float) -> Block:
@@ -171,44 +171,42 @@ def mesh_block(
             geo.mesh.setTransfiniteCurve(curve, n + 1)
         geo.addPlaneSurface([geo.addCurveLoop(curves)])
         geo.synchronize()
-        return meshed()
+        gmsh.model.mesh.generate(2)
+        gmsh.model.mesh.setOrder(2)
+        return _current_block()
 
 
 @contextmanager
 def quiet_gmsh() -> Iterator[None]:
-    """An empty gmsh model that prints nothing; a model that the caller has open is kept."""
+    """An empty gmsh model that prints nothing; models that the caller has open are kept."""
     ours = not gmsh.isInitialized()
     if ours:
         gmsh.initialize(interruptible=False)
-    before = None if ours else gmsh.model.getCurrent()
-    options = {
-        "General.Terminal": 0,
-        "General.NumThreads": 1,
-        "Mesh.Algorithm": 6,
-        "Mesh.SecondOrderLinear": 0,
-    }
-    kept = {name: gmsh.option.getNumber(name) for name in options}
-    for name, value in options.items():
-        gmsh.option.setNumber(name, value)
+    before = gmsh.model.getCurrent()
+    numbers = {"Mesh.Algorithm": 6, "Mesh.SecondOrderLinear": 0, "Mesh.MeshSizeMax": 1e22}
     try:
-        gmsh.model.add("modeharvest")
-        yield
+        with gmsh_options({"General.Terminal": 0, "General.NumThreads": 1, **numbers}):
+            gmsh.model.add("modeharvest")
+            yield
     finally:
         if ours:
             gmsh.finalize()
         else:
             gmsh.model.remove()
             gmsh.model.setCurrent(before)
-            for name, value in kept.items():
-                gmsh.option.setNumber(name, value)
 
 
-def meshed() -> Block:
-    """The T6 mesh of gmsh's current plane model, made if there is none yet."""
-    if not gmsh.model.mesh.getElementTypes(2).size:
-        gmsh.model.mesh.generate(2)
-    gmsh.model.mesh.setOrder(2)
-    return _current_block()
+@contextmanager
+def gmsh_options(numbers: Mapping[str, float]) -> Iterator[None]:
+    """Options of gmsh by their names, as long as the context lasts."""
+    kept = {name: gmsh.option.getNumber(name) for name in numbers}
+    for name, value in numbers.items():
+        gmsh.option.setNumber(name, value)
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            gmsh.option.setNumber(name, value)
 
 
 def _current_block() -> Block:

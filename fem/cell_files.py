@@ -1,0 +1,258 @@
+"""Unit cells of one's own: from a mesh that meshio reads, or from a gmsh model.
+
+Lengths are millimetres. What the copies of a cell must do to fit together is checked by
+``fem.periodicity``, which names the nodes that don't.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import gmsh
+import meshio
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.fem.lattices import UnitCell
+from modeharvest.fem.meshing import gmsh_options, quiet_gmsh
+from modeharvest.fem.triangles import sound_t6
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Cells = dict[str, IntArray]  # by meshio's names of the elements
+
+GEOMETRY = (".geo", ".geo_unrolled", ".step", ".stp", ".brep", ".iges", ".igs")
+"""Suffixes of the files that gmsh meshes."""
+
+_LOWER = ("vertex", "line")  # what meshes hold besides their elements
+
+
+def read_cell(
+    path: Path | str, lattice: ArrayLike | None = None, size: float | None = None
+) -> UnitCell:
+    """Read the unit cell of a lattice from a file.
+
+    Parameters
+    ----------
+    path
+        A mesh of six-node triangles in the x-y plane, in any format of meshio or gmsh; three-node
+        triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
+        (suffixes ``GEOMETRY``), whose opposite sides are divided alike. [mm] If a gmsh
+        file names physical surfaces, these are the material.
+    lattice
+        (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x and
+        y, as wide and as high as its material.
+    size
+        Largest edge length of the elements that gmsh makes of a geometry [mm]; None: what the
+        geometry itself says.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it can't be read; has no triangles, or other elements as
+        well; isn't plane; has elements inside out, or is not periodic.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"expected a cell (mesh or geometry) at {path}, found no such file")
+    if path.suffix.lower() in (*GEOMETRY, ".msh"):
+        with quiet_gmsh():
+            _merge(path)
+            return _from_model(lattice, size, path.suffix.lower() != ".msh", str(path))
+    if size is not None:
+        raise InputError(
+            f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not for meshes"
+        )
+    source = _read_meshio(path)
+    cells: Cells = {}
+    for block in source.cells:
+        rows = [cells[block.type]] if block.type in cells else []
+        cells[block.type] = np.vstack([*rows, np.asarray(block.data, dtype=np.int64)])
+    return _unit_cell(np.asarray(source.points, dtype=np.float64), cells, lattice, str(path))
+
+
+def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) -> UnitCell:
+    """The unit cell in gmsh's current model, which stays open.
+
+    If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
+    divided alike. Parameters and errors are those of :func:`read_cell`.
+    """
+    if not gmsh.isInitialized():
+        raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")
+    with gmsh_options({"General.Terminal": 0, "Mesh.MeshSizeMax": 1e22}):
+        to_mesh = not gmsh.model.mesh.getElementTypes(2).size
+        return _from_model(lattice, size, to_mesh, "gmsh model")
+
+
+def _merge(path: Path) -> None:
+    gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
+    try:
+        gmsh.merge(str(path))
+    except Exception as error:  # gmsh raises nothing else
+        raise InputError(
+            f"expected a file that gmsh reads at {path}, got: {_said(error)}"
+        ) from error
+
+
+def _from_model(
+    lattice: ArrayLike | None, size: float | None, to_mesh: bool, source: str
+) -> UnitCell:
+    """The cell in gmsh's current model."""
+    if size is not None:
+        if not 0 < size < np.inf:
+            raise InputError(f"mesh size: expected a positive length in mm, got {size}")
+        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    if to_mesh:
+        try:
+            _mesh_periodically(lattice)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from error
+        except Exception as error:  # gmsh raises nothing else
+            raise InputError(
+                f"{source}: gmsh can't mesh it ({_said(error)}); holes must neither overlap nor "
+                "touch each other"
+            ) from error
+    return _unit_cell(*_current_mesh(), lattice, source)
+
+
+def _said(error: Exception) -> str:
+    return " ".join((str(error) or gmsh.logger.getLastError()).split())
+
+
+def _mesh_periodically(lattice: ArrayLike | None) -> None:
+    """T6 mesh of the current model whose sides are divided alike where a translation maps them."""
+    mesh = gmsh.model.mesh
+    mesh.clear()
+    mesh.generate(1)
+    surfaces = gmsh.model.getEntities(2)
+    _refuse_crossing({tag for _, tag in gmsh.model.getBoundary(surfaces, False, False)})
+    curves = [tag for _, tag in gmsh.model.getBoundary(surfaces, combined=True, oriented=False)]
+    outline = [_marks(tag) for tag in curves]
+    if outline:
+        vectors = _lattice(lattice, mesh.getNodes()[1].reshape(-1, 3)[:, :2])
+        for a, b, shift in _translates(outline, vectors):
+            if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set by the user
+                affine = np.eye(4)
+                affine[:2, 3] = shift
+                mesh.setPeriodic(1, [curves[b]], [curves[a]], affine.ravel())
+    mesh.clear()
+    mesh.generate(2)
+    mesh.setOrder(2)
+
+
+def _refuse_crossing(curves: set[int]) -> None:
+    """Curves must not cross: gmsh would try to mesh what they enclose, and never end."""
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    order = np.argsort(tags)
+    points = coordinates.reshape(-1, 3)[order, :2]
+    ends = [nodes for curve in curves for nodes in gmsh.model.mesh.getElements(1, curve)[2]]
+    lines = np.searchsorted(tags[order], np.concatenate([[], *ends])).reshape(-1, 2)
+    start, along = points[lines[:, 0]], points[lines[:, 1]] - points[lines[:, 0]]
+    for p, d in zip(start, along, strict=True):
+        near = 1e-6 * (d @ d)  # what is that near only touches
+
+        def apart(a: FloatArray, b: FloatArray, near: float = near) -> NDArray[np.bool_]:
+            return np.asarray((np.minimum(a, b) < -near) & (np.maximum(a, b) > near))
+
+        crossed = apart(_cross(d, start - p), _cross(d, start + along - p))
+        crossed &= apart(_cross(along, p - start), _cross(along, p + d - start))
+        if crossed.any():
+            raise InputError(
+                f"expected curves that don't cross, got some that do near ({p[0]:.5g}, {p[1]:.5g}) "
+                "mm; holes must neither overlap each other nor leave their surface"
+            )
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n,) cross products of vectors (n, 2) or (2,)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _marks(curve: int) -> FloatArray:
+    """(3, 2) ends, in the order of x and y, and middle of a curve of the current model [mm]."""
+    low, high = (float(bound[0]) for bound in gmsh.model.getParametrizationBounds(1, curve))
+    at = [low, high, 0.5 * (low + high)]
+    points = np.array(gmsh.model.getValue(1, curve, at)).reshape(3, 3)[:, :2]
+    if tuple(points[1]) < tuple(points[0]):
+        points = points[[1, 0, 2]]
+    return points
+
+
+def _translates(
+    outline: list[FloatArray], lattice: FloatArray
+) -> list[tuple[int, int, FloatArray]]:
+    """Pairs of curves, the second being the first moved by a vector; each is in one pair."""
+    near = 1e-6 * float(np.linalg.norm(lattice, axis=1).min())
+    found, paired = [], set()
+    for shift in np.array([[1, 0], [0, 1], [1, 1], [-1, 1]]) @ lattice:
+        for a, start in enumerate(outline):
+            for b, end in enumerate(outline):
+                if not {a, b} & paired and np.abs(start + shift - end).max() < near:
+                    found.append((a, b, shift))
+                    paired |= {a, b}
+    return found
+
+
+def _current_mesh() -> tuple[FloatArray, Cells]:
+    """Nodes (n, 3) [mm] and elements of gmsh's current model: of its material, if it names one."""
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    order = np.argsort(tags)
+    groups = gmsh.model.getPhysicalGroups(2)
+    named = [
+        int(e) for _, group in groups for e in gmsh.model.getEntitiesForPhysicalGroup(2, group)
+    ]
+    cells: dict[str, list[IntArray]] = {}
+    for entity in named or [tag for _, tag in gmsh.model.getEntities(2)]:
+        for kind, _, nodes in zip(*gmsh.model.mesh.getElements(2, entity), strict=True):
+            _, _, degree, count, *_ = gmsh.model.mesh.getElementProperties(kind)
+            name = {(1, 3): "triangle", (2, 6): "triangle6"}.get((degree, count), f"{count}-node")
+            place = np.searchsorted(tags[order], nodes).reshape(-1, count)
+            cells.setdefault(name, []).append(place.astype(np.int64))
+    points = coordinates.reshape(-1, 3)[order]
+    return points, {name: np.vstack(blocks) for name, blocks in cells.items()}
+
+
+def _read_meshio(path: Path) -> Any:
+    said = io.StringIO()
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
+        reason = " ".join((said.getvalue() or str(error)).split())
+        raise InputError(f"expected a mesh that meshio reads at {path}, got: {reason}") from error
+
+
+def _unit_cell(
+    points: FloatArray, cells: Mapping[str, IntArray], lattice: ArrayLike | None, source: str
+) -> UnitCell:
+    """Check a mesh as files hold it, put it in order, and find its periodicity."""
+    kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
+    if kinds not in (["triangle"], ["triangle6"]):
+        raise InputError(
+            f"{source}: expected triangles of three or of six nodes and nothing else, got "
+            f"{' and '.join(kinds) or 'no elements'}"
+        )
+    try:
+        mesh = sound_t6(points, cells[kinds[0]])
+        return UnitCell(mesh, _lattice(lattice, mesh.nodes))
+    except InputError as error:
+        taken = "; no lattice vectors given: those of a rectangular cell were tried"
+        raise InputError(f"{source}: {error}{taken if lattice is None else ''}") from error
+
+
+def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:
+    """The lattice vectors given, or those of a rectangle around the nodes."""
+    if given is None:
+        return np.diag(np.ptp(nodes, axis=0))
+    try:
+        vectors = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        vectors = np.empty(0)
+    if vectors.shape != (2, 2) or not np.isfinite(vectors).all():
+        raise InputError(f"expected two lattice vectors of two numbers [mm] as rows, got {given}")
+    return vectors
