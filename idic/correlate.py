@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.agreement import autocorrelation
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.gauss_newton import (
@@ -142,8 +143,10 @@ def correlate(
         a, before = (np.concatenate([x, a[x.size :]]) for x in (found.unknowns, before))
         if found.outcome in (Outcome.LEFT_IMAGE, Outcome.SINGULAR):
             break
+    correlation = autocorrelation(_residual(pair, model, found.unknowns))
+    clock.lap("judge the residual")
     progress(len(levels), len(levels), "correlate")
-    return _result(model, grid, found, history, clock.laps)
+    return _result(model, grid, found, history, clock.laps, correlation)
 
 
 def fit_displacement(
@@ -281,12 +284,27 @@ def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
     return landed
 
 
+def _residual(pair: Pair, ansatz: Ansatz, a: FloatArray) -> NDArray[np.float32]:
+    """(rows, cols) f - g(x + u) at the pixels that count, NaN at the others."""
+    grid, landed = pair.grid, _landed(pair, ansatz, a)
+    residual = np.full(grid.shape, np.nan, dtype=np.float32)
+    for first in range(0, grid.rows, _BAND):
+        band = slice(first, first + _BAND)
+        row, col = np.nonzero(landed[band])
+        u = (ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size)[row, col]
+        gain, offset = (b[row, col] for b in ansatz.gain_and_offset(a, grid.x, grid.y[band]))
+        value, _, _ = pair.deformed.sample(first + row - u[:, 1], col + u[:, 0])
+        residual[first + row, col] = pair.reference[first + row, col] - gain * value - offset
+    return residual
+
+
 def _result(
     ansatz: Ansatz,
     grid: PixelGrid,
     found: Minimum,
     history: tuple[Iteration, ...],
     timings_s: dict[str, float],
+    residual_correlation: float = float("nan"),
 ) -> Result:
     eigen = ScaledEigen.of(found.equations.matrix)
     return Result(
@@ -301,6 +319,7 @@ def _result(
         condition_number=eigen.condition_number,
         history=history,
         timings_s=timings_s,
+        residual_correlation=residual_correlation,
     )
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
+from modeharvest.idic.agreement import Agreement
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.gauss_newton import Iteration, Outcome
 from modeharvest.idic.serialise import ansatz_from_dict, ansatz_to_dict
@@ -20,7 +21,7 @@ from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]
 
-FORMAT = "modeharvest-result-1"
+FORMAT = "modeharvest-result-2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,9 @@ class Result:
         Every iteration of every level.
     timings_s
         Seconds for each stage.
+    residual_correlation
+        Rms autocorrelation of the residual 4 to 12 px apart [-]: near 0 for noise; NaN for a
+        fit to a displacement. See :meth:`agreement`.
     """
 
     ansatz: Ansatz
@@ -65,6 +69,7 @@ class Result:
     condition_number: float
     history: tuple[Iteration, ...] = ()
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    residual_correlation: float = float("nan")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -123,9 +128,57 @@ class Result:
         residual = 2.0 * self.noise_sd**2
         return (residual if noise_sd is None else noisy_images * noise_sd**2) * self.inverse
 
+    def agreement(
+        self, noise_sd: float | None = None, noisy_images: int = 2, order: int = 5
+    ) -> Agreement:
+        """Whether the residual is noise: what the standard errors rest on.
+
+        Parameters
+        ----------
+        noise_sd
+            Standard deviation of the noise in an image [grey levels], if known; then chi
+            squared is told, too.
+        noisy_images
+            2 if both images are noisy, 1 if only the reference is.
+        order
+            Of the spline that was used.
+        """
+        return Agreement.of(
+            self.residual_rms,
+            self.residual_correlation,
+            self.pixels,
+            self.ansatz.size,
+            noise_sd,
+            noisy_images,
+            order,
+        )
+
     def standard_errors(self, noise_sd: float | None = None) -> FloatArray:
         """(n,): square roots of the diagonal of :meth:`covariance`."""
         return np.sqrt(np.diag(self.covariance(noise_sd)))
+
+    def displacement_sd(
+        self, x: ArrayLike, y: ArrayLike, noise_sd: float | None = None
+    ) -> FloatArray:
+        """(..., 2): predicted standard deviation of u_x and u_y [mm] at positions [mm].
+
+        Infinite where it depends on unknowns that the images say nothing about.
+
+        Parameters
+        ----------
+        x, y
+            Positions that broadcast together, or two axes; for maps take every tenth pixel or
+            so: it is as smooth as the ansatz.
+        noise_sd
+            As for :meth:`covariance`.
+        """
+        S = self.ansatz.sensitivities(self.unknowns, x, y)
+        covariance = self.covariance(noise_sd)
+        lost = np.isinf(np.diag(covariance))
+        covariance[np.ix_(lost, lost)] = 0.0
+        variance = np.einsum("...n,nm,...m->...", S, covariance, S, optimize=True)
+        touched = np.any(S[..., lost] != 0.0, axis=-1)
+        return np.asarray(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
 
     def mode_parameters(self, i: int = 0) -> FloatArray:
         """(m,): the parameters of the mode number i (from 0)."""
@@ -190,6 +243,7 @@ class Result:
             "condition_number": _to_json(self.condition_number),
             "history": [{k: _to_json(v) for k, v in vars(s).items()} for s in self.history],
             "timings_s": dict(self.timings_s),
+            "residual_correlation": _to_json(self.residual_correlation),
             "grid": vars(self.grid),
             "ansatz": ansatz_to_dict(self.ansatz),
             "inverse": [[_to_json(float(v)) for v in row] for row in self.inverse],
@@ -222,6 +276,7 @@ class Result:
                 condition_number=_from_json(content["condition_number"]),
                 history=tuple(Iteration(**step) for step in steps),
                 timings_s=content["timings_s"],
+                residual_correlation=content["residual_correlation"] or np.nan,
             )
         except InputError:
             raise
@@ -232,8 +287,8 @@ class Result:
 
 
 def _to_json(value: Any) -> Any:
-    """Null for infinity, which JSON doesn't know."""
-    return None if value == np.inf else value
+    """Null for infinity and NaN, which JSON doesn't know."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _from_json(value: Any) -> Any:

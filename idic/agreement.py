@@ -1,0 +1,151 @@
+"""Whether what a correlation leaves over is noise, or a displacement that the ansatz lacks.
+
+Noise has no correlation from one pixel to another a few pixels off; a displacement that is left
+over shows the speckle's own gradient, which is correlated over a speckle. So the residual's
+autocorrelation tells the two apart without knowing how large the noise is; where that is known,
+chi squared tells, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.imaging.interpolation import SplineImage
+
+LAGS_PX = (4, 6, 8, 10, 12)
+"""Beyond what the spline itself correlates (0.43 per px), within a speckle of 10 px."""
+_WHITE = 0.02
+"""Rms autocorrelation up to which a residual counts as noise, besides its own scatter."""
+_SIGMAS, _MODEL = 4.0, 0.03
+"""Chi squared may be off by 4 standard deviations and by 3 %: the noise that the spline passes
+is known as a mean over all positions between pixels."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The residual against the noise that the images are said to have.
+
+    Parameters
+    ----------
+    correlation
+        Rms autocorrelation of the residual at ``LAGS_PX`` along rows and columns [-].
+    pixels
+        In the residual.
+    chi_square
+        Sum of squares of the residual over what the noise predicts; 1 is agreement [-]. NaN
+        where the noise is not known.
+    """
+
+    correlation: float
+    pixels: int
+    chi_square: float = float("nan")
+
+    @classmethod
+    def of(
+        cls,
+        residual_rms: float,
+        correlation: float,
+        pixels: int,
+        unknowns: int,
+        noise_sd: float | None = None,
+        noisy_images: int = 2,
+        order: int = 5,
+    ) -> Agreement:
+        """Judge a residual.
+
+        Parameters
+        ----------
+        residual_rms, correlation, pixels
+            Of the residual: rms [grey levels], :func:`autocorrelation`, number of pixels.
+        unknowns
+            Number of fitted unknowns.
+        noise_sd
+            Standard deviation of the white noise in an image [grey levels], if known.
+        noisy_images
+            2 if both images are noisy, 1 if only the reference is.
+        order
+            Of the spline, which smooths the deformed image's noise.
+
+        Raises
+        ------
+        InputError
+            If the noise is not positive.
+        """
+        if noise_sd is None:
+            return cls(correlation, pixels)
+        if not noise_sd > 0 or noisy_images not in (1, 2):
+            raise InputError(
+                "expected a noise of more than 0 grey levels in 1 or 2 images, got "
+                f"{noise_sd} in {noisy_images}"
+            )
+        passed = spline_noise(order) if noisy_images == 2 else 0.0
+        freedom = max(1, pixels - unknowns)
+        return cls(
+            correlation, pixels, residual_rms**2 * pixels / freedom / noise_sd**2 / (1.0 + passed)
+        )
+
+    @property
+    def is_white(self) -> bool:
+        """Whether neighbouring pixels' residuals have nothing to do with each other."""
+        return bool(self.correlation < _WHITE + _SIGMAS / np.sqrt(max(1, self.pixels)))
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether chi squared is 1 within its scatter; True where the noise is not known."""
+        reach = _SIGMAS * np.sqrt(2.0 / max(1, self.pixels)) + _MODEL
+        return bool(np.isnan(self.chi_square) or abs(self.chi_square - 1.0) < reach)
+
+    @property
+    def sentence(self) -> str:
+        """What that means."""
+        known = "" if np.isnan(self.chi_square) else f"chi squared is {self.chi_square:.3g}, and "
+        if self.is_white and self.is_predicted:
+            return f"The residual is noise: {known}it is uncorrelated ({self.correlation:.3f})."
+        if self.is_white:
+            return (
+                f"The residual is uncorrelated, but chi squared is {self.chi_square:.3g}: the "
+                "noise is not what it is said to be."
+            )
+        return (
+            f"The residual is not noise: {known}its autocorrelation over 4 to 12 px is "
+            f"{self.correlation:.2f}. The displacement has parts that the ansatz can't describe; "
+            "the standard errors don't include them."
+        )
+
+
+def spline_noise(order: int) -> float:
+    """Variance of interpolated white noise of variance 1, over all positions between pixels."""
+    impulse = np.zeros((41, 41))
+    impulse[20, 20] = 1.0
+    fine = 16
+    along = np.arange(fine * 32 + 1)[:-1] / fine + 4.0
+    weights, _, _ = SplineImage.of(impulse, order, np.float64).sample(20.0, along)
+    return float(((weights**2).sum() / fine) ** 2)
+
+
+def autocorrelation(residual: NDArray[Any]) -> float:
+    """Rms autocorrelation of a residual at ``LAGS_PX`` along rows and columns [-].
+
+    Parameters
+    ----------
+    residual
+        (rows, cols) f - g(x + u), NaN where no pixel counts.
+    """
+    used = np.isfinite(residual)
+    zeroed = np.where(used, residual, np.float32(0.0))
+    variance = float(np.vdot(zeroed, zeroed)) / max(1, int(used.sum()))
+    if variance == 0.0:
+        return 0.0
+    found = []
+    for values, counts in ((zeroed, used), (zeroed.T, used.T)):
+        for lag in LAGS_PX:
+            pairs = int(np.count_nonzero(counts[lag:] & counts[:-lag]))
+            if pairs:
+                product = np.einsum("ij,ij->", values[lag:], values[:-lag], dtype=np.float64)
+                found.append(float(product) / pairs / variance)
+    return float(np.sqrt(np.mean(np.square(found)))) if found else 0.0

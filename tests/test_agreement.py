@@ -1,0 +1,158 @@
+"""What a correlation says about itself: noise or not, what is determined, how exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import manufactured
+import numpy as np
+import pytest
+from filling_mode import MASK, STRAIN, case
+from manufactured import GRID
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.agreement import Agreement, autocorrelation, spline_noise
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.result import Result
+from modeharvest.imaging.interpolation import SplineImage
+
+FloatArray = NDArray[np.float64]
+
+NOISE = 0.02
+
+
+@cache
+def noisy(v0_degree: int = 5) -> Result:
+    """White noise in both images; a v0 of lower degree than the truth's lacks a part of it."""
+    ansatz, _, f, g = case()
+    ansatz = replace(ansatz, v0_degree=v0_degree)
+    noise = NOISE * np.random.default_rng(5).normal(size=(2, *GRID.shape))
+    return correlate(f + noise[0], g + noise[1], GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+
+
+def test_noise_is_recognised_and_chi_squared_is_one() -> None:
+    judged = noisy().agreement(NOISE)
+    assert judged.is_white
+    assert judged.is_predicted
+    assert judged.chi_square == pytest.approx(1.0, abs=0.03)
+    assert "is noise" in judged.sentence
+
+
+def test_a_wrong_noise_is_recognised() -> None:
+    judged = noisy().agreement(1.3 * NOISE)
+    assert judged.is_white
+    assert not judged.is_predicted
+    assert "not what it is said to be" in judged.sentence
+
+
+def test_a_displacement_that_the_ansatz_lacks_is_recognised_without_knowing_the_noise() -> None:
+    judged = noisy(1).agreement()
+    assert not judged.is_white
+    assert "not noise" in judged.sentence
+    assert np.isnan(judged.chi_square)
+
+
+@pytest.mark.parametrize("order", [3, 5])
+def test_noise_that_a_spline_passes_against_sampling_noise(order: int) -> None:
+    rng = np.random.default_rng(1)
+    image = rng.normal(size=(400, 400))
+    at = rng.uniform(5, 394, size=(2, 200_000))
+    sampled, _, _ = SplineImage.of(image, order, np.float64).sample(*at)
+    # 160 000 independent pixels: the variance scatters by sqrt(2/160 000) = 0.35 %.
+    assert spline_noise(order) == pytest.approx(sampled.var(), rel=0.015)
+    assert spline_noise(3) < spline_noise(5) < 1.0
+
+
+def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:
+    rng = np.random.default_rng(2)
+    white = rng.normal(size=(300, 300))
+    white[40:80] = np.nan
+    assert autocorrelation(white) < 4 / 300
+    # A wave of 24 px along the rows: cos(2 pi lag / 24) along it, 1 across.
+    wave = np.cos(2 * np.pi * np.arange(2400) / 24)[:, None] * np.ones(480)
+    lags = np.cos(2 * np.pi * np.array([4, 6, 8, 10, 12]) / 24)
+    expected = np.sqrt(np.mean([*(lags**2), *np.ones(5)]))
+    assert autocorrelation(wave) == pytest.approx(expected, rel=2e-3)
+    assert autocorrelation(np.zeros((20, 20))) == 0.0
+
+
+def test_bad_noise() -> None:
+    with pytest.raises(InputError, match="more than 0 grey levels"):
+        Agreement.of(0.1, 0.0, 100, 3, noise_sd=0.0)
+
+
+def test_standard_deviation_of_the_displacement_is_the_covariance_through_the_sensitivities() -> (
+    None
+):
+    result = noisy()
+    sd = result.displacement_sd(GRID.x[::40], GRID.y[::40], NOISE)
+    S = result.ansatz.sensitivities(result.unknowns, GRID.x[None, ::40], GRID.y[::40, None])
+    half = np.linalg.cholesky(result.covariance(NOISE))
+    np.testing.assert_allclose(sd, np.linalg.norm(S @ half, axis=-1), rtol=1e-6)
+
+
+def test_a_strong_mode_is_observable() -> None:
+    result = noisy()
+    seen = identifiability(result, MASK)
+    assert seen.unobservable == ()
+    assert seen.warnings == ()
+    # Over 2.6 cells a polynomial of degree 5 follows the waves closely, one of degree 1 can't.
+    low = identifiability(noisy(1), MASK)
+    assert 0 < low.overlap[0] < 0.9 < seen.overlap[0] < 1
+    u = result.fluctuation()[MASK] / GRID.pixel_size
+    assert seen.amplitude_px[0] == pytest.approx(np.sqrt((u**2).mean()), rel=0.05)
+    # The leftover is the residual over the gradient of the noisy image, at any positions.
+    g = case()[3] + NOISE * np.random.default_rng(5).normal(size=(2, *GRID.shape))[1]
+    rows, cols = np.nonzero(MASK)
+    moved = np.random.default_rng(6).uniform(-0.5, 0.5, size=(2, rows.size))
+    _, d_row, d_col = SplineImage.of(g).sample(rows + moved[0], cols + moved[1])
+    per_px = np.sqrt((d_row**2 + d_col**2).mean())
+    assert seen.leftover_px == pytest.approx(result.residual_rms / per_px, rel=0.05)
+
+
+def test_worst_combination_is_an_eigenvector_of_the_scaled_matrix() -> None:
+    result = noisy()
+    worst = identifiability(result, MASK).worst[0]
+    assert worst.eigenvalue * result.condition_number < result.ansatz.size
+    assert len(worst.terms) == 3
+    assert all(name in result.names for name, _ in worst.terms)
+    assert "eigenvalue" in str(worst)
+
+
+def test_without_a_pattern_the_mode_is_said_to_be_unobservable() -> None:
+    """A smooth displacement that the ansatz lacks a part of, as before buckling."""
+    ansatz = manufactured.one_mode()
+    cubic = Ansatz(ansatz.domain, v0_degree=3)
+    truth = cubic.start(0.03)
+    truth += 0.004 * np.random.default_rng(3).normal(size=cubic.size)
+    f, g = manufactured.image_pair(manufactured.speckle(), cubic, truth)
+    low = replace(ansatz, v0_degree=1, v_degree=0)
+    mask = manufactured.inner_mask(0.1)
+    result = correlate(f, g, GRID, low, low.start(0.03, 0.1), mask)
+    seen = identifiability(result, mask)
+    assert seen.unobservable == (0,)
+    assert "phi1 is not observable" in seen.warnings[0]
+
+
+def test_unknowns_without_information_are_named() -> None:
+    ansatz = case()[0]
+    a = ansatz.start(STRAIN, 0.0)  # v1 = 0: phi1 has no effect
+    still = replace(noisy(), unknowns=a)
+    inverse = still.inverse.copy()
+    lost = np.arange(ansatz.size)[ansatz.phi_slice(0)]
+    inverse[lost, :] = inverse[:, lost] = 0.0
+    inverse[lost, lost] = np.inf
+    still = replace(still, inverse=inverse)
+    seen = identifiability(still, MASK)
+    assert seen.undetermined == still.names[-7:]
+    assert "nothing about 7 unknowns: phi1.a1" in seen.warnings[-1]
+    assert np.isfinite(still.displacement_sd(GRID.x[::80], GRID.y[::80])).all()  # v1 is 0 there
+
+
+def test_mask_of_another_size() -> None:
+    with pytest.raises(InputError, match="some material"):
+        identifiability(noisy(), np.zeros((3, 3), dtype=bool))
