@@ -2,147 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from modeharvest.fem.field import Mesh
-from modeharvest.fem.modes import Branch, ModeSet, Wave
 from modeharvest.files import atomic
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.page import render
+from modeharvest.validation import lattice_words as words
+from modeharvest.validation.lattice_run import SHAPE, CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.validation.page import render, short
 from modeharvest.validation.patch import Patch
-from modeharvest.validation.plots_lattice import draw_lattice
+from modeharvest.validation.plots_branches import (
+    combination_name,
+    draw_amplitudes,
+    draw_captured,
+    draw_critical_strains,
+    draw_energies,
+    draw_overlaps,
+)
+from modeharvest.validation.plots_lattice import draw_growth, draw_lattice, draw_overlay
+from modeharvest.validation.plots_waves import draw_dispersion, draw_lattice_spectrum, draw_zone_map
+from modeharvest.validation.report import Picture
 from modeharvest.validation.style import to_svg
 
-if TYPE_CHECKING:  # its module needs dolfinx
-    from modeharvest.fem.bloch_critical import LatticeCritical
-
-FloatArray = NDArray[np.float64]
+__all__ = ["CriticalPoint", "FoundPattern", "LatticeRun", "write_lattice_report"]
 
 TEMPLATE = "lattice_report.html"
 CELLS = 4
 """Unit cells along the side of a picture's window."""
-
-
-@dataclass(frozen=True)
-class CriticalPoint:
-    """What ``LatticeCritical`` says, in plain values: where a lattice first becomes unstable.
-
-    Parameters
-    ----------
-    loading
-        Its name, e.g. "uniaxial".
-    load
-        Critical load [-]; without one, the largest at which the lattice was found stable.
-    found
-        Whether there is a critical point up to there.
-    outcome
-        In words.
-    waves
-        Phases (k . a1, k . a2) of the critical waves [rad]; empty for long waves.
-    below, above
-        Negative eigenvalues at each of them a millionth of the load below and above.
-    earlier
-        Waves of the grid that are unstable already below.
-    value
-        Lowest measure filling · λ / k² at ``load`` [MPa].
-    angle
-        Direction of long waves [rad]; None for others.
-    """
-
-    loading: str
-    load: float
-    found: bool
-    outcome: str
-    waves: tuple[Wave, ...] = ()
-    below: tuple[int, ...] = ()
-    above: tuple[int, ...] = ()
-    earlier: tuple[Wave, ...] = ()
-    value: float = 0.0
-    angle: float | None = None
-
-    @classmethod
-    def of(cls, loading: str, found: LatticeCritical) -> CriticalPoint:
-        """Take the plain values of a search's result."""
-        least = found.least
-        return cls(loading, found.load, found.found, found.outcome, found.waves, found.below,
-                   found.above, found.earlier, least.value, least.angle)  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class LatticeRun:
-    """All that the report of a lattice shows; what is None or empty is left out.
-
-    Parameters
-    ----------
-    title
-        Of the page.
-    case
-        What was run, as plain values.
-    command
-        That makes this page again.
-    mesh, lattice
-        Primitive cell [mm], and its (2, 2) lattice vectors as rows [mm].
-    pitch
-        Unit cell size l [mm].
-    critical
-        First critical points, one for each loading.
-    dispersion
-        :class:`modeharvest.fem.dispersion.Dispersion`.
-    modes, branches
-        At the critical point, and what leaves there.
-    spectrum
-        :class:`modeharvest.idic.lattice_spectrum.LatticeSpectrum` of the pattern.
-    family
-        :class:`modeharvest.idic.automatic.FoundFamily` of it.
-    study
-        :class:`modeharvest.validation.independence.ModeStudy`.
-    exports
-        Files beside the page, and what each holds.
-    notes
-        What a reader should know before trusting the numbers.
-    timings, versions
-        Stage to seconds [s]; software to version.
-    """
-
-    title: str
-    case: Mapping[str, Any]
-    command: str
-    mesh: Mesh
-    lattice: FloatArray
-    pitch: float
-    critical: Sequence[CriticalPoint] = ()
-    dispersion: Any = None
-    modes: ModeSet | None = None
-    branches: Sequence[Branch] = ()
-    spectrum: Any = None
-    family: Any = None
-    study: Any = None
-    exports: Mapping[str, str] = field(default_factory=dict)
-    notes: Sequence[str] = ()
-    timings: Mapping[str, float] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture in the page: anchor, what is written above it, the picture, a line below it."""
-
-    id: str
-    label: str
-    svg: str
-    fact: str = ""
-
-    @classmethod
-    def of(cls, id: str, label: str, drawn: Figure, fact: str = "") -> Picture:
-        """Turn a figure into a picture."""
-        return cls(id, label, to_svg(drawn, id, label), fact)
 
 
 def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress = silent) -> None:
@@ -157,14 +46,127 @@ def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress =
     progress
         Listener.
     """
-    page = render(TEMPLATE, title=run.title, run=run, cells=_cells(run))
+    parts = [_hero, _reference, _patterns, _dispersion, _modes, _branches, _study]
+    content: dict[str, Any] = {}
+    for n, part in enumerate(parts):
+        progress(n, len(parts), "report")
+        content[part.__name__.removeprefix("_")] = part(run)
+    page = render(TEMPLATE, title=run.title, run=run, words=words, **content)
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
     progress(1, 1, "report")
 
 
-def _cells(run: LatticeRun) -> list[Picture]:
-    """The lattice before and after."""
-    side = CELLS * run.pitch
-    still = Patch.of(run.mesh, run.lattice, (side, side))
-    return [Picture.of("reference", "Reference", draw_lattice(still, run.pitch))]
+def _picture(name: str, label: str, drawn: Figure, fact: str = "") -> Picture:
+    return Picture(name, label, to_svg(drawn, name, label), fact)
+
+
+def _window(run: LatticeRun, width: float, height: float) -> Patch:
+    """Cells of the modes where there are some, primitive ones otherwise [l]."""
+    mesh, lattice = run.mesh, run.lattice
+    if run.modes is not None:
+        mesh, lattice = run.modes.mesh, run.modes.lattice
+    return Patch.of(mesh, lattice, (width * run.pitch, height * run.pitch))
+
+
+def _hero(run: LatticeRun) -> str:
+    if run.modes is None:
+        drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch)
+    else:
+        shape = run.modes.shapes[0]
+        if run.patterns:
+            first = run.patterns[0]
+            shape = first.displacement - run.modes.mesh.nodes @ (first.gradient - np.eye(2)).T
+        drawn = draw_growth(_window(run, 7.0, 5.6), shape, SHAPE * run.pitch, run.pitch)
+    return to_svg(drawn, "hero", "The lattice and its pattern")
+
+
+def _reference(run: LatticeRun) -> Picture:
+    drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch)
+    return _picture("reference", "Reference", drawn, "dashed: the cell that repeats")
+
+
+def _patterns(run: LatticeRun) -> list[dict[str, Any]]:
+    """For each pattern the deformed lattice and both densities, and its family."""
+    shown = []
+    for n, found in enumerate(run.patterns, start=1):
+        spectrum = found.spectrum
+        largest = float(max(spectrum.S_xx.max(), spectrum.S_yy.max()))
+        still = _window(run, CELLS, CELLS)
+        deformed = draw_lattice(still, run.pitch, found.displacement, found.gradient)
+        xx, yy = (draw_lattice_spectrum(spectrum.xi, S, largest)
+                  for S in (spectrum.S_xx, spectrum.S_yy))  # fmt: skip
+        shown.append({
+            "found": found,
+            "waves": found.family.waves,
+            "pictures": [
+                _picture(f"deformed-{n}", "Deformed", deformed, found.remark),
+                _picture(f"Sxx-{n}", "S_xx", xx, f"0 dB = {short(largest)} mm⁶"),
+                _picture(f"Syy-{n}", "S_yy", yy, f"0 dB = {short(largest)} mm⁶"),
+            ],
+        })  # fmt: skip
+    return shown
+
+
+def _dispersion(run: LatticeRun) -> dict[str, Any]:
+    """The path's curves and the zone's maps."""
+    found = run.dispersion
+    if found is None:
+        return {}
+    waves = [wave for point in run.critical for wave in point.waves]
+    return {
+        "path": _picture("dispersion-path", "Along a path", draw_dispersion(found, waves)),
+        "maps": [
+            _picture(f"zone-{n}", f"At {100 * part.load:.4g} %",
+                     draw_zone_map(part, run.pitch, waves))
+            for n, part in enumerate(found.zone, start=1)
+        ],
+    }  # fmt: skip
+
+
+def _modes(run: LatticeRun) -> list[Picture]:
+    """Every mode of the set upon the undeformed lattice."""
+    modes = run.modes
+    if modes is None:
+        return []
+    still, pictures = _window(run, CELLS, CELLS), []
+    for k, (wave, value) in enumerate(zip(modes.waves, modes.eigenvalues, strict=True)):
+        shape = modes.shapes[k]
+        u = SHAPE * run.pitch / float(np.linalg.norm(shape, axis=1).max()) * shape
+        name = combination_name([float(j == k) for j in range(len(modes.waves))])
+        label = f"{name} · wave {words.wave_name(wave)}"
+        fact = f"eigenvalue {short(float(value))} N/mm⁴"
+        pictures.append(_picture(f"mode-{k + 1}", label, draw_lattice(still, run.pitch, u), fact))
+    return pictures
+
+
+def _branches(run: LatticeRun) -> list[Picture]:
+    followed = [branch for branch in run.branches if branch.states]
+    if not followed or run.modes is None:
+        return []
+    critical = run.modes.load
+    return [
+        _picture("energies", "Energy", draw_energies(followed, critical)),
+        _picture("amplitudes", "Amplitude", draw_amplitudes(followed, critical)),
+    ]
+
+
+def _study(run: LatticeRun) -> dict[str, Any]:
+    """Curves and overlays of a study."""
+    study = run.study
+    if study is None:
+        return {}
+    curves = [
+        _picture("strains", "Critical strain", draw_critical_strains(study.ratios)),
+        _picture("overlaps", "Overlap with Eq. (mode)", draw_overlaps(study.ratios)),
+        _picture("captured", "Energy captured", draw_captured(study.ratios)),
+    ]
+    overlays = [
+        _picture(f"overlay-{n}", f"d/l = {mode.row.ratio:.4g}",
+                 draw_overlay(mode.mesh, mode.row.pitch, mode.shape, mode.analytic,
+                              SHAPE * mode.row.pitch),
+                 f"overlap {mode.row.overlap:.4f}; {mode.row.loading}, state at "
+                 f"{100 * mode.row.state:.4g} %")
+        for n, mode in enumerate(study.overlays, start=1)
+    ]  # fmt: skip
+    return {"curves": curves if study.ratios else [], "overlays": overlays}

@@ -48,7 +48,12 @@ def draw_energies(branches: Sequence[Branch], critical: float | None) -> Figure:
 
 def draw_amplitudes(branches: Sequence[Branch], critical: float | None) -> Figure:
     """Draw the size of the critical modes' amplitudes along each branch."""
-    return _branches(branches, critical, "amplitude, rms over the material [mm]", _size)
+    drawn = _branches(branches, critical, "amplitude, rms over the material [mm]", _size)
+    axes = drawn.axes[0]
+    for n, branch in enumerate(b for b in branches if b.states):
+        amplitude, load = branch.curve.T
+        axes.plot(100.0 * load, amplitude, color=_COLOURS[n % len(_COLOURS)], lw=0.9, alpha=0.6)
+    return drawn
 
 
 def _excess(branch: Branch) -> list[float]:
