@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattices import UnitCell
 from modeharvest.fem.meshing import gmsh_options, quiet_gmsh
 from modeharvest.fem.triangles import sound_t6
@@ -188,7 +189,8 @@ def _translates(
 ) -> list[tuple[int, int, FloatArray]]:
     """Pairs of curves, the second being the first moved by a vector; each is in one pair."""
     near = 1e-6 * float(np.linalg.norm(lattice, axis=1).min())
-    found, paired = [], set()
+    found: list[tuple[int, int, FloatArray]] = []
+    paired: set[int] = set()
     for shift in np.array([[1, 0], [0, 1], [1, 1], [-1, 1]]) @ lattice:
         for a, start in enumerate(outline):
             for b, end in enumerate(outline):
@@ -239,10 +241,24 @@ def _unit_cell(
         )
     try:
         mesh = sound_t6(points, cells[kinds[0]])
+        if lattice is None:
+            _refuse_unless_rectangular(mesh)
         return UnitCell(mesh, _lattice(lattice, mesh.nodes))
     except InputError as error:
-        taken = "; no lattice vectors given: those of a rectangular cell were tried"
-        raise InputError(f"{source}: {error}{taken if lattice is None else ''}") from error
+        raise InputError(f"{source}: {error}") from error
+
+
+def _refuse_unless_rectangular(mesh: Mesh) -> None:
+    """On each side of the rectangle around a mesh there must lie sides of elements."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    middles = mesh.nodes[np.unique(mesh.cells[:, 3:])]
+    near = 1e-6 * (high - low).min()
+    gaps = [np.abs(middles - bound).min(axis=0) for bound in (low, high)]
+    if np.max(gaps) > near:
+        raise InputError(
+            f"expected lattice vectors, because the cell does not fill a rectangle of "
+            f"{high[0] - low[0]:.5g} x {high[1] - low[1]:.5g} mm along x and y; give them as two rows"
+        )
 
 
 def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:

@@ -173,18 +173,13 @@ def _chunks(numbers: IntArray, size: int) -> Iterator[IntArray]:
 
 
 def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
-    """The lattice must be one body that holds together along both lattice vectors.
-
-    What holds are common sides, known by their middles; a common corner alone is a hinge.
-    """
-    middles = mesh.cells[:, 3:]
-    piece = _pieces(found.master[middles], found.count)[found.master[middles[:, 0]]]
-    largest = np.argmax(np.bincount(piece))
-    if (piece != largest).any():
-        loose = np.unique(mesh.cells[piece != largest])
+    """The lattice must be one body that holds together along both lattice vectors."""
+    piece = _pieces(found.master[mesh.cells], found.count)[found.master]
+    if piece.max() > 0:
+        largest = np.argmax(np.bincount(piece))
         raise InputError(
             "periodic cell: expected one body, got parts that nothing holds: "
-            f"{_named(loose, mesh.nodes)}; connect or remove them"
+            f"{_named(np.flatnonzero(piece != largest), mesh.nodes)}; connect or remove them"
         )
     shifts = _cycle_shifts(mesh, found)
     rank = np.linalg.matrix_rank(shifts) if len(shifts) else 0
@@ -206,13 +201,11 @@ def _pieces(cells: IntArray, count: int) -> IntArray:
 
 
 def _cycle_shifts(mesh: Mesh, found: Periodicity) -> IntArray:
-    """(p, 2) differing shifts of mid-sides that are the same master and in the same piece."""
-    middles = np.unique(mesh.cells[:, 3:])
-    piece = _pieces(mesh.cells[:, 3:], len(mesh.nodes))[middles]
-    master, shift = found.master[middles], found.shift[middles]
-    order = np.lexsort((piece, master))
-    same = (np.diff(master[order]) == 0) & (np.diff(piece[order]) == 0)
-    return np.asarray(np.unique(np.diff(shift[order], axis=0)[same], axis=0))
+    """(p, 2) differing shifts of nodes that are the same master and in the same piece."""
+    piece = _pieces(mesh.cells, len(mesh.nodes))
+    order = np.lexsort((piece, found.master))
+    same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
+    return np.asarray(np.unique(np.diff(found.shift[order], axis=0)[same], axis=0))
 
 
 def _named(numbers: IntArray, nodes: FloatArray, most: int = 4) -> str:

@@ -68,7 +68,9 @@ def test_a_mesh_comes_back_from_any_format(suffix: str, tmp_path: Path) -> None:
 def test_a_rectangular_cell_needs_no_lattice_vectors(tmp_path: Path) -> None:
     cell = read_cell(written(tmp_path / "cell.vtu", SQUARE.mesh))
     assert np.allclose(cell.lattice, SQUARE.lattice, atol=1e-12)
-    with pytest.raises(InputError, match="those of a rectangular cell were tried"):
+    with pytest.raises(
+        InputError, match=r"expected lattice vectors.* rectangle of 1.386 x 1.6\d+ mm"
+    ):
         read_cell(written(tmp_path / "hexagon.vtu", HEXAGONAL.mesh))
 
 
@@ -172,7 +174,7 @@ def test_named_surfaces_are_the_material(live: None, tmp_path: Path) -> None:
 
 
 def test_without_gmsh_running_there_is_no_live_model() -> None:
-    with pytest.raises(InputError, match="got none: call gmsh.initialize"):
+    with pytest.raises(InputError, match="got none: call"):
         cell_from_gmsh()
 
 
