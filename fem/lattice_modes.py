@@ -130,13 +130,13 @@ def _distinct(turns: Sequence[Turns]) -> list[Turns]:
 
 
 def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
-    """The lowest eigenvalue at one wave with all of its eigenvectors, in a basis of its own."""
+    """The lowest eigenvalue at one wave with all of its eigenvectors."""
     found = bloch.lowest(wave, _MULTIPLICITY)
     cell = bloch.cell
     scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
     values = found.eigenvalues
     count = int(np.sum(values - values[0] < _DEGENERATE * scale))
-    return BlochModes(wave, values[:count], canonical(found.vectors[:, :count]))
+    return BlochModes(wave, values[:count], found.vectors[:, :count])
 
 
 def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
@@ -172,16 +172,16 @@ def _real_fields(
         @ np.linalg.inv(cell.cell.lattice)
     )
     phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
+    at_nodes = np.stack(
+        [cell.reduction.displacement(vector, modes.wave).ravel() for vector in modes.vectors.T], 1
+    )
     fields: list[FloatArray] = []
-    for vector in modes.vectors.T:
-        at_nodes = math.sqrt(material) * cell.reduction.displacement(vector, modes.wave)
+    for field in math.sqrt(material) * canonical(at_nodes).T:
         whole = np.empty((len(enlarged.mesh.nodes), 2), dtype=np.complex128)
         for place, phase in zip(places, phases, strict=True):
-            whole[place] = phase * at_nodes
-        is_real = np.isrealobj(modes.vectors)
-        fields += (
-            [whole.real]
-            if is_real
-            else [math.sqrt(2.0) * part for part in (whole.real, whole.imag)]
-        )
+            whole[place] = phase * field.reshape(-1, 2)
+        if np.isrealobj(modes.vectors):
+            fields.append(whole.real)
+        else:
+            fields += [math.sqrt(2.0) * whole.real, math.sqrt(2.0) * whole.imag]
     return np.stack(fields)
