@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.constraints import (
+    SAME_AMPLITUDE,
     SAME_PHASE,
     RealWave,
     Tie,
@@ -138,36 +139,41 @@ def mode_family(
 
 def _family(waves: list[RealWave], ties: list[Tie], pitch: float, shared: bool) -> ModeFamily:
     count = f"{len(waves)} wave" + "s" * (len(waves) > 1)
+    rows = as_rows(waves, pitch)
+    rows[:, :2] /= np.abs(rows[:, :2]).max()
     if not shared:
-        rows = as_rows(waves, pitch)
-        rows[:, :2] /= np.abs(rows[:, :2]).max()
         return free_family(rows, f"{count}, free")
-    tied = tied_family(count, waves, ties, pitch)
-    return as_square(tied, pitch) or tied
+    return as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
 
 
-def as_square(family: ModeFamily, pitch: float) -> ModeFamily | None:
-    """The same field as the paper's Eq. (mode), if two waves of a family are that; else None.
+def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
+    """The paper's Eq. (mode) with these two waves as its start, if it has them; else None.
 
-    Two waves near the two diagonals, |A| equal, |B| equal, and the product of the signs of A and
-    of B opposite. Turned and shifted (:mod:`modeharvest.idic.equivalents`) to whichever of the two
-    starts is nearer: the origin at a junction, or at a hole's centre.
+    Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component
+    and opposite in the other. Turned and shifted (:mod:`modeharvest.idic.equivalents`) to
+    whichever of the paper's starts is nearer: the origin at a junction, or at a hole's centre.
+
+    Parameters
+    ----------
+    waves
+        (w, 5) A, B, kx, ky [-] and c [mm].
+    pitch
+        l [mm].
     """
-    waves = family.waves(family.start)
-    if len(waves) != 2 or family.size != 7 or np.any(waves[:, :2] == 0):
+    if len(waves) != 2:
         return None
-    k = waves[:, 2:4]
-    diagonal = np.all(np.abs(np.abs(k) - 1.0) <= NEAR_DIAGONAL) and np.prod(np.sign(k)) < 0
-    (a1, b1), (a2, b2) = waves[:, :2]
-    if not diagonal or a1 * a2 * b1 * b2 > 0:
+    amplitudes, k, phases = waves[:, :2], waves[:, 2:4], waves[:, 4].copy()
+    same = SAME_AMPLITUDE * np.linalg.norm(amplitudes, axis=1).max()
+    diagonal = np.all(np.abs(np.abs(k) - 1.0) <= NEAR_DIAGONAL) and k.prod() < 0
+    equal = np.all(np.abs(np.diff(np.abs(amplitudes), axis=0)) <= same)
+    if not (diagonal and equal and amplitudes.prod() < 0):
         return None
-    phases = waves[:, 4].copy()
     # Eq. (mode) has B = 1 and −1; a wave with the other sign is moved by half its length.
-    turn = np.sign([b1, b2]) != (1, -1)
-    phases[turn] += pitch
-    ratio = -(a1 if not turn[0] else -a1) / abs(b1)
-    mode = np.array([ratio, *k[0], *k[1], *phases])
-    return _nearer(mode, pitch)
+    turned = np.sign(amplitudes[:, 1]) != (1, -1)
+    phases[turned] += pitch
+    signs = np.where(turned, -1.0, 1.0)
+    ratio = -(signs @ amplitudes[:, 0]) / np.abs(amplitudes[:, 1]).sum()
+    return _nearer(np.array([ratio, *k[0], *k[1], *phases]), pitch)
 
 
 def _nearer(mode: FloatArray, pitch: float) -> ModeFamily:

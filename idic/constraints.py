@@ -1,17 +1,18 @@
 """What the waves of a field have in common, as a family with few parameters.
 
 Plane waves with complex amplitudes become real ones, A and B sin(π/l (kx x + ky y + c)), and what
-symmetry makes equal among them becomes one parameter:
+symmetry makes equal among them becomes one parameter. A symmetry that turns one wave vector into
+another turns the motion with it, so amplitudes are compared in each wave's own frame: L along its
+wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by +90 degrees.
 
-* Components x and y with a common phase: one wave. Otherwise two waves with the same wave vector,
-  one along x and one along y, each with a phase of its own.
-* |A|, and |B|, equal within a star of waves: one parameter, the signs held.
-* An amplitude of zero is held at zero.
+* L and T with a common phase: one wave. Otherwise two waves with the same wave vector, one of L
+  and one of T, each with a phase of its own.
+* |L|, and |T|, equal within a star of waves: one parameter, the signs held.
+* L or T zero: held at zero.
 * The overall amplitude is held, since v_i carries it.
 
 Wave vectors are free, and so are phases: they make up for a specimen that isn't quite its drawing
-(the paper's a₂ ... a₇). A and B have parameters of their own even where they are equal, as in the
-paper's Eq. (mode): a load along one axis tells them apart.
+(the paper's a₂ ... a₇). The frames stay those of the wave vectors found.
 """
 
 from __future__ import annotations
@@ -41,14 +42,14 @@ POLARISED = 0.1
 
 @dataclass(frozen=True)
 class RealWave:
-    """A wave A and B sin(π/l (k·x + c)) of the field.
+    """A wave (L n + T m) sin(π/l (k·x + c)) of the field.
 
     Parameters
     ----------
     k
         Wave vector [π/l].
     amplitude
-        (A, B) with their signs [unit of the field].
+        (L, T) along n = k/|k| and along m = n turned by +90 degrees, signed [unit of the field].
     phase
         c [l], above −1/2 and up to 1/2; the rest is in the signs.
     star
@@ -64,33 +65,41 @@ class RealWave:
     shares_k: bool = False
 
     @property
+    def frame(self) -> FloatArray:
+        """(2, 2) n and m as rows."""
+        return local_frame(np.array(self.k))
+
+    @property
     def strength(self) -> float:
-        """Length of (A, B) [unit of the field]."""
+        """Length of the amplitude [unit of the field]."""
         return float(np.hypot(*self.amplitude))
 
     @property
+    def row(self) -> FloatArray:
+        """(5,) A, B [unit of the field], kx, ky [-] and c [l]."""
+        return np.array([*(np.array(self.amplitude) @ self.frame), *self.k, self.phase])
+
+    @property
     def polarisation(self) -> str:
-        """How it moves compared with where it points: transverse, longitudinal, or both."""
-        a, b = self.amplitude
-        along = (a * self.k[0] + b * self.k[1]) / (self.strength * np.hypot(*self.k))
-        across = (a * self.k[1] - b * self.k[0]) / (self.strength * np.hypot(*self.k))
-        if abs(along) <= POLARISED:
+        """How it moves compared with where it points: transverse, longitudinal, or mixed."""
+        along, across = np.abs(self.amplitude) / self.strength
+        if along <= POLARISED:
             return "transverse"
-        return "longitudinal" if abs(across) <= POLARISED else "mixed"
+        return "longitudinal" if across <= POLARISED else "mixed"
 
 
 @dataclass(frozen=True)
 class Tie:
-    """Amplitudes of one component that are one parameter, held at zero, or held at the scale.
+    """Amplitudes of one component that are one parameter, or held.
 
     Parameters
     ----------
     component
-        0 for A (along x), 1 for B (along y).
+        0 for L, along the wave vector, 1 for T, across.
     waves
         Numbers of the waves, from 0.
     value
-        Their common magnitude [unit of the field].
+        Their common magnitude [unit of the field]; 0: they are held at zero.
     """
 
     component: int
@@ -99,22 +108,30 @@ class Tie:
 
     @property
     def name(self) -> str:
-        """Name of the parameter, such as "A1" or "A1,2"."""
-        return "AB"[self.component] + ",".join(str(w + 1) for w in self.waves)
+        """Name of the parameter, such as "T1" or "T1,2"."""
+        return "LT"[self.component] + ",".join(str(w + 1) for w in self.waves)
+
+
+def local_frame(vector: FloatArray) -> FloatArray:
+    """(2, 2) rows: the direction of a vector, and that turned by +90 degrees."""
+    x, y = vector / np.linalg.norm(vector)
+    return np.array([[x, y], [-y, x]])
 
 
 def real_waves(selection: Selection) -> list[RealWave]:
     """Turn complex amplitudes into real waves, one each or two."""
     waves: list[RealWave] = []
-    for xi, z, star in zip(selection.xi, selection.amplitudes, selection.star, strict=True):
+    for xi, cartesian, star in zip(selection.xi, selection.amplitudes, selection.star, strict=True):
+        z = local_frame(xi) @ cartesian
         angle = 0.5 * float(np.angle(np.sum(z**2)))
         turned = z * np.exp(-1j * angle)
         if np.linalg.norm(turned.imag) <= IN_PHASE * np.linalg.norm(turned):
             waves.append(_real_wave(xi, turned.real, angle, star))
             continue
-        for axis in (0, 1):
-            alone = np.where(np.arange(2) == axis, np.abs(z), 0.0)
-            waves.append(_real_wave(xi, alone, float(np.angle(z[axis])), star, axis == 1))
+        for component in (0, 1):
+            alone = np.where(np.arange(2) == component, np.abs(z), 0.0)
+            angle = float(np.angle(z[component]))
+            waves.append(_real_wave(xi, alone, angle, star, component == 1))
     return waves
 
 
@@ -124,42 +141,37 @@ def _real_wave(
     """Move the phase between −1/2 and 1/2 l; what rounding makes of 0 and 1/2 is the same."""
     phase = round(angle / np.pi, 12)
     turns = np.ceil(phase - 0.5 - 1e-9)
-    a, b = amplitude * (-1.0) ** turns
+    along, across = amplitude * (-1.0) ** turns
     k = (2.0 * float(xi[0]), 2.0 * float(xi[1]))
-    return RealWave(k, (float(a), float(b)), float(phase - turns) + 0.0, star, shares_k)
+    return RealWave(k, (float(along), float(across)), float(phase - turns) + 0.0, star, shares_k)
 
 
 def find_ties(waves: list[RealWave]) -> list[Tie]:
-    """Amplitudes that are equal within a star, or zero; A before B, strongest star first."""
+    """Amplitudes that are equal within a star, or zero: T before L, strongest star first."""
     ties = []
-    for component in (0, 1):
-        for star in dict.fromkeys(w.star for w in waves):
-            members = [k for k, w in enumerate(waves) if w.star == star]
-            tolerance = SAME_AMPLITUDE * max(waves[k].strength for k in members)
+    for star in dict.fromkeys(w.star for w in waves):
+        members = [k for k, w in enumerate(waves) if w.star == star]
+        tolerance = SAME_AMPLITUDE * max(waves[k].strength for k in members)
+        for component in (1, 0):
             sizes = {k: abs(waves[k].amplitude[component]) for k in members}
             ties += _clustered(component, sizes, tolerance)
     return ties
 
 
 def _clustered(component: int, sizes: dict[int, float], tolerance: float) -> list[Tie]:
-    ties: list[Tie] = []
-    left = dict(sizes)
+    zero = tuple(k for k, size in sizes.items() if size <= tolerance)
+    ties = [Tie(component, zero, 0.0)] if zero else []
+    left = {k: size for k, size in sizes.items() if size > tolerance}
     while left:
         first = next(iter(left.values()))
-        same = [k for k, size in left.items() if abs(size - first) <= tolerance]
-        value = float(np.mean([left.pop(k) for k in same]))
-        ties.append(Tie(component, tuple(same), 0.0 if value <= tolerance else value))
+        same = tuple(k for k, size in left.items() if abs(size - first) <= tolerance)
+        ties.append(Tie(component, same, float(np.mean([left.pop(k) for k in same]))))
     return ties
 
 
 def held_tie(ties: list[Tie]) -> Tie:
-    """The amplitudes that are held at ±1: B's first if they are among the larger, else the largest.
-
-    The paper holds B in Eq. (mode). Half the largest is large enough for v_i to carry.
-    """
-    largest = max(ties, key=lambda tie: tie.value)
-    first = next((tie for tie in ties if tie.component == 1 and tie.value > 0), largest)
-    return first if first.value >= 0.5 * largest.value else largest
+    """The amplitudes that are held at ±1: the largest."""
+    return max(ties, key=lambda tie: tie.value)
 
 
 def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
@@ -170,44 +182,50 @@ def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float)
     name
         What to call it.
     waves
-        Of the field, two or more of a star tied.
+        Of the field.
     ties
         From :func:`find_ties`.
     pitch
         l [mm].
     """
-    held = held_tie(ties)
-    unit = np.copysign(held.value, waves[held.waves[0]].amplitude[held.component])
+    rows = PER_WAVE * len(waves)
     columns, start, names, units = [], [], [], []
-    offset = np.zeros(PER_WAVE * len(waves))
-
-    def add(rows: dict[int, float], value: float, called: str, unit_of_it: str = "-") -> None:
-        column = np.zeros(len(offset))
-        column[list(rows)] = list(rows.values())
-        columns.append(column)
-        start.append(value)
-        names.append(called)
-        units.append(unit_of_it)
-
+    held = held_tie(ties)
+    offset = _amplitude_column(held, waves)
     for tie in ties:
-        signs = [np.sign(waves[w].amplitude[tie.component] / unit) for w in tie.waves]
-        rows = {
-            PER_WAVE * w + tie.component: float(sign / signs[0])
-            for w, sign in zip(tie.waves, signs, strict=True)
-            if tie.value > 0
-        }
-        if tie is held:
-            offset[list(rows)] = list(rows.values())
-        elif tie.value > 0:
-            add(rows, float(signs[0] * tie.value / abs(unit)), tie.name)
+        if tie is not held and tie.value > 0:
+            columns.append(_amplitude_column(tie, waves))
+            start.append(tie.value / held.value)
+            names.append(tie.name)
+            units.append("-")
     for first, both in _by_wave_vector(waves):
         for axis in (0, 1):
-            rows = {PER_WAVE * w + 2 + axis: 1.0 for w in both}
-            add(rows, waves[first].k[axis], f"k{'xy'[axis]}{first + 1}")
+            columns.append(_unit_column(rows, [PER_WAVE * w + 2 + axis for w in both]))
+            start.append(waves[first].k[axis])
+            names.append(f"k{'xy'[axis]}{first + 1}")
+            units.append("-")
     for w, wave in enumerate(waves):
-        add({PER_WAVE * w + 4: 1.0}, wave.phase * pitch, f"c{w + 1}", "mm")
+        columns.append(_unit_column(rows, [PER_WAVE * w + 4]))
+        start.append(wave.phase * pitch)
+        names.append(f"c{w + 1}")
+        units.append("mm")
     matrix = np.stack(columns, axis=1)
     return ModeFamily(name, matrix, offset, np.array(start), tuple(names), tuple(units))
+
+
+def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
+    """(5 w,) What a unit of the tied amplitude is, as A and B of each wave, signs included."""
+    column = np.zeros((len(waves), PER_WAVE))
+    for w in tie.waves:
+        sign = np.sign(waves[w].amplitude[tie.component])
+        column[w, :2] = sign * waves[w].frame[tie.component]
+    return column.ravel()
+
+
+def _unit_column(rows: int, ones: list[int]) -> FloatArray:
+    column = np.zeros(rows)
+    column[ones] = 1.0
+    return column
 
 
 def _by_wave_vector(waves: list[RealWave]) -> list[tuple[int, list[int]]]:
@@ -223,4 +241,4 @@ def _by_wave_vector(waves: list[RealWave]) -> list[tuple[int, list[int]]]:
 
 def as_rows(waves: list[RealWave], pitch: float) -> FloatArray:
     """(w, 5) A, B [unit of the field], kx, ky [-], c [mm], nothing tied."""
-    return np.array([[*w.amplitude, *w.k, w.phase * pitch] for w in waves])
+    return np.array([wave.row for wave in waves]) * [1.0, 1.0, 1.0, 1.0, pitch]

@@ -9,6 +9,7 @@ from modeharvest.idic.fourier import ModeFamily
 from modeharvest.idic.selection import Selection
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+_ACROSS = ("along", "across")
 
 
 def describe(
@@ -21,8 +22,7 @@ def describe(
     """Which waves, what they have in common, and how much of the field they are."""
     said = [_stars(waves), _energy(selection, captured)]
     said += _phases(waves)
-    said += _amplitudes(waves, ties) if ties else ["Nothing is tied."]
-    said.append(_family(family))
+    said += [*_amplitudes(waves, ties), _family(family, ties)]
     return tuple(said)
 
 
@@ -61,8 +61,7 @@ def _phases(waves: list[RealWave]) -> list[str]:
         )
     phases = np.array([w.phase for w in waves])
     if np.all(np.abs(phases) <= SAME_PHASE):
-        said.append("All phases are 0 at the origin: turned by half a turn about it, the field is"
-                    " the same.")  # fmt: skip
+        said.append("All phases are 0 at the origin: a half turn about it keeps the field.")
     elif np.all(np.abs(phases - 0.5) <= SAME_PHASE):
         said.append("All phases are l/2 at the origin: a half turn about it reverses the field.")
     else:
@@ -71,28 +70,39 @@ def _phases(waves: list[RealWave]) -> list[str]:
 
 
 def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
-    said, held = [], held_tie(ties)
+    said = []
     for tie in ties:
-        if len(tie.waves) == 1 or tie.value == 0:
-            continue
-        signs = "".join("+-"[waves[w].amplitude[tie.component] < 0] for w in tie.waves)
-        first = signs[0]
-        relative = " ".join("+" if s == first else "−" for s in signs)
-        said.append(
-            f"|{'AB'[tie.component]}| is the same in waves "
-            f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
-            f"signs {relative}: one parameter."
-        )
-    zero = [tie for tie in ties if tie.value == 0 for _ in tie.waves]
-    names = [f"{'AB'[t.component]}{w + 1}" for t in ties if t.value == 0 for w in t.waves]
+        if len(tie.waves) > 1 and tie.value > 0:
+            said.append(
+                f"The amplitude {_ACROSS[tie.component]} the wave vector is the same in waves "
+                f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
+                f"signs {_signs(tie, waves)}."
+            )
+    split = {w for w, wave in enumerate(waves) if wave.shares_k}
+    split |= {w - 1 for w in split}
+    zero = [tie.name for tie in ties if tie.value == 0 and not split & set(tie.waves)]
     if zero:
-        said.append(f"Held at zero: {', '.join(names)}.")
-    said.append(f"Held at ±1, since v carries the amplitude: {held.name}.")
+        said.append(f"Zero within {100 * SAME_AMPLITUDE:.0f} %: {', '.join(zero)}.")
     return said
 
 
-def _family(family: ModeFamily) -> str:
-    start = ", ".join(f"{value:.3g}" for value in np.round(family.start, 3) + 0.0)
-    is_paper = family.name.startswith("square")
-    kind = "Eq. (mode) of the paper" if is_paper else f"Family {family.name!r}"
-    return f"{kind}: {number(family.size, 'parameter')}, start [{start}] ({family.name})."
+def _signs(tie: Tie, waves: list[RealWave]) -> str:
+    """Relative to the first."""
+    values = np.array([waves[w].amplitude[tie.component] for w in tie.waves])
+    return " ".join("+" if value > 0 else "−" for value in values * values[0])
+
+
+def _family(family: ModeFamily, ties: list[Tie]) -> str:
+    free = [name for name in family.names if name[0] not in "kc"]
+    if family.name.startswith("square"):
+        start = ", ".join(f"{value:.3g}" for value in np.round(family.start, 3) + 0.0)
+        return (
+            f"This is Eq. (mode) of the paper ({family.name}): {number(family.size, 'parameter')}, "
+            f"start [{start}]."
+        )
+    names = f" ({', '.join(free)})" if free else ""
+    held = f"; {held_tie(ties).name} is held, since v carries the amplitude" if ties else ""
+    return (
+        f"{number(family.size, 'parameter').capitalize()}: all wave vectors and phases, and "
+        f"{number(len(free), 'amplitude')}{names}{held}."
+    )

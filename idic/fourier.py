@@ -8,7 +8,7 @@ the paper's Eq. (mode) is one of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,6 +86,24 @@ class ModeFamily:
         """(w, 5): A, B, kx, ky [-] and c [mm] of every wave."""
         full = self.matrix @ np.asarray(parameters, dtype=np.float64) + self.offset
         return full.reshape(-1, PER_WAVE)
+
+    def moved(self, shift: ArrayLike) -> ModeFamily:
+        """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
+
+        For a specimen whose origin isn't where the mode was found to have its own.
+
+        Raises
+        ------
+        InputError
+            If the family's phases can't follow.
+        """
+        full = self.waves(self.start)
+        full[:, 4] -= full[:, 2:4] @ np.asarray(shift, dtype=np.float64)
+        wanted = full.ravel() - self.offset
+        start = np.asarray(np.linalg.lstsq(self.matrix, wanted, rcond=None)[0], np.float64)
+        if not np.allclose(self.matrix @ start, wanted, atol=1e-9):
+            raise InputError(f"mode family {self.name!r}: expected free phases, to move the mode")
+        return replace(self, start=start)
 
 
 def square_family(origin: str = "junction") -> ModeFamily:

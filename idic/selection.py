@@ -5,9 +5,9 @@ differ by a vector of the lattice of holes, so a wave shows up at each of those 
 :mod:`modeharvest.idic.waves`). What counts is how much of the field's energy over the material
 the waves explain together, by least squares.
 
-Waves are added as stars: peaks of equal density, which a symmetry of the field turns into each
-other, stay together. The first star is that of the largest peak; from then on the star that
-explains most of what is left is next (orthogonal matching pursuit, Pati, Rezaiifar &
+Waves are added as stars: peaks of equal density and wavelength, which a symmetry of the field may
+turn into each other, stay together. The first star is that of the largest peak; from then on the
+star that explains most of what is left is next (orthogonal matching pursuit, Pati, Rezaiifar &
 Krishnaprasad, 1993, doi 10.1109/ACSSC.1993.342465).
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.lattice_spectrum import LatticeSpectrum
+from modeharvest.idic.lattice_spectrum import LatticePeak, LatticeSpectrum
 from modeharvest.idic.quadrature import Quadrature
 
 FloatArray = NDArray[np.float64]
@@ -31,6 +31,8 @@ what a fit over the holes' gaps can't tell from others only makes it ill-conditi
 SAME_DENSITY = 0.02
 """Relative difference of densities that are called equal, 1 % of the amplitude. Symmetric meshes
 reach 1e-7."""
+SAME_LENGTH = 1e-3
+"""Relative difference of wave numbers that are called equal: for lattices given with few digits."""
 GROWTH = 0.04
 """A star of waves is worth its parameters if it explains this much more of the energy: it moves
 the material by a fifth of the field's amplitude."""
@@ -149,17 +151,27 @@ def select_waves(
 
 
 def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
-    """Peaks worth considering, those of equal density together and from right to left."""
-    stars: list[list[tuple[float, float]]] = []
-    density = np.inf
+    """Peaks worth considering, those that symmetry may exchange together, from right to left."""
+    stars: list[list[LatticePeak]] = []
     for peak in spectrum.peaks:
         if peak.density < PEAK_SHARE * spectrum.peaks[0].density:
             break
-        if peak.density < (1.0 - SAME_DENSITY) * density:
-            stars.append([])
-            density = peak.density
-        stars[-1].append(peak.xi)
-    return [sorted(star, key=lambda xi: np.arctan2(xi[1], xi[0])) for star in stars]
+        home = next((star for star in stars if _exchangeable(star[0], peak)), None)
+        if home is None:
+            stars.append([peak])
+        else:
+            home.append(peak)
+    return [
+        sorted((peak.xi for peak in star), key=lambda xi: np.arctan2(xi[1], xi[0]))
+        for star in stars
+    ]
+
+
+def _exchangeable(first: LatticePeak, other: LatticePeak) -> bool:
+    """Whether two peaks have the same density and the same wavelength."""
+    lengths = np.hypot(*first.xi), np.hypot(*other.xi)
+    same_length = abs(lengths[1] - lengths[0]) <= SAME_LENGTH * lengths[0]
+    return bool(same_length and other.density >= (1.0 - SAME_DENSITY) * first.density)
 
 
 def _pursued(

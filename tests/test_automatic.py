@@ -74,7 +74,7 @@ def test_square_pattern_is_the_papers_mode(origin: str, shift: float) -> None:
     np.testing.assert_allclose(found.family.start, paper.start, atol=INTERPOLATION)
     assert found.amplitude == pytest.approx(-0.3, rel=INTERPOLATION)
     assert_is_field(found, mesh, u)
-    assert "Eq. (mode) of the paper: seven parameters" in found.sentences[-1]
+    assert f"Eq. (mode) of the paper ({paper.name})" in found.sentences[-1]
 
 
 @SETTINGS
@@ -145,26 +145,41 @@ def test_amplitudes_converge_with_the_mesh() -> None:
 
 
 def test_flower_is_three_tied_waves() -> None:
-    """|A| and |B| of the two waves that mirror each other are one parameter each."""
+    """All move across their wave vectors and equally far: only wave vectors and phases are free."""
     found = mode_family(HEXAGONAL_MESH, OBLIQUE * TWO, field(HEXAGONAL_MESH, M_WAVES), PITCH)
     assert_is_field(found, HEXAGONAL_MESH, field(HEXAGONAL_MESH, M_WAVES))
-    # 15 numbers; tied: one |A|, one |B|; zero: one B; held: one.
-    assert found.family.size == 15 - 4
-    assert found.family.names[:2] == ("A1,3", "A2")
+    # 15 numbers; the three L are zero, the three T are one, and held.
+    assert found.family.size == 15 - 6
+    assert all(name[0] in "kc" for name in found.family.names)
+    assert found.family.units == ("-",) * 6 + ("mm",) * 3
     assert "transverse" in found.sentences[0]
-    assert "Held at zero: B2." in found.sentences
-    # Nothing but the wave vectors, the phases and two ratios of amplitudes is free.
-    assert sum(name.startswith("k") for name in found.family.names) == 6
-    assert found.family.units[-3:] == ("mm",) * 3
+    assert "Zero within 2 %: L1,2,3." in found.sentences
+
+
+def test_rotations_and_mirrors_tie_both_components() -> None:
+    """|L| and |T| are one parameter each, whether three waves are turned or two are mirrored."""
+    for angles, mirrored in ((M_ANGLES, False), (M_ANGLES[[0, 2]], True)):
+        waves = []
+        for number, t in enumerate(angles):
+            sign = -1.0 if mirrored and number else 1.0
+            turn = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
+            waves.append([*(np.array([0.4, sign]) @ turn), *(2 / np.sqrt(3) * turn[0]), 0.0])
+        u = field(HEXAGONAL_MESH, np.array(waves))
+        found = mode_family(HEXAGONAL_MESH, OBLIQUE * TWO, u, PITCH)
+        assert_is_field(found, HEXAGONAL_MESH, u)
+        count = len(waves)
+        assert found.family.size == 1 + 3 * count
+        assert found.family.names[0] == "L" + ",".join(str(w + 1) for w in range(count))
+        assert found.family.start[0] == pytest.approx(0.4, abs=5 * INTERPOLATION)
 
 
 def test_what_differs_stays_free() -> None:
-    """Three M waves of different strengths: nothing is tied but the zero."""
+    """Three M waves of different strengths: nothing is tied."""
     waves = M_WAVES * np.array([[1.0], [0.8], [0.6]]) ** [1, 1, 0, 0, 0]
     found = mode_family(HEXAGONAL_MESH, OBLIQUE * TWO, field(HEXAGONAL_MESH, waves), PITCH)
     assert_is_field(found, HEXAGONAL_MESH, field(HEXAGONAL_MESH, waves))
-    assert found.family.size == 15 - 2
-    assert not any("one parameter" in sentence for sentence in found.sentences)
+    assert found.family.size == 15 - 4  # three L are zero, the largest T is held
+    assert not any("is the same" in sentence for sentence in found.sentences)
 
 
 def test_components_out_of_phase_become_two_waves() -> None:
@@ -173,7 +188,7 @@ def test_components_out_of_phase_become_two_waves() -> None:
     u = field(SQUARE_MESH, waves)
     found = mode_family(SQUARE_MESH, SQUARE * TWO, u, PITCH)
     assert_is_field(found, SQUARE_MESH, u - u.mean(axis=0) + found_mean(found, u))
-    assert found.family.names == ("A1", "kx1", "ky1", "c1", "c2")
+    assert found.family.names == ("T2", "kx1", "ky1", "c1", "c2")
     k = found.family.matrix[:, 1].reshape(-1, 5)
     assert np.array_equal(k, [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
     assert any("out of phase" in sentence for sentence in found.sentences)
@@ -210,7 +225,7 @@ def test_tied_and_free_families_start_from_the_same_field() -> None:
     assert free.family.size == 5 * 3 - 1
     difference = evaluated(tied, HEXAGONAL_MESH) - evaluated(free, HEXAGONAL_MESH)
     assert np.abs(difference).max() < 5 * INTERPOLATION
-    assert "Nothing is tied." in free.sentences
+    assert "14 parameters: all wave vectors and phases, and five amplitudes" in free.sentences[-1]
 
 
 def test_captured_is_the_square_of_the_overlap() -> None:

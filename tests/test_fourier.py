@@ -104,3 +104,22 @@ def test_bad_families() -> None:
         FourierMode(square_family(), 0.0, 1.0, TAPER)
     with pytest.raises(InputError, match="taper"):
         Taper(Box(0, 1, 0, 1), 0.0)
+
+
+@few
+@given(st.tuples(*[st.floats(-3, 3)] * 2), st.sampled_from(["hole", "junction"]))
+def test_moved_family_is_the_field_moved(shift: tuple[float, float], origin: str) -> None:
+    family, x = square_family(origin), np.linspace(-2, 2, 7)
+    y = x[:, None] + 0.3
+    far = Taper(Box(-99.0, 99.0, -99.0, 99.0), 1.0)
+    there = FourierMode(family.moved(shift), 1.9, 1.0, far)
+    here = FourierMode(family, 1.9, 1.0, far)
+    moved = there.evaluate(there.family.start, x, y)
+    expected = here.evaluate(family.start, x - shift[0], y - shift[1])
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_a_family_with_fixed_phases_cannot_be_moved() -> None:
+    fixed = ModeFamily("fixed", np.eye(5)[:, :4], np.zeros(5), np.ones(4))
+    with pytest.raises(InputError, match="free phases"):
+        fixed.moved((0.5, 0.0))
