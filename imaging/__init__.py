@@ -8,6 +8,10 @@ jacobian         proof that an element's map is one to one
 isoparametric    inverse mapping: element and local coordinates of every pixel
 rasterise        its compiled kernels
 render           reference and deformed images, and the truth behind them
+aperture         what one pixel averages: its area, behind the lens's blur
+integrate        images whose pixels average over it
+sensor           gain, offset, noise, saturation, rounding, and the noise foretold
+overlap          pixels inside more than one element
 spec, imageset   what to image, and the folder of files that comes of it
 truth, io        truth files; images and masks from and to files
 interpolation    values and gradients of a measured image between its pixels

@@ -7,8 +7,23 @@
     images.json
 
 The number in a file's name is the nominal strain in hundredths of a percent (0780 is 7.80 %).
-``images.json`` says how the set was made and is written last: without it, the set isn't
-finished. For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
+The plain images are noise-free averages over the pixels in float32; those with the bits in
+their name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says
+how the set was made and is written last: without it, the set isn't finished. In it, besides
+what makes the set anew:
+
+``noise``
+    The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
+    full scale, squared]; in each image's entry ``noise_sd`` is its root mean over the material.
+``saturated_px``, ``doubly_covered_px``
+    In each image's entry: material pixels at the highest level, and pixels inside more than one
+    element, where the specimen overlaps.
+``quadrature``
+    In each image's entry, if the sensor averages: points a pixel and their error's bound.
+``warnings``
+    Sentences about what makes the images other than what a camera would show.
+
+For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
 """
 
 from __future__ import annotations
@@ -17,7 +32,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,14 +45,18 @@ from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.io import quantise, read_image, read_mask, write_image
+from modeharvest.imaging.integrate import Scene, integrate
+from modeharvest.imaging.io import read_image, read_mask, write_image
 from modeharvest.imaging.isoparametric import Located, locate
+from modeharvest.imaging.overlap import doubly_covered
 from modeharvest.imaging.render import Rendering, Truth, render_deformed, render_reference
+from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 from modeharvest.imaging.truth import read_truth, write_truth
 from modeharvest.progress import Progress, silent
 
+FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 __all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
@@ -85,7 +104,9 @@ class ImageSet:
     def spec(self) -> ImagingSpec:
         """How the set was imaged."""
         values = dict(self.info["spec"])
-        return ImagingSpec(**(values | {"speckle": SpeckleSpec(**values["speckle"])}))
+        values["speckle"] = SpeckleSpec(**values["speckle"])
+        values["sensor"] = Sensor(**values.get("sensor", {}))
+        return ImagingSpec(**values)
 
     @property
     def strains(self) -> tuple[float, ...]:
@@ -98,7 +119,7 @@ class ImageSet:
         return float(self.info["inverse_map_max_residual_px"])
 
     def reference(self, *, camera: bool = False) -> NDArray[np.float32]:
-        """(rows, cols) reference image [fraction of full scale]; ``camera``: the quantised one."""
+        """(rows, cols) reference image [fraction of full scale]; ``camera``: as exposed."""
         return self._image(self.info["reference"], camera)
 
     def mask(self) -> BoolArray:
@@ -112,6 +133,14 @@ class ImageSet:
     def deformed_mask(self, strain: float) -> BoolArray:
         """(rows, cols) True where the deformed image shows material."""
         return read_mask(self.folder / self._snapshot(strain)["mask"])
+
+    def noise_sd(self, strain: float | None = None) -> FloatArray:
+        """(rows, cols) predicted standard deviation of a camera image [fraction of full scale].
+
+        ``strain`` names a deformed image, None the reference image.
+        """
+        mean = self.reference() if strain is None else self.deformed(strain)
+        return np.sqrt(self.spec.sensor.noise_variance(mean, self.spec.bits))
 
     def truth(self, strain: float) -> Truth:
         """Read the truth behind the deformed image at a nominal strain [-]."""
@@ -139,7 +168,10 @@ class ImageSet:
 def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
     """Digest everything that the images depend on, hexadecimal."""
     digest = hashlib.sha256()
-    wanted = {"format": FORMAT, "spec": asdict(spec), "element": solution.mesh.element,
+    how = asdict(spec)
+    if spec.sensor == Sensor():  # sets from before there was a sensor are still what they were
+        del how["sensor"]
+    wanted = {"format": FORMAT, "spec": how, "element": solution.mesh.element,
               "strains": [float(s) for s in strains]}  # fmt: skip
     digest.update(json.dumps(wanted, sort_keys=True).encode())
     for array in (solution.mesh.nodes, solution.mesh.cells):
@@ -229,50 +261,53 @@ def _write_set(
     grid = choose_grid(solution, [strain for strain, _ in wanted], spec)
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
-    rendering = render_reference(located, speckle, spec.background)
-    reference = _write_rendering(folder, "reference", "mask.tif", rendering, spec)
+    scene = Scene(mesh, None, grid, speckle, spec.background, "undeformed mesh")
+    seen = render_reference(located, speckle, spec.background)
+    overlap = doubly_covered(located, mesh.nodes, mesh.cells, mesh.element, grid)
+    seen = replace(seen, doubly_covered=overlap)
+    reference = _write_rendering(folder, "reference", "mask.tif", seen, scene, spec)
     snapshots = []
     for k, (strain, label) in enumerate(wanted):
         progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
-        snapshots.append(
-            _write_snapshot(solution, strain, label, located, grid, speckle, spec, folder)
-        )
+        where = f"snapshot at strain {strain:.4f}"
+        moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
+        entry = _write_snapshot(moved, strain, label, located, spec, folder)
+        snapshots.append({"branch": solution.at(strain).branch, **entry})
     residuals = [s["inverse_map_max_residual_px"] for s in snapshots]
+    constant, slope = spec.sensor.noise_model(spec.bits)
     return {
         "grid": asdict(grid),
         "spec": asdict(spec),
         "speckle_period_px": list(speckle.period),
         "inverse_map_max_residual_px": max(located.max_residual_px, *residuals),
+        "noise": {"constant": constant, "slope": slope, "offset": spec.sensor.offset},
         "reference": reference,
         "snapshots": snapshots,
+        "warnings": _warnings(reference, *snapshots),
         "solution": dict(solution.info),
         "versions": _versions(),
     }
 
 
 def _write_snapshot(
-    solution: Solution,
+    scene: Scene,
     strain: float,
     label: str,
     located_reference: Located,
-    grid: PixelGrid,
-    speckle: Speckle,
     spec: ImagingSpec,
     folder: Path,
 ) -> dict[str, Any]:
     """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
-    snapshot = solution.at(strain)
-    where = f"snapshot at strain {strain:.4f}"
-    rendering, truth = render_deformed(
-        solution.mesh, snapshot.displacement, located_reference, grid, speckle, spec.background,
-        where,
+    assert scene.displacement is not None
+    seen, truth = render_deformed(
+        scene.mesh, scene.displacement, located_reference, scene.grid, scene.speckle,
+        scene.background, scene.where,
     )  # fmt: skip
     name, truth_name = f"deformed_{label}", f"truth_{label}.h5"
-    images = _write_rendering(folder, name, f"{name}_mask.tif", rendering, spec)
-    write_truth(folder / truth_name, truth, strain, grid)
+    images = _write_rendering(folder, name, f"{name}_mask.tif", seen, scene, spec)
+    write_truth(folder / truth_name, truth, strain, scene.grid)
     return {
         "nominal_strain": float(strain),
-        "branch": snapshot.branch,
         **images,
         "truth": truth_name,
         "inverse_map_max_residual_px": float(np.nanmax(truth.residual_px)),
@@ -280,13 +315,39 @@ def _write_snapshot(
 
 
 def _write_rendering(
-    folder: Path, name: str, mask_name: str, rendering: Rendering, spec: ImagingSpec
-) -> dict[str, str]:
+    folder: Path, name: str, mask_name: str, seen: Rendering, scene: Scene, spec: ImagingSpec
+) -> dict[str, Any]:
+    """Write what the sensor makes of an image; return the entry in the sidecar."""
+    sensor, mask, irradiance = spec.sensor, seen.mask, seen.image
+    entry: dict[str, Any] = {}
+    if not sensor.aperture.is_point:
+        averaged, quadrature = integrate(scene, sensor.aperture, mask)
+        irradiance = averaged.astype(np.float32)
+        entry["quadrature"] = asdict(quadrature)
+    mean, levels = sensor.mean(irradiance), sensor.expose(irradiance, spec.bits, name)
     camera_name = f"{name}_{spec.bits}bit.tif"
-    write_image(folder / f"{name}.tif", rendering.image)
-    write_image(folder / camera_name, quantise(rendering.image, spec.bits))
-    write_image(folder / mask_name, rendering.mask)
-    return {"image": f"{name}.tif", "camera_image": camera_name, "mask": mask_name}
+    write_image(folder / f"{name}.tif", mean)
+    write_image(folder / camera_name, levels)
+    write_image(folder / mask_name, mask)
+    variance = sensor.noise_variance(mean[mask], spec.bits)
+    return entry | {
+        "image": f"{name}.tif",
+        "camera_image": camera_name,
+        "mask": mask_name,
+        "noise_sd": float(np.sqrt(variance.mean())),
+        "saturated_px": sensor.saturated(levels[mask], spec.bits),
+        "doubly_covered_px": seen.doubly_covered,
+    }
+
+
+def _warnings(*entries: dict[str, Any]) -> list[str]:
+    """Tell of images in which the specimen overlaps."""
+    return [
+        f"{entry['image']}: {entry['doubly_covered_px']} px lie inside more than one element; "
+        "the specimen overlaps there, as a real one in contact doesn't"
+        for entry in entries
+        if entry["doubly_covered_px"]
+    ]
 
 
 def _file_names(entry: dict[str, Any]) -> list[str]:

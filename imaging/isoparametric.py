@@ -65,7 +65,12 @@ class Located:
 
 
 def locate(
-    nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid, where: str = "mesh"
+    nodes: FloatArray,
+    cells: IntArray,
+    element: str,
+    grid: PixelGrid,
+    where: str = "mesh",
+    wanted: BoolArray | None = None,
 ) -> Located:
     """Find element and local coordinates of every pixel centre of a grid.
 
@@ -81,6 +86,8 @@ def locate(
         The pixels.
     where
         What to call the mesh in an error.
+    wanted
+        (rows, cols) True where to look; by default everywhere. Other pixels count as background.
 
     Raises
     ------
@@ -98,12 +105,16 @@ def locate(
     row_from, row_to = _row_ranges(hulls, centres, grid.rows)
     visit_start, visits = rasterise.bands(row_from, row_to, grid.rows)
     owner = np.full(grid.shape, -1, dtype=np.int32)
+    if wanted is not None:
+        owner[~wanted] = 0  # whose pixels the kernel leaves alone
     xi = np.full((*grid.shape, 2), np.nan)
     rasterise.rasterise(
         relative, hulls, centres, _one_to_one(relative, reference.triangular), bezier,
         sub_elements(reference.triangular), reference.triangular,
         visit_start, visits, row_from, row_to, owner, xi,
     )  # fmt: skip
+    if wanted is not None:
+        owner[~wanted] = -1
     x, y = _evaluate(polynomials(element, cells, nodes), reference.triangular, owner, xi)
     row, col = grid.to_px(x, y)
     row -= np.arange(grid.rows)[:, None]

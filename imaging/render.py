@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import Located, interpolate, locate
+from modeharvest.imaging.overlap import doubly_covered
 from modeharvest.imaging.speckle import Speckle
 
 FloatArray = NDArray[np.float64]
@@ -31,10 +32,14 @@ class Rendering:
         (rows, cols) float32 intensity [fraction of full scale].
     mask
         (rows, cols) True where there is material.
+    doubly_covered
+        How many of its pixels lie inside more than one element: the specimen overlaps there,
+        and the element of the lowest number is shown.
     """
 
     image: NDArray[np.float32]
     mask: BoolArray
+    doubly_covered: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,4 +122,5 @@ def render_deformed(
     mask = located.mask
     image = np.full(grid.shape, background, dtype=np.float32)
     image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
-    return Rendering(image, mask), truth
+    overlap = doubly_covered(located, mesh.nodes + displacement, mesh.cells, mesh.element, grid)
+    return Rendering(image, mask, overlap), truth

@@ -11,6 +11,7 @@ import numpy as np
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
 
 
@@ -32,6 +33,8 @@ class ImagingSpec:
         Bits of the camera-like copies, 1 to 16.
     speckle
         The pattern.
+    sensor
+        What a pixel averages, and its noise; the default shows points without noise.
 
     Raises
     ------
@@ -45,6 +48,7 @@ class ImagingSpec:
     background: float = 0.0
     bits: int = 8
     speckle: SpeckleSpec = field(default_factory=SpeckleSpec)
+    sensor: Sensor = field(default_factory=Sensor)
 
     def __post_init__(self) -> None:
         if not (self.pixel_size > 0.0 and math.isfinite(self.pixel_size)):

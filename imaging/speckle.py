@@ -20,6 +20,7 @@ References
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -152,9 +153,17 @@ class Speckle:
         bright = gaussian_field(self.spec, self.period) > 0.0
         return np.where(bright, self.spec.bright, self.spec.dark)
 
-    def image(self) -> FloatArray:
-        """(rows, cols) exact intensities at whole pixels [fraction of full scale]."""
-        whole = scipy.fft.irfft2(self._spectrum * math.prod(self.period), s=self.period)
+    def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
+        """(rows, cols) exact intensities at whole pixels [fraction of full scale].
+
+        ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
+        multiplied by those of its row and its column frequency (see Aperture.transfer).
+        """
+        spectrum = self._spectrum * math.prod(self.period)
+        if transfer is not None:
+            spectrum *= transfer(np.fft.fftfreq(self.period[0]))[:, None]
+            spectrum *= transfer(np.fft.rfftfreq(self.period[1]))
+        whole = scipy.fft.irfft2(spectrum, s=self.period)
         return np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]])
 
     def __call__(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:

@@ -30,7 +30,9 @@ def test_every_option_of_the_paper_case_is_in_its_text() -> None:
     tables = [plain["experiment"], plain["imaging"], plain["correlation"]]
     tables += [table[key] for table in tables for key in table if isinstance(table[key], dict)]
     names = {name for table in tables for name in table}
-    left_out = {"path", *plain["experiment"]["path"], "shape"}  # for those who read the docstring
+    # For those who read the docstring:
+    left_out = {"path", *plain["experiment"]["path"], "shape"}
+    left_out |= {"sensor", *plain["imaging"]["sensor"]}
     assert {name for name in names - left_out if name not in text} == set()
 
 

@@ -1,0 +1,173 @@
+"""Images whose pixels average over an aperture instead of showing single points.
+
+Away from the edge of the material the reference image is exact in Fourier space. A deformed
+image is summed over the points of a Gauss rule in each pixel of the *deformed* frame, each
+point found in the mesh and evaluated exactly; the rule has as many points as keep its error
+below :data:`TOLERANCE`. Near an edge, both images average evenly scattered points, some of them
+material and some background.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.fem.field import Mesh
+from modeharvest.imaging.aperture import EDGE_POINTS, Aperture
+from modeharvest.imaging.elements import monomial_gradients, polynomials, reference_element
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+TOLERANCE = 1e-7  # of full scale, rms: its largest among millions of pixels stays below 1e-6
+_MOST_POINTS = 16  # a side
+_POINTS_AT_ONCE = 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A state of the specimen before a camera.
+
+    Parameters
+    ----------
+    mesh
+        The undeformed mesh.
+    displacement
+        (n, 2) at its nodes [mm]; None for the undeformed state.
+    grid
+        The pixels; the speckle's whole pixels are the grid's.
+    speckle, background
+        Intensity of the material and around it [fraction of full scale].
+    where
+        What to call the state in an error.
+    """
+
+    mesh: Mesh
+    displacement: FloatArray | None
+    grid: PixelGrid
+    speckle: Speckle
+    background: float
+    where: str = "mesh"
+
+    @property
+    def compression(self) -> float:
+        """How many times a length shrinks, at most, among the elements' centres [-]."""
+        if self.displacement is None:
+            return 1.0
+        mesh = self.mesh
+        middle = np.full(2, 1.0 / 3.0 if reference_element(mesh.element).triangular else 0.0)
+        slopes = monomial_gradients(middle)
+        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
+        after = polynomials(mesh.element, mesh.cells, mesh.nodes + self.displacement) @ slopes
+        stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
+        return float(1.0 / stretches.min())
+
+    def shown(self, offset: FloatArray, wanted: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Image positions (row, col), (k,) each [px], where the reference shows what k pixels do.
+
+        The pixels are the wanted ones, all moved by ``offset`` (row, col) [px]; NaN where that
+        is background.
+        """
+        mesh, h = self.mesh, self.grid.pixel_size
+        x0, y0 = self.grid.x0 + h * offset[1], self.grid.y0 - h * offset[0]
+        moved = PixelGrid(self.grid.rows, self.grid.cols, h, float(x0), float(y0))
+        u = 0.0 if self.displacement is None else self.displacement
+        located = locate(mesh.nodes + u, mesh.cells, mesh.element, moved, self.where, wanted)
+        x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, wanted]
+        return self.grid.to_px(x, y)
+
+    def average(self, offsets: FloatArray, weights: FloatArray, wanted: BoolArray) -> FloatArray:
+        """(k,) weighted sum of the intensities at the k wanted pixels moved by each offset."""
+        total = np.zeros(np.count_nonzero(wanted))
+        # One Fourier transform for many points, as long as there are not too many to hold.
+        batch = max(1, _POINTS_AT_ONCE // max(1, total.size))
+        for k in range(0, len(offsets), batch):
+            row, col = np.stack([self.shown(o, wanted) for o in offsets[k : k + batch]], axis=1)
+            shown = ~np.isnan(row)
+            intensity = np.full(row.shape, self.background)
+            intensity[shown] = self.speckle(row[shown], col[shown])
+            total += weights[k : k + batch] @ intensity
+        return total
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """How the pixels of an image were averaged.
+
+    Parameters
+    ----------
+    points
+        Points in each pixel away from the edges; 0: none needed, the average is exact.
+    rms_bound
+        Bound of their root-mean-square error on the pattern [fraction of full scale].
+    edge_points
+        Points in each pixel near an edge.
+    """
+
+    points: int
+    rms_bound: float
+    edge_points: int = EDGE_POINTS
+
+
+def integrate(scene: Scene, aperture: Aperture, mask: BoolArray) -> tuple[FloatArray, Quadrature]:
+    """(rows, cols) intensity averaged over every pixel's aperture, and how.
+
+    ``mask`` tells material (at pixel centres) from background.
+    """
+    near = near_edges(mask, aperture.reach_px)
+    inside = mask & ~near
+    image = np.full(mask.shape, scene.background)
+    if scene.displacement is None:
+        image[inside] = scene.speckle.image(aperture.transfer)[inside]
+        quadrature = Quadrature(0, 0.0)
+    else:
+        side, bound = points_a_side(aperture, scene.speckle.spec, scene.compression)
+        nodes, weights = aperture.rule(side)
+        offsets = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+        pairs = np.asarray(np.outer(weights, weights).ravel(), dtype=np.float64)
+        image[inside] = scene.average(offsets, pairs, inside)
+        quadrature = Quadrature(side**2, bound)
+    scattered = aperture.scattered()
+    even: FloatArray = np.full(len(scattered), 1.0 / len(scattered))
+    image[near] = scene.average(scattered, even, near)
+    return image, quadrature
+
+
+def near_edges(mask: BoolArray, reach_px: int) -> BoolArray:
+    """(rows, cols) True where material and background both lie within reach, rows or columns."""
+    size = 2 * reach_px + 1
+    dilated = ndimage.maximum_filter(mask, size, mode="nearest")
+    eroded = ndimage.minimum_filter(mask, size, mode="nearest")
+    return np.asarray(dilated & ~eroded)
+
+
+def points_a_side(
+    aperture: Aperture, pattern: SpeckleSpec, compression: float = 1.0
+) -> tuple[int, float]:
+    """How many points a side the Gauss rule needs, and the bound of its rms error.
+
+    A plane wave of the pattern is seen at up to ``compression`` times its frequency f. The rule
+    multiplies it by one factor, the exact average by another; by Parseval's theorem the rms
+    error is at most the largest of |difference of factors| times the blur's transfer function
+    at f, times the standard deviation of the pattern before its blur. The least number of
+    points is taken for which that is below TOLERANCE, but at most 16.
+    """
+    f = np.linspace(0.0, 0.5, 257)
+    blur = np.exp(-2.0 * (np.pi * pattern.blur_px * f) ** 2)
+    exact = aperture.transfer(compression * f)
+    contrast = 0.5 * (pattern.bright - pattern.dark)
+    bound = np.inf
+    for side in range(1, _MOST_POINTS + 1):
+        nodes, weights = aperture.rule(side)
+        ruled = np.cos(2.0 * np.pi * compression * np.outer(f, nodes)) @ weights
+        error = np.outer(ruled, ruled) - np.outer(exact, exact)
+        bound = contrast * float(np.abs(error * np.outer(blur, blur)).max())
+        if bound <= TOLERANCE:
+            break
+    return side, bound
