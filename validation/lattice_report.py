@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.files import atomic
+from modeharvest.idic.lattice_spectrum import upward
 from modeharvest.progress import Progress, silent
 from modeharvest.validation import lattice_words as words
 from modeharvest.validation.lattice_run import SHAPE, CriticalPoint, FoundPattern, LatticeRun
@@ -19,6 +20,7 @@ from modeharvest.validation.plots_branches import (
     draw_amplitudes,
     draw_captured,
     draw_critical_strains,
+    draw_differences,
     draw_energies,
     draw_overlaps,
 )
@@ -32,6 +34,8 @@ __all__ = ["CriticalPoint", "FoundPattern", "LatticeRun", "write_lattice_report"
 TEMPLATE = "lattice_report.html"
 CELLS = 4
 """Unit cells along the side of a picture's window."""
+VISIBLE = 0.12
+"""Largest fluctuation that a deformed lattice is drawn with, at least [l]."""
 
 
 def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress = silent) -> None:
@@ -73,10 +77,10 @@ def _hero(run: LatticeRun) -> str:
     if run.modes is None:
         drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch)
     else:
-        shape = run.modes.shapes[0]
-        if run.patterns:
-            first = run.patterns[0]
-            shape = first.displacement - run.modes.mesh.nodes @ (first.gradient - np.eye(2)).T
+        shape, patterns = run.modes.shapes[0], run.patterns
+        if patterns:
+            shown = next((p for p in patterns if p.stable), patterns[0])
+            shape = shown.fluctuation(run.modes.mesh.nodes)
         drawn = draw_growth(_window(run, 7.0, 5.6), shape, SHAPE * run.pitch, run.pitch)
     return to_svg(drawn, "hero", "The lattice and its pattern")
 
@@ -88,24 +92,38 @@ def _reference(run: LatticeRun) -> Picture:
 
 def _patterns(run: LatticeRun) -> list[dict[str, Any]]:
     """For each pattern the deformed lattice and both densities, and its family."""
-    shown = []
-    for n, found in enumerate(run.patterns, start=1):
-        spectrum = found.spectrum
-        largest = float(max(spectrum.S_xx.max(), spectrum.S_yy.max()))
-        still = _window(run, CELLS, CELLS)
-        deformed = draw_lattice(still, run.pitch, found.displacement, found.gradient)
-        xx, yy = (draw_lattice_spectrum(spectrum.xi, S, largest)
-                  for S in (spectrum.S_xx, spectrum.S_yy))  # fmt: skip
-        shown.append({
-            "found": found,
-            "waves": found.family.waves,
-            "pictures": [
-                _picture(f"deformed-{n}", "Deformed", deformed, found.remark),
-                _picture(f"Sxx-{n}", "S_xx", xx, f"0 dB = {short(largest)} mm⁶"),
-                _picture(f"Syy-{n}", "S_yy", yy, f"0 dB = {short(largest)} mm⁶"),
-            ],
-        })  # fmt: skip
-    return shown
+    return [
+        {"found": found, "waves": found.family.waves,
+         "pictures": [_deformed(run, found, n), *_densities(found, n)]}
+        for n, found in enumerate(run.patterns, start=1)
+    ]  # fmt: skip
+
+
+def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> Picture:
+    """The deformed lattice; a fluctuation that is too small to be seen is magnified."""
+    assert run.modes is not None
+    nodes = run.modes.mesh.nodes
+    fluctuation = found.fluctuation(nodes)
+    factor = max(1.0, VISIBLE * run.pitch / float(np.linalg.norm(fluctuation, axis=1).max()))
+    u = found.displacement + (factor - 1.0) * fluctuation
+    drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch, u, found.gradient)
+    fact = {True: "stable", False: "unstable", None: "no equilibrium"}[found.stable]
+    fact += f"; fluctuation × {factor:.3g}" if factor > 1.005 else "; true to scale"
+    return _picture(f"deformed-{n}", "Deformed", drawn, fact)
+
+
+def _densities(found: FoundPattern, n: int) -> list[Picture]:
+    spectrum = found.spectrum
+    both = {"xx": spectrum.S_xx, "yy": spectrum.S_yy}
+    largest = float(max(S.max() for S in both.values()))
+    pictures = []
+    for name, S in both.items():
+        up = np.where(upward(spectrum.xi), S, 0.0)
+        xi = [float(x) for x in spectrum.xi[int(np.argmax(up))]]
+        fact = f"largest {short(float(S.max()))} mm⁶, at ±({short(xi[0])}, {short(xi[1])})"
+        drawn = draw_lattice_spectrum(spectrum.xi, S, largest)
+        pictures.append(_picture(f"S{name}-{n}", f"S_{name}", drawn, fact))
+    return pictures
 
 
 def _dispersion(run: LatticeRun) -> dict[str, Any]:
@@ -148,7 +166,9 @@ def _branches(run: LatticeRun) -> list[Picture]:
     return [
         _picture("energies", "Energy", draw_energies(followed, critical)),
         _picture("amplitudes", "Amplitude", draw_amplitudes(followed, critical)),
-    ]
+        *([_picture("differences", "Which one is lowest", draw_differences(followed))]
+          if len(followed) > 1 else []),
+    ]  # fmt: skip
 
 
 def _study(run: LatticeRun) -> dict[str, Any]:

@@ -86,8 +86,9 @@ class FoundPattern:
         (2, 2) F̄ of that [-].
     spectrum, family
         Of the displacement without its affine part.
-    remark
-        What a reader should know about the picture.
+    stable
+        Whether it is an equilibrium that is stable for fields with the period of its cell; None
+        for a mode, which is no equilibrium.
     """
 
     name: str
@@ -95,7 +96,11 @@ class FoundPattern:
     gradient: FloatArray
     spectrum: LatticeSpectrum
     family: FoundFamily
-    remark: str = ""
+    stable: bool | None = None
+
+    def fluctuation(self, nodes: FloatArray) -> FloatArray:
+        """(n, 2) displacement of these nodes without its affine part [mm]."""
+        return np.asarray(self.displacement - nodes @ (self.gradient - np.eye(2)).T)
 
     @classmethod
     def of_state(
@@ -104,9 +109,9 @@ class FoundPattern:
         """The pattern of a branch, at its last state unless another is given."""
         state = state or branch.states[-1]
         name = f"{combination_name(branch.combination)} at {100 * state.load:.4g} %"
-        remark = "" if state.negative_eigenvalues == 0 else "An unstable equilibrium."
+        stable = state.negative_eigenvalues == 0
         u, F = state.displacement, state.gradient
-        return cls(name, u, F, *_analysed(modes, state.fluctuation(modes.mesh), pitch), remark)
+        return cls(name, u, F, *_analysed(modes, state.fluctuation(modes.mesh), pitch), stable)
 
     @classmethod
     def of_mode(cls, modes: ModeSet, k: int, pitch: float) -> FoundPattern:
@@ -114,8 +119,7 @@ class FoundPattern:
         shape = modes.shapes[k]
         u = SHAPE * pitch / float(np.linalg.norm(shape, axis=1).max()) * shape
         name = combination_name([float(j == k) for j in range(len(modes.waves))])
-        remark = f"A mode, no equilibrium: drawn with a largest displacement of {SHAPE} l."
-        return cls(f"mode {name}", u, np.eye(2), *_analysed(modes, u, pitch), remark)
+        return cls(f"mode {name}", u, np.eye(2), *_analysed(modes, u, pitch))
 
 
 def _analysed(

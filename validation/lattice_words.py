@@ -7,11 +7,16 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from modeharvest.fem.modes import Branch, Wave
 from modeharvest.validation.mode_study import ModeStudy
 from modeharvest.validation.mode_table import ModeRow
 from modeharvest.validation.page import short
 from modeharvest.validation.plots_branches import combination_name
+
+FloatArray = NDArray[np.float64]
 
 if TYPE_CHECKING:
     from modeharvest.validation.lattice_run import CriticalPoint, LatticeRun
@@ -52,7 +57,7 @@ def waves_in_words(point: CriticalPoint) -> str:
         return "–"
     if point.angle is not None:
         return f"long waves along {math.degrees(point.angle) + 0.0:.3g}°"
-    return " ".join(wave_name(wave) for wave in point.waves)
+    return ", ".join(wave_name(wave) for wave in point.waves)
 
 
 def proof(point: CriticalPoint) -> str:
@@ -62,7 +67,7 @@ def proof(point: CriticalPoint) -> str:
     if point.angle is not None:
         said = "the acoustic tensor of the effective moduli is singular"
     else:
-        below, above = (" ".join(map(str, n)) for n in (point.below, point.above))
+        below, above = (", ".join(map(str, n)) for n in (point.below, point.above))
         said = f"negative eigenvalues a millionth below: {below}, above: {above}"
     others = len(point.earlier)
     return said + (f"; but {others} other waves are unstable before" if others else
@@ -77,13 +82,13 @@ def key_numbers(run: LatticeRun) -> list[dict[str, str]]:
         keys += [
             _key("critical strain" if point.found else "stable up to", percent(point.load), "%",
                  point.loading),
-            _key("critical waves", waves_in_words(point), "", _cells_in_words(run)),
+            _waves_key(point, run),
         ]  # fmt: skip
-    if run.modes is not None:
-        count = len(run.modes.waves)
-        keys.append(_key("modes", str(count), "", "one at a time" if count == 1 else "at once"))
+        if point.found and point.angle is None:
+            before = f"{sum(point.below)} → {sum(point.above)}"
+            keys.append(_key("negative eigenvalues", before, "", "a millionth below → above"))
     if run.patterns:
-        family = run.patterns[0].family
+        family = next((p for p in run.patterns if p.stable), run.patterns[0]).family
         waves = family.family.wave_count
         keys += [
             _key("captured", percent(family.captured, 3), "%",
@@ -98,9 +103,13 @@ def key_numbers(run: LatticeRun) -> list[dict[str, str]]:
     return keys
 
 
-def _cells_in_words(run: LatticeRun) -> str:
+def _waves_key(point: CriticalPoint, run: LatticeRun) -> dict[str, str]:
     copies = (run.modes.info if run.modes is not None else {}).get("copies")
-    return f"repeat after {copies[0]} × {copies[1]} cells" if copies else "phases from cell to cell"
+    remark = f"repeat after {copies[0]} × {copies[1]} cells" if copies else "phases (k·a₁, k·a₂)"
+    named = waves_in_words(point)
+    if len(point.waves) > 1:
+        return _key("critical waves", str(len(point.waves)), "at once", named)
+    return _key("critical wave", "long" if point.angle is not None else named, "", remark)
 
 
 def _key(name: str, value: str, unit: str, remark: str) -> dict[str, str]:
@@ -119,10 +128,15 @@ def branch_rows(branches: Sequence[Branch]) -> list[dict[str, Any]]:
                 "load": percent(state.load),
                 "excess": 1e3 * (state.energy - state.primary_energy),
                 "negative": state.negative_eigenvalues,
-                "amplitudes": ", ".join(short(float(a)) for a in state.amplitudes),
+                "amplitudes": ", ".join(short(float(a)) for a in _cleared(state.amplitudes)),
             }
         rows.append(row)
     return rows
+
+
+def _cleared(amplitudes: FloatArray) -> FloatArray:
+    """What is nothing beside the largest is 0."""
+    return np.where(np.abs(amplitudes) > 1e-6 * np.abs(amplitudes).max(), amplitudes, 0.0)
 
 
 def study_sentences(study: ModeStudy) -> list[str]:

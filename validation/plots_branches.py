@@ -50,10 +50,25 @@ def draw_amplitudes(branches: Sequence[Branch], critical: float | None) -> Figur
     """Draw the size of the critical modes' amplitudes along each branch."""
     drawn = _branches(branches, critical, "amplitude, rms over the material [mm]", _size)
     axes = drawn.axes[0]
-    for n, branch in enumerate(b for b in branches if b.states):
-        amplitude, load = branch.curve.T
-        axes.plot(100.0 * load, amplitude, color=_COLOURS[n % len(_COLOURS)], lw=0.9, alpha=0.6)
+    for line, branch in zip(axes.lines[::3], (b for b in branches if b.states), strict=False):
+        kept = [(size, s.load) for size, s in zip(_size(branch), branch.states, strict=True)]
+        points = np.vstack([branch.curve, kept])  # the branch is passed in finer steps
+        points = points[np.argsort(points[:, 0])]
+        points = points[points[:, 0] <= max(kept)[0]]
+        line.set_data(100.0 * points[:, 1], points[:, 0])
     return drawn
+
+
+def draw_differences(branches: Sequence[Branch]) -> Figure:
+    """Draw each branch's energy over that of the lowest branch at the same load."""
+    lowest: dict[float, float] = {}
+    for state in (s for branch in branches for s in branch.states):
+        lowest[state.load] = min(state.energy, lowest.get(state.load, np.inf))
+
+    def above(branch: Branch) -> list[float]:
+        return [1e6 * (s.energy - lowest[s.load]) for s in branch.states]
+
+    return _branches(branches, None, "energy − lowest branch's [Pa]", above, zero=True)
 
 
 def _excess(branch: Branch) -> list[float]:

@@ -16,7 +16,7 @@ from scipy.spatial import Voronoi
 from modeharvest.fem.dispersion import Dispersion, ZoneMap
 from modeharvest.fem.modes import Wave
 from modeharvest.validation.plots_fields import WIDTH, Scale, colour_bar
-from modeharvest.validation.plots_path import curve, say
+from modeharvest.validation.plots_path import curve
 from modeharvest.validation.style import (
     BLUE,
     DENSITY,
@@ -129,20 +129,19 @@ def draw_lattice_spectrum(
     reach
         Of the axes [1/l].
     """
-    seen = np.abs(xi).max(axis=1) <= reach
+    seen = np.abs(xi).max(axis=1) <= reach + 1e-9
     xi, density = xi[seen], density[seen]
     level = 10.0 * np.log10(np.maximum(density, 1e-30) / largest)
     order = np.argsort(level)
     shown = order[level[order] >= _FLOOR]
     scale = Scale(DENSITY, _FLOOR, 0.0, "dB")
     with style():
-        drawn, axes = _plane(reach)
+        drawn, axes = _plane(reach + 0.2)
         axes.set_facecolor(DENSITY(0.0))
         axes.plot(xi[:, 0], xi[:, 1], "o", ms=1.1, color="#ffffff", alpha=0.22, mew=0)
         size = 3.0 + 105.0 * (1.0 - level[shown] / _FLOOR) ** 3
         axes.scatter(xi[shown, 0], xi[shown, 1], s=size, c=scale.normalise(level[shown]),
                      cmap=_bright(), vmin=0.0, vmax=1.0, lw=0)  # fmt: skip
-        _name_largest(axes, xi, density)
         colour_bar(drawn, axes, Scale(_bright(), _FLOOR, 0.0, "dB"))
     return drawn
 
@@ -150,15 +149,6 @@ def draw_lattice_spectrum(
 def _bright() -> LinearSegmentedColormap:
     """The densities' colours from where they are seen on their own background."""
     return LinearSegmentedColormap.from_list("bright", DENSITY(np.linspace(0.28, 1.0, 64)))
-
-
-def _name_largest(axes: Axes, xi: FloatArray, density: FloatArray) -> None:
-    """Write the largest density beside one of its dots."""
-    if not density.size or not density.max() > 0:
-        return
-    highest = np.flatnonzero(density > 0.999 * density.max())
-    k = min(highest, key=lambda i: (round(np.abs(xi[i]).max(), 6), -xi[i, 1], -xi[i, 0]))
-    say(axes, xi[k, 0], xi[k, 1], f"{density[k]:.2g} mm⁶", "#ffffff", (0, 7), "center")
 
 
 def _plane(half: float) -> tuple[Figure, Axes]:
