@@ -26,9 +26,11 @@ from modeharvest.idic.quadrature import Quadrature, points_for
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-PERIODIC = 1e-6
-"""Largest difference of a field between partner nodes, of its largest value: far above
-rounding, far below what an affine part leaves."""
+PERIODIC = 1e-4
+"""Largest difference of a field between partner nodes, of its largest value: far above what
+single precision leaves, far below what an affine part does."""
+PARTNERS = 1e-4
+"""Distance, in lattice vectors, up to which nodes are partners; elements are far larger."""
 SAME_WAVE = 1e-6
 """Difference [1/l] of wave vectors that are the same."""
 LEAST_SHARE = 1e-6
@@ -215,17 +217,27 @@ def _checked_field(
         )
     if not 0 < pitch < np.inf:
         raise InputError(f"pitch: expected a positive length in mm, got {pitch}")
-    fractional = mesh.nodes @ np.linalg.inv(vectors)
-    tree = cKDTree(np.mod(np.mod(fractional, 1.0), 1.0), boxsize=1.0)
-    pairs = tree.query_pairs(1e-6, output_type="ndarray")
-    jump = np.abs(u[pairs[:, 0]] - u[pairs[:, 1]]).max(axis=1, initial=0.0)
-    if jump.size and jump.max() > PERIODIC * np.abs(u).max():
+    _check_periodic(mesh, vectors, u)
+    return u, vectors
+
+
+def _check_periodic(mesh: Mesh, lattice: FloatArray, u: FloatArray) -> None:
+    """Raise InputError where partner nodes differ in the field, or there are no partners."""
+    fractional = np.mod(np.mod(mesh.nodes @ np.linalg.inv(lattice), 1.0), 1.0)
+    pairs = cKDTree(fractional, boxsize=1.0).query_pairs(PARTNERS, output_type="ndarray")
+    distance = np.linalg.norm(np.diff(mesh.nodes[pairs], axis=1)[:, 0], axis=1)
+    if not np.any(distance > 0.5 * np.linalg.norm(lattice, axis=1).min()):
+        raise InputError(
+            f"lattice: expected nodes a lattice vector apart, got none for {lattice.tolist()} mm; "
+            "give the vectors of the very cell that is meshed"
+        )
+    jump = np.abs(u[pairs[:, 0]] - u[pairs[:, 1]]).max(axis=1)
+    if jump.max() > PERIODIC * np.abs(u).max():
         a, b = pairs[int(np.argmax(jump))]
         raise InputError(
             f"periodic field: expected the same value at nodes {a} and {b}, a lattice vector "
             f"apart, got {u[a].tolist()} and {u[b].tolist()}; remove the affine part"
         )
-    return u, vectors
 
 
 def _check_energy(energy: float, whole: float, rule: Quadrature, lattice: FloatArray) -> None:

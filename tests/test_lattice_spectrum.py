@@ -206,6 +206,7 @@ def test_bad_input_is_named() -> None:
         ((mesh, SQUARE, sheared, PITCH), "remove the affine part"),
         ((mesh, SQUARE, np.ones_like(u), PITCH), "more than a translation"),
         ((mesh, np.ones((2, 2)), u, PITCH), "two independent vectors"),
+        ((mesh, 2 * SQUARE, u, PITCH), "very cell that is meshed"),
         ((mesh, SQUARE, u, 0.0), "pitch"),
         ((mesh, SQUARE, u, PITCH, -1.0), "reach"),
         ((holed_cell(SQUARE, 4, (2, 2)), SQUARE, np.tile(u, (4, 1)), PITCH), "enlarged cell"),
