@@ -93,10 +93,10 @@ class ZoneMap:
     @property
     def lowest(self) -> tuple[float, Wave]:
         """The lowest eigenvalue of the grid but Γ [N/mm^4] and its phases [rad]."""
-        values = self.eigenvalues.copy()
-        values[len(values) // 2, len(values) // 2] = np.inf
+        values = self.eigenvalues[1:, 1:].copy()  # -pi and pi are the same
+        values[len(values) // 2 - 1, len(values) // 2 - 1] = np.inf
         i, j = np.unravel_index(int(np.argmin(values)), values.shape)
-        return float(self.eigenvalues[i, j]), (float(self.phases[i]), float(self.phases[j]))
+        return float(values[i, j]), (float(self.phases[i + 1]), float(self.phases[j + 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +268,7 @@ def zone_map(
     if divisions < 2 or divisions % 2:
         raise InputError(f"zone map: expected an even number of divisions, got {divisions}")
     waves = BlochWaves(path.cell, _state(path, load))
-    phases: FloatArray = np.linspace(-_PI, _PI, divisions + 1)
+    phases = np.asarray(np.linspace(-_PI, _PI, divisions + 1), dtype=np.float64)
     phases[divisions // 2] = 0.0
     values = np.empty((divisions + 1, divisions + 1))
     # k and -k are the same: the rows from -pi to 0 are all rows.

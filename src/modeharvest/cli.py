@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +16,10 @@ from rich.table import Table
 
 from modeharvest import __version__
 from modeharvest.case import case_text, read_case, shipped_cases
+from modeharvest.case_file import lattice_cases
 from modeharvest.console import ProgressBars
 from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.lattice_table import print_lattice
 from modeharvest.ranks import is_first
 
 app = typer.Typer(
@@ -25,7 +27,8 @@ app = typer.Typer(
         "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
         "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
         "every pixel, measure them, and see how wrong the measurement was, and why.\n\n"
-        "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold]"
+        "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold], or, for the modes "
+        "of an infinite lattice, [bold]modeharvest modes square-lattice --out out/square[/bold]"
     ),
     epilog="Exit codes: 0 done, 2 the input can't be used (one line says why), 130 interrupted.",
     no_args_is_help=True,
@@ -79,6 +82,26 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
 
 
 @app.command()
+def bloch(case: CaseName, out: OutFolder) -> None:
+    """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
+
+    Leaves the first critical load and waves with their proof, the lowest eigenvalues against the
+    wave vector at several loads (dispersion.csv, dispersion.h5), report.html and summary.json.
+    """
+    print_lattice(_of_lattice(case, out, "bloch", lambda analysis: analysis.bloch()), out)
+
+
+@app.command()
+def modes(case: CaseName, out: OutFolder) -> None:
+    """Find an infinite lattice's modes, buckled branches and mode families (needs dolfinx).
+
+    Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
+    cell, branches with their energies, spectra, and the Fourier mode families found in them.
+    """
+    print_lattice(_of_lattice(case, out, "modes", lambda analysis: analysis.all()), out)
+
+
+@app.command()
 def fem(case: CaseName, out: OutFolder) -> None:
     """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
 
@@ -123,15 +146,17 @@ def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> N
 def cases(
     name: Annotated[str | None, typer.Argument(help="Print this case's TOML file.")] = None,
 ) -> None:
-    """List the shipped cases, or print one as a start for your own.
+    """List the shipped cases and their commands, or print one as a start for your own.
 
     For example: modeharvest cases paper-virtual > mine.toml
     """
     if name is not None:
         print(case_text(name), end="")
         return
+    lattices = lattice_cases()
     for shipped, title in shipped_cases().items():
-        print(f"{shipped:16}  {title}")
+        commands = "bloch, modes" if shipped in lattices else "run"
+        print(f"{shipped:18}{commands:14}{title}")
 
 
 def _with_bars(case: str, out: Path, solution: Path | None, work: Callable[[Any], Any]) -> Any:
@@ -139,9 +164,27 @@ def _with_bars(case: str, out: Path, solution: Path | None, work: Callable[[Any]
     checked = read_case(case)  # before the heavy imports, so that a typo is told at once
     from modeharvest.pipeline import Run
 
+    with _bars() as bars:
+        return work(Run(checked, out, bars, solution))
+
+
+def _of_lattice(case: str, out: Path, command: str, work: Callable[[Any], Any]) -> Any:
+    """Read a lattice's case, then do some of its analysis under progress bars."""
+    from modeharvest.lattice_case import read_lattice_case
+
+    checked = read_lattice_case(case)
+    from modeharvest.lattice_pipeline import LatticeAnalysis
+
+    with _bars() as bars:
+        said = f"modeharvest {command} {case} --out {out}"
+        return work(LatticeAnalysis(checked, out, bars, said))
+
+
+@contextmanager
+def _bars() -> Iterator[ProgressBars]:
     try:
         with ProgressBars(_errors) as bars:
-            return work(Run(checked, out, bars, solution))
+            yield bars
     except KeyboardInterrupt as error:
         raise _InterruptedError from error
 

@@ -13,10 +13,6 @@ A stage whose inputs have not changed is not run again.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +21,13 @@ from modeharvest import __version__
 from modeharvest.case import Case, read_case, shipped_cases, shipped_solution
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json, require_writable, write_json
+from modeharvest.files import read_json
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.progress import Progress, silent
-from modeharvest.ranks import agreed, is_first
+from modeharvest.ranks import is_first
+from modeharvest.stages import Stages, digest
 from modeharvest.validation.study import Measured, validate
 
 STAGES = ("fem", "image", "correlate", "validate")
@@ -63,6 +60,11 @@ class Run:
     progress: Progress = silent
     solution: Path | None = None
 
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
     def fem(self) -> Solution:
         """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
 
@@ -81,8 +83,8 @@ class Run:
                 solution.write(path)
                 solution.write_vtu(path.with_suffix(".vtu"))
 
-        key = _digest([self.case.plain()["experiment"], __version__])
-        self._stage("fem", key, work, path, collective=True)
+        key = digest([self.case.plain()["experiment"], __version__])
+        self.stages.do("fem", key, work, path, collective=True)
         return Solution.read(path)
 
     def image(self) -> ImageSet:
@@ -91,7 +93,7 @@ class Run:
         strains = self._strains(solution)
         spec = self.case.imaging
         key = image_key(solution, strains, spec)
-        self._stage(
+        self.stages.do(
             "image",
             key,
             lambda: make_images(solution, strains, spec, folder, self.progress),
@@ -114,7 +116,7 @@ class Run:
             for strain, path in paths.items():
                 self._correlate_one(images, strain).write(path)
 
-        self._stage("correlate", self._correlate_key(images), work, *paths.values())
+        self.stages.do("correlate", self._correlate_key(images), work, *paths.values())
         return {strain: Result.read(path) for strain, path in paths.items()}
 
     def validate(self) -> dict[str, Any]:
@@ -127,7 +129,7 @@ class Run:
         """
         images = self._images()
         key = self._correlate_key(images)
-        if self._finished("correlate").get("key") != key:
+        if self.stages.finished("correlate").get("key") != key:
             raise InputError(
                 f"expected results of this case in {self.folder / 'correlation'}, found none that "
                 "are finished; make them with 'modeharvest correlate'"
@@ -139,11 +141,11 @@ class Run:
             case = self.case
             experiment, how = case.experiment, case.correlation
             measured = Measured(experiment, how, self._solution(), images, results)
-            taken = {stage: self._finished(stage).get("seconds") for stage in STAGES[:-1]}
+            taken = {stage: self.stages.finished(stage).get("seconds") for stage in STAGES[:-1]}
             validate(measured, case.plain(), taken, self.folder, self.progress)
 
-        key = _digest([key, self.case.title, __version__])
-        self._stage("validate", key, work, path, self.folder / "report.html")
+        key = digest([key, self.case.title, __version__])
+        self.stages.do("validate", key, work, path, self.folder / "report.html")
         summary: dict[str, Any] = read_json(path)
         return summary
 
@@ -177,7 +179,7 @@ class Run:
         return images
 
     def _correlate_key(self, images: ImageSet) -> str:
-        return _digest([images.info["key"], self.case.plain()["correlation"], __version__])
+        return digest([images.info["key"], self.case.plain()["correlation"], __version__])
 
     def _simulate(self) -> Solution:
         try:
@@ -229,45 +231,6 @@ class Run:
             self.progress,
         )
 
-    # -- what is finished ---------------------------------------------------------------
-
-    def _finished(self, stage: str) -> dict[str, Any]:
-        return dict(self._record().get(stage, {}))
-
-    def _record(self) -> dict[str, Any]:
-        """What ``stages.json`` says; nothing if it is missing or damaged."""
-        try:
-            return dict(read_json(self.folder / "stages.json"))
-        except (InputError, TypeError, ValueError):
-            return {}
-
-    def _stage(
-        self,
-        name: str,
-        key: str,
-        work: Callable[[], object],
-        *outputs: Path,
-        collective: bool = False,
-    ) -> None:
-        """Do the work unless it was finished with the same key and its files are there.
-
-        Under mpirun, rank 0 does it alone and the others wait, unless it is ``collective``.
-        """
-        finished = self._finished(name).get("key") == key
-        if agreed(finished and all(path.is_file() for path in outputs)):
-            return
-        begin = time.perf_counter()
-        if is_first():
-            require_writable(self.folder)
-            for path in outputs:  # what is there is of other inputs: not to be taken for this
-                path.unlink(missing_ok=True)
-        if is_first() or collective:
-            work()
-        if is_first():
-            record = {"key": key, "seconds": time.perf_counter() - begin}
-            write_json(self.folder / "stages.json", {**self._record(), name: record})
-        agreed(True)  # nobody reads the files before they are there
-
 
 def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
     """Run a case from simulation to report; what ``modeharvest run`` does.
@@ -288,7 +251,3 @@ def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent
     """
     case = case if isinstance(case, Case) else read_case(case)
     return Run(case, Path(folder), progress).all()
-
-
-def _digest(content: object) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,333 @@
+"""The analysis of an infinite lattice in one folder, in stages that can be resumed.
+
+::
+
+    critical.json                   critical    the first critical load over all wave vectors
+    dispersion.h5 dispersion.csv    dispersion  lowest eigenvalues against the wave vector
+    modes.h5 modes.vtu modes.xdmf   modes       real modes and buckled branches
+    family_*.json                   families    their spectra and mode families
+    study.csv                       study       how the pattern depends on d/l and more
+    report.html summary.json        report      everything of it that is there
+    stages.json                                 which stages are finished, and what they took
+
+``modeharvest bloch`` is the first two, ``modeharvest modes`` all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from modeharvest import __version__
+from modeharvest.errors import MissingDependencyError
+from modeharvest.fem.dispersion import Dispersion, ZoneMap, dispersion, zone_map
+from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_xdmf
+from modeharvest.fem.modes import Branch, ModeSet
+from modeharvest.files import read_json, write_json
+from modeharvest.lattice_case import LatticeCase, read_lattice_case
+from modeharvest.lattice_patterns import (
+    PatternFamily,
+    find_family,
+    find_modes,
+    patterns,
+    read_pattern_family,
+    why_no_modes,
+)
+from modeharvest.lattice_summary import exports_in, summary_of
+from modeharvest.lattice_tables import FileLattice
+from modeharvest.progress import Progress, silent
+from modeharvest.stages import Stages, digest, file_digest
+from modeharvest.validation.lattice_report import CriticalPoint, LatticeRun, write_lattice_report
+from modeharvest.validation.mode_study import ModeStudy
+
+if TYPE_CHECKING:  # their modules need dolfinx
+    from modeharvest.fem.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattices import UnitCell
+
+_NO_DOLFINX = (
+    "infinite lattices need dolfinx >= 0.9, slepc4py and gmsh: install them with 'conda install "
+    "-c conda-forge fenics-dolfinx slepc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-slepc4py python3-gmsh python3-h5py-mpi'"
+)
+
+
+@dataclass(frozen=True)
+class LatticeAnalysis:
+    """A lattice's case, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    case
+        What to do.
+    folder
+        Where; made if it does not exist.
+    progress
+        Listener.
+    command
+        That is running, for the report.
+    """
+
+    case: LatticeCase
+    folder: Path
+    progress: Progress = silent
+    command: str = "modeharvest"
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    def critical(self) -> CriticalPoint:
+        """Find the first critical load over all wave vectors; leaves ``critical.json``.
+
+        Raises
+        ------
+        InputError
+            If the cell is not periodic, or the lattice is a mechanism.
+        MissingDependencyError
+            If dolfinx is not there.
+        """
+        path = self.folder / "critical.json"
+
+        def work() -> None:
+            from modeharvest.fem.bloch_critical import CriticalSearch, first_critical
+
+            search = CriticalSearch(**asdict(self.case.search))
+            found = first_critical(self._path(), search, self.progress)
+            point = CriticalPoint.of(self.case.loading.name, found)
+            history = [asdict(least) for least in found.history]
+            write_json(path, {"point": asdict(point), "history": history})
+
+        self.stages.do("critical", self._keys["critical"], work, path)
+        return _point(read_json(path)["point"])
+
+    def dispersion(self) -> Dispersion:
+        """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
+        critical, plan = self.critical(), self.case.dispersion
+        path = self.folder / "dispersion.h5"
+        table = path.with_suffix(".csv")
+
+        def work() -> None:
+            cell_path, zone = self._path(), list[ZoneMap]()
+            tour = plan.tour(self.case.lattice, self.case.loading)
+            loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
+            found = dispersion(cell_path, tour, loads, plan.points, plan.bands, self.progress)
+            if plan.map_divisions:
+                divisions = plan.map_divisions
+                zone.append(zone_map(cell_path, critical.load, divisions, self.progress))
+            replace(found, zone=tuple(zone)).write(path)
+            found.write_csv(table)
+
+        self.stages.do("dispersion", self._keys["dispersion"], work, path, table)
+        return Dispersion.read(path)
+
+    def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
+        """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
+
+        Raises
+        ------
+        InputError
+            If a wave asked for doesn't repeat within a dozen cells, or a load can't be reached.
+        """
+        critical, plan = self.critical(), self.case.modes
+        if why_no_modes(critical, plan):
+            return None, ()
+        path = self.folder / "modes.h5"
+        others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
+
+        def work() -> None:
+            cell_path, info = self._path(), self._info(critical)
+            found = find_modes(cell_path, self.case.material, critical, plan, info, self.progress)
+            write_modes(path, *found)
+            for write, other in others.items():
+                write(other, *found)
+
+        self.stages.do("modes", self._keys["modes"], work, path, *others.values())
+        return read_modes(path)
+
+    def families(self) -> list[PatternFamily]:
+        """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
+        critical, plan = self.critical(), self.case.modes
+        modes, branches = self.modes()
+        index = self.folder / "families.json"
+
+        def work() -> None:
+            load = plan.load or critical.load
+            every = patterns(self._path(), load, modes, branches, self._info(critical))
+            for k, pattern in enumerate(every):
+                self.progress(k, len(every), "mode families")
+                path = self.folder / f"family_{pattern.name}.json"
+                find_family(pattern, self.case.lattice.pitch, path)
+            self.progress(1, 1, "mode families")
+            write_json(index, [f"family_{pattern.name}.json" for pattern in every])
+
+        self.stages.do("families", self._keys["families"], work, index)
+        return [read_pattern_family(self.folder / name) for name in read_json(index)]
+
+    def study(self) -> ModeStudy | None:
+        """Do the study, if the case has one; leaves ``study.csv``."""
+        if self.case.study is None:
+            return None
+        path, key = self.folder / "study.csv", self._keys["study"]
+        # Rows of this very study only, to go on from where it was broken off.
+        rows = self.folder / f"study-{key[:8]}.csv"
+
+        def work() -> None:
+            self.case.run_study(rows, self.progress)
+            rows.replace(path)
+
+        self.stages.do("study", key, work, path)
+        return self.case.run_study(path, self.progress)
+
+    def report(self) -> dict[str, Any]:
+        """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
+
+        Whatever was computed in this folder for this very case is in it.
+        """
+        path, page = self.folder / "summary.json", self.folder / "report.html"
+
+        def work() -> None:
+            run = self._run()
+            families = self.families() if "families" in self._finished else []
+            write_lattice_report(page, run, self.progress)
+            write_json(path, summary_of(run, self.case, families))
+
+        key = digest([self._finished, self.case.title, self.command, __version__])
+        self.stages.do("report", key, work, path, page)
+        content: dict[str, Any] = read_json(path)
+        return content
+
+    def bloch(self) -> dict[str, Any]:
+        """Stability against all waves, and dispersion; returns the content of ``summary.json``."""
+        self.dispersion()
+        return self.report()
+
+    def all(self) -> dict[str, Any]:
+        """All stages that are not finished; returns the content of ``summary.json``."""
+        self.dispersion()
+        self.families()
+        self.study()
+        return self.report()
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _info(self, critical: CriticalPoint) -> dict[str, Any]:
+        """What a mode's user must know of where it comes from."""
+        content = self.case.plain()
+        tables = {name: content[name] for name in ("title", "lattice", "material", "loading")}
+        return {**tables, "critical": asdict(critical)}
+
+    def _run(self) -> LatticeRun:
+        """All there is, for the report."""
+        from modeharvest.fem import dolfinx_api
+
+        unit, done, critical = self._unit, self._finished, self.critical()
+        modes, branches = self.modes() if "modes" in done else (None, ())
+        return LatticeRun(
+            title=self.case.title or "An infinite lattice",
+            case=self.case.plain(),
+            command=self.command,
+            mesh=unit.mesh,
+            lattice=unit.lattice,
+            pitch=self.case.lattice.pitch,
+            critical=(critical,),
+            dispersion=self.dispersion() if "dispersion" in done else None,
+            modes=modes,
+            branches=branches,
+            study=self.study() if "study" in done else None,
+            notes=[note for note in (why_no_modes(critical, self.case.modes),) if note],
+            exports=exports_in(self.folder),
+            timings={name: self.stages.finished(name)["seconds"] for name in done},
+            versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
+        )
+
+    @cached_property
+    def _keys(self) -> dict[str, str]:
+        """By stage, the digest of all that its outcome depends on."""
+        content = self.case.plain()
+        lattice = self.case.lattice
+        if isinstance(lattice, FileLattice):
+            content["lattice"]["content"] = file_digest(lattice.path)
+        tables = {name: content[name] for name in ("lattice", "material", "loading", "search")}
+        critical = digest([tables, __version__])
+        return {
+            "critical": critical,
+            "dispersion": digest([critical, content["dispersion"]]),
+            "modes": digest([critical, content["modes"]]),
+            "families": digest([critical, content["modes"], "families"]),
+            "study": digest([tables, content["study"], __version__]),
+        }
+
+    @property
+    def _finished(self) -> dict[str, str]:
+        """The keys of the stages that are finished for this very case."""
+        return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
+
+    @cached_property
+    def _unit(self) -> UnitCell:
+        try:
+            return self.case.lattice.cell()
+        except ImportError as error:
+            raise MissingDependencyError(_NO_DOLFINX) from error
+
+    @cached_property
+    def _cell(self) -> PeriodicCell:
+        try:
+            from modeharvest.fem.cell import PeriodicCell
+        except ImportError as error:
+            raise MissingDependencyError(_NO_DOLFINX) from error
+        return PeriodicCell(self._unit, self.case.material)
+
+    def _path(self) -> CellPath:
+        """The primary path from its beginning, so that no stage depends on another's steps."""
+        cell = self._cell  # first: without dolfinx it says what is missing
+        from modeharvest.fem.cell import CellPath
+
+        return CellPath(cell, self.case.loading.macro())
+
+
+def bloch(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
+) -> dict[str, Any]:
+    """Analyse a lattice's stability against all waves; what ``modeharvest bloch`` does.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a LatticeCase.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    return _analysis(case, folder, progress, "bloch").bloch()
+
+
+def modes(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
+) -> dict[str, Any]:
+    """Do all of a lattice's analysis; what ``modeharvest modes`` does. Parameters as ``bloch``."""
+    return _analysis(case, folder, progress, "modes").all()
+
+
+def _analysis(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress, command: str
+) -> LatticeAnalysis:
+    name = "CASE" if isinstance(case, LatticeCase) else case
+    case = case if isinstance(case, LatticeCase) else read_lattice_case(case)
+    said = f"modeharvest {command} {name} --out {folder}"
+    return LatticeAnalysis(case, Path(folder), progress, said)
+
+
+def _point(content: Mapping[str, Any]) -> CriticalPoint:
+    waves = {name: tuple(map(tuple, content[name])) for name in ("waves", "earlier")}
+    signs = {name: tuple(content[name]) for name in ("below", "above")}
+    return CriticalPoint(**{**content, **waves, **signs})
