@@ -8,56 +8,19 @@ what was missed is said.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 import synthetic_report as made_up
+from html_page import Page
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.validation import words
 from modeharvest.validation.page import fixed, short
 from modeharvest.validation.plots import PANELS, Atlas
 from modeharvest.validation.report import write_report
-
-VOID = {"meta", "link", "br", "img", "hr", "input"}
-
-
-class Page(HTMLParser):
-    """The ids, links and balance of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.ids: Counter[str] = Counter()
-        self.links: list[str] = []
-        self.sources: list[str] = []
-        self.tags: Counter[str] = Counter()
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags[tag] += 1
-        if tag not in VOID:
-            self.open.append(tag)
-        self._note(tag, dict(attrs))
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags[tag] += 1
-        self._note(tag, dict(attrs))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag, f"</{tag}> closes something else"
-
-    def _note(self, tag: str, attributes: dict[str, str | None]) -> None:
-        if attributes.get("id"):
-            self.ids[str(attributes["id"])] += 1
-        for name in ("src", "href", "srcset", "data", "poster", "action"):
-            value = attributes.get(name)
-            if value is not None:
-                (self.links if tag in ("a", "use") else self.sources).append(value)
 
 
 def report(atlas: Atlas, folder: Path, summary: dict[str, Any]) -> str:
