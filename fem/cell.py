@@ -68,7 +68,7 @@ class Failure(Enum):
     """Why there is no equilibrium, in words."""
 
     NOT_CONVERGED = "Newton's method did not converge"
-    REVERSED = "an element is turned inside out (det F <= 0)"
+    REVERSED = "an element would be turned inside out (det F <= 0)"
 
 
 @dataclass(frozen=True, eq=False)

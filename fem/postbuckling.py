@@ -3,15 +3,15 @@
 A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
 load is an unknown, which is regular where the branch leaves the primary path and where its load
 has a maximum or minimum; so branches along which the load falls are followed as well. The states
-at the loads asked for are then met exactly. Contact isn't
-modelled: a branch ends where the material would run into itself.
+at the loads asked for are then met exactly. Contact isn't modelled: a
+branch ends where the material would run into itself.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +29,7 @@ FloatArray = NDArray[np.float64]
 
 _BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
 _CRITICAL = 1e-3  # of the eigenvalues' scale: what a critical mode may have
+_NEAR = 0.5  # of a step: how far from where it is expected a point may be
 _REFINEMENTS = 6
 
 
@@ -39,14 +40,15 @@ class BranchOptions:
     Parameters
     ----------
     first, longest
-        First and largest step of the amplitude, which is the rms displacement in the mode [-].
+        First and largest step of the amplitude, the rms displacement in the mode [-].
     growth
         Of the step from one point to the next.
     farthest
         The amplitude where to give up [-].
     """
 
-    first: float = 0.002
+    # At small amplitudes the directions of a degenerate set are all but equivalent.
+    first: float = 0.01
     longest: float = 0.02
     growth: float = 1.6
     farthest: float = 0.4
@@ -152,10 +154,15 @@ class _Tracing:
         return Branch(mix, tuple(states), self._in_words(states, loads), curve)
 
     def _in_words(self, states: list[BranchState], loads: list[float]) -> str:
-        if len(self.points) < 2:
+        if not self.points:
             return f"not followed: {self.stopped}"
-        start, first, last = self.points[0], self.points[1], self.points[-1]
-        way = "rises" if first.load > start.load else "falls"
+        start, last = self.points[0], self.points[-1]
+        if len(self.points) == 1:
+            return (
+                f"not followed from the load {start.load:.6g} on: {self.stopped}; perhaps no branch "
+                "starts along this combination of the modes"
+            )
+        way = "rises" if self.points[1].load > start.load else "falls"
         text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
         text += f"amplitude {last.amplitude:.4g} mm"
         text += f"; {self.stopped}" if self.stopped else ""
@@ -176,9 +183,11 @@ class _Tracing:
             if isinstance(found, str):
                 step *= 0.5
                 if step < 0.05 * options.first * self.pitch:
-                    self.stopped = f"there {found}"
+                    self.stopped = found
                     return
                 continue
+            if len(self.points) == 1:
+                self.points[0] = self._turned(start, found)
             self.points.append(found)
             yield found
             step = min(options.growth * step, options.longest * self.pitch)
@@ -202,14 +211,20 @@ class _Tracing:
         values = _flat(below.load, below.gradient, below.fluctuation)
         values += (load - below.load) * _flat(1.0, below.gradient_rate, below.fluctuation_rate)
         self.origin = values[5:]
-        return _Point(0.0, values, _flat(0.0, np.zeros((2, 2)), self._direction()))
+        return _Point(0.0, values, _flat(0.0, np.zeros((2, 2)), self._direction(self.mix)))
 
-    def _direction(self) -> FloatArray:
-        """The combination as a fluctuation; one master is held by a translation."""
+    def _direction(self, mix: FloatArray) -> FloatArray:
+        """A combination of the modes as a fluctuation; one master is held by a translation."""
         periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
         at_masters = np.empty((periodicity.count, 2))
-        at_masters[periodicity.master] = np.tensordot(self.mix, self.modes.shapes, 1)
+        at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
         return np.asarray((at_masters - at_masters[0]).ravel()[order])
+
+    def _turned(self, start: _Point, first: _Point) -> _Point:
+        """The start with the direction in which the branch really leaves, to judge by a point."""
+        amplitudes = self.weights @ (first.values[5:] - self.origin)
+        direction = self._direction(amplitudes) / first.amplitude
+        return replace(start, rates=_flat(0.0, np.zeros((2, 2)), direction))
 
     def _at_amplitude(self, points: Sequence[_Point], amplitude: float) -> _Point | str:
         """The point of the branch at an amplitude, from one or two before it; or why not."""
@@ -221,7 +236,7 @@ class _Tracing:
         if self._overlaps(found):
             return "the material would run into itself (contact is not modelled)"
         off = found.fluctuation - guess[5:]
-        if off @ (self.mass @ off) > (amplitude - points[-1].amplitude) ** 2:
+        if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
             return "another branch is nearer"
         rates = _flat(1.0, found.gradient_rate, found.fluctuation_rate)
         rates /= weights @ found.fluctuation_rate
