@@ -256,8 +256,8 @@ def _refuse_unless_rectangular(mesh: Mesh) -> None:
     gaps = [np.abs(middles - bound).min(axis=0) for bound in (low, high)]
     if np.max(gaps) > near:
         raise InputError(
-            f"expected lattice vectors, because the cell does not fill a rectangle of "
-            f"{high[0] - low[0]:.5g} x {high[1] - low[1]:.5g} mm along x and y; give them as two rows"
+            "expected lattice vectors as two rows, because the cell does not fill a rectangle of "
+            f"{high[0] - low[0]:.5g} x {high[1] - low[1]:.5g} mm along x and y, got none"
         )
 
 

@@ -48,9 +48,10 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     Raises
     ------
     InputError
-        If the scatter could close a ligament: four standard deviations beyond half of it.
+        If the scatter could close the thinnest ligament: four standard deviations beyond half of
+        it.
     """
-    ligament = specimen.pitch - specimen.diameter
+    ligament = specimen.pitch - specimen.diameters.max()
     reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
     if reach > 0.5 * ligament:
         raise InputError(
@@ -63,8 +64,8 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     growth = random.normal(0.0, 1.0, len(centres)) * 0.5 * imperfection.diameter_sd
 
     nodes = mesh.nodes.copy()
-    radius, outer = 0.5 * specimen.diameter, 0.5 * specimen.pitch
-    for centre, move, grow in zip(centres, shift, growth, strict=True):
+    radii, outer = 0.5 * specimen.diameters, 0.5 * specimen.pitch
+    for centre, radius, move, grow in zip(centres, radii, shift, growth, strict=True):
         arm = mesh.nodes - centre
         distance = np.linalg.norm(arm, axis=1)
         near = distance < outer

@@ -1,9 +1,9 @@
 """T6 meshes with the specimen's own symmetries: one quarter cell, mirrored and tiled.
 
 A mesh without the mirror symmetries turns the bifurcation into an imperfect one, and Newton
-slips onto a branch unnoticed. So gmsh meshes only four small blocks (a quarter of a unit
-cell, a piece of each bulk strip, a corner), whose shared sides are divided alike, and numpy
-reflects and places them. Mid-side nodes of hole edges lie on the circle.
+slips onto a branch unnoticed. So gmsh meshes only a few small blocks (a quarter of a unit
+cell for each diameter, a piece of each bulk strip, a corner), whose shared sides are divided
+alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on the circle.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ def rectangle(width: float, height: float, n_width: int, n_height: int) -> Block
 
 
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
-    """The specimen's T6 mesh, symmetric about both axes to the last bit.
+    """The specimen's T6 mesh, symmetric to the last bit about the axes that the holes have.
+
+    Those are both, unless diameters are graded.
 
     Parameters
     ----------
@@ -126,9 +128,10 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
     half = 0.5 * specimen.pitch
     a, b = specimen.cellular_half_size
     n_half = divisions_of(half, size)
-    cell = quarter_cell(specimen.pitch, specimen.diameter, size)
-    for x, y in specimen.hole_centres:
-        yield from (cell.placed(sign, (x, y)) for sign in _SIGNS)
+    diameters, which = np.unique(specimen.diameters, return_inverse=True)
+    cells = [quarter_cell(specimen.pitch, float(d), size) for d in diameters]
+    for (x, y), k in zip(specimen.hole_centres, which, strict=True):
+        yield from (cells[k].placed(sign, (x, y)) for sign in _SIGNS)
 
     centres_x = (np.arange(specimen.holes_x) - 0.5 * (specimen.holes_x - 1)) * specimen.pitch
     centres_y = (np.arange(specimen.holes_y) - 0.5 * (specimen.holes_y - 1)) * specimen.pitch

@@ -22,12 +22,16 @@ class Specimen:
     holes_x, holes_y
         Number of holes in the loading and in the transverse direction [-].
     diameter
-        Hole diameter d [mm].
+        Hole diameter d [mm]; of a graded specimen, the one at its centre.
     pitch
         Centre-to-centre distance l, the unit cell size [mm].
     bulk_x, bulk_y
         Width of the solid strips beside the cellular part, at the loaded edges and at the
         free edges [mm]; 0 leaves them out.
+    grading_x, grading_y
+        Change of the diameter from hole to hole, per distance of their centres in the loading and
+        in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A
+        specimen graded in one direction keeps its mirror symmetry in the other.
     """
 
     holes_x: int = 6
@@ -36,6 +40,8 @@ class Specimen:
     pitch: float = 1.9
     bulk_x: float = 1.9
     bulk_y: float = 0.9
+    grading_x: float = 0.0
+    grading_y: float = 0.0
 
     def __post_init__(self) -> None:
         if self.holes_x < 1 or self.holes_y < 1:
@@ -54,6 +60,12 @@ class Specimen:
             raise InputError(
                 "specimen: expected bulk edges of 0 mm or more, got "
                 f"bulk_x = {self.bulk_x} mm, bulk_y = {self.bulk_y} mm"
+            )
+        smallest, largest = self.diameters.min(), self.diameters.max()
+        if not 0 < smallest <= largest < self.pitch:
+            raise InputError(
+                f"specimen: expected every hole with 0 < d < {self.pitch} mm, the pitch, got d from "
+                f"{smallest:.5g} to {largest:.5g} mm; make grading_x and grading_y smaller"
             )
 
     @property
@@ -78,6 +90,11 @@ class Specimen:
         x = (np.arange(self.holes_x) - 0.5 * (self.holes_x - 1)) * self.pitch
         y = (np.arange(self.holes_y) - 0.5 * (self.holes_y - 1)) * self.pitch
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    @property
+    def diameters(self) -> NDArray[np.float64]:
+        """(holes_x * holes_y,) diameters of the holes [mm], in the order of ``hole_centres``."""
+        return self.diameter + self.hole_centres @ [self.grading_x, self.grading_y]
 
     def pattern(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The square lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].

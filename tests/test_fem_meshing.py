@@ -26,6 +26,7 @@ CASES = [
     (Specimen(5, 4, diameter=1.1, pitch=1.386, bulk_x=0.31), 0.2),
 ]
 cases = pytest.mark.parametrize(("specimen", "size"), CASES)
+GRADED = Specimen(4, 3, diameter=1.4, grading_x=0.08, bulk_x=0.5)
 
 few = settings(max_examples=8, deadline=None, derandomize=True)
 
@@ -88,7 +89,7 @@ def on_outer_edge(points: NDArray[np.float64], specimen: Specimen) -> NDArray[np
 
 def on_hole(points: NDArray[np.float64], specimen: Specimen) -> NDArray[np.bool_]:
     arms = points[:, None] - specimen.hole_centres
-    off = np.abs(np.linalg.norm(arms, axis=-1) - 0.5 * specimen.diameter)
+    off = np.abs(np.linalg.norm(arms, axis=-1) - 0.5 * specimen.diameters)
     return np.asarray(np.min(off, axis=1) < 1e-12)
 
 
@@ -187,6 +188,53 @@ def test_pattern_is_that_of_the_paper_about_a_junction() -> None:
     np.testing.assert_allclose(got, sign * expected, atol=1e-12)
 
 
+def test_grading_gives_every_hole_its_diameter() -> None:
+    specimen = Specimen(3, 2, diameter=1.0, pitch=2.0, grading_x=0.1, grading_y=-0.2)
+    expected = {(x, y): 1.0 + 0.1 * x - 0.2 * y for x in (-2.0, 0.0, 2.0) for y in (-1.0, 1.0)}
+    assert dict(zip(rows(specimen.hole_centres), specimen.diameters, strict=True)) == pytest.approx(
+        expected
+    )
+    mesh = mesh_specimen(specimen, 0.2)
+    for centre, diameter in expected.items():
+        distance = np.linalg.norm(mesh.nodes - centre, axis=1)
+        assert distance.min() == pytest.approx(0.5 * diameter, rel=1e-12)
+        # Twice as many nodes as elements of at most 0.2 mm on each quarter of the edge.
+        on_edge = np.sum(np.abs(distance - 0.5 * diameter) < 1e-12)
+        assert on_edge == 8 * np.ceil(0.25 * np.pi * diameter / 0.2)
+
+
+def test_a_graded_mesh_is_sound_and_has_the_mirror_symmetry_that_is_left() -> None:
+    mesh = mesh_specimen(GRADED, 0.25)
+    assert smallest_bernstein(mesh) > 0.0
+    assert not cKDTree(mesh.nodes).query_pairs(1e-6)
+    shared = edges(mesh)
+    boundary = np.array([edge for edge, count in shared.items() if count == 1]).ravel()
+    points = mesh.nodes[boundary]
+    assert np.all(on_outer_edge(points, GRADED) | on_hole(points, GRADED))
+    places = set(rows(mesh.nodes))
+    assert set(rows(mesh.nodes * [1.0, -1.0] + 0.0)) == places
+    assert set(rows(mesh.nodes * [-1.0, 1.0] + 0.0)) != places
+    a, b = GRADED.half_size
+    exact = 4 * a * b - 0.25 * np.pi * np.sum(GRADED.diameters**2)
+    # Parabolas through three points of a circle: h^4 / 720 r^3 a length, with h up to 0.25.
+    assert area(mesh) == pytest.approx(exact, rel=1e-4)
+
+
+def test_scatter_of_a_graded_specimen_leaves_its_edges_and_topology() -> None:
+    mesh = mesh_specimen(GRADED, 0.25)
+    scattered = perturb(mesh, GRADED, Imperfection(0.005, 0.005, seed=3))
+    outer = on_outer_edge(mesh.nodes, GRADED)
+    assert np.array_equal(scattered.nodes[outer], mesh.nodes[outer])
+    assert smallest_bernstein(scattered) > 0.0
+    for centre, diameter in zip(GRADED.hole_centres, GRADED.diameters, strict=True):
+        rim = np.abs(np.linalg.norm(mesh.nodes - centre, axis=1) - 0.5 * diameter) < 1e-12
+        points = scattered.nodes[rim] - centre
+        system = np.column_stack([2 * points, np.ones(len(points))])
+        square = np.sum(points**2, axis=1)
+        solution, *_ = np.linalg.lstsq(system, square)
+        np.testing.assert_allclose(system @ solution, square, rtol=0, atol=1e-12)
+
+
 def test_scatter_moves_holes_but_neither_edges_nor_topology() -> None:
     mesh = mesh_specimen(SMALL, 0.2)
     scattered = perturb(mesh, SMALL, Imperfection(0.01, 0.02, seed=3))
@@ -231,6 +279,16 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
         (lambda: Specimen(diameter=float("nan")), "0 < diameter < pitch"),
         (lambda: Specimen(bulk_y=float("nan")), "bulk edges of 0 mm or more"),
         (lambda: Specimen(pitch=float("inf")), "finite"),
+        (
+            lambda: Specimen(grading_x=0.1),
+            r"0 < d < 1.9 mm, the pitch, got d from 1.025 to 1.975 mm",
+        ),
+        (lambda: Specimen(grading_y=-0.2), "every hole with 0 < d < 1.9 mm"),
+        (lambda: Specimen(grading_x=float("nan")), "got d from nan"),
+        (
+            lambda: perturb(mesh_specimen(GRADED, 0.25), GRADED, Imperfection(0.05)),
+            "<= 0.136 mm, half a ligament, got 0.2 mm",
+        ),
         (lambda: mesh_specimen(SMALL, 0.0), "positive length in mm, got 0"),
         (lambda: mesh_specimen(SMALL, float("nan")), "positive length in mm, got nan"),
         (lambda: mesh_specimen(SMALL, 0.7), "at most 0.589 mm .*got 0.7 mm"),
