@@ -12,6 +12,7 @@ from modeharvest.files import atomic
 from modeharvest.idic.lattice_spectrum import upward
 from modeharvest.progress import Progress, silent
 from modeharvest.validation import lattice_words as words
+from modeharvest.validation.independence import PatternMode
 from modeharvest.validation.lattice_run import SHAPE, CriticalPoint, FoundPattern, LatticeRun
 from modeharvest.validation.page import render, short
 from modeharvest.validation.patch import Patch
@@ -181,12 +182,15 @@ def _study(run: LatticeRun) -> dict[str, Any]:
         _picture("overlaps", "Overlap with Eq. (mode)", draw_overlaps(study.ratios)),
         _picture("captured", "Energy captured", draw_captured(study.ratios)),
     ]
-    overlays = [
-        _picture(f"overlay-{n}", f"d/l = {mode.row.ratio:.4g}",
-                 draw_overlay(mode.mesh, mode.row.pitch, mode.shape, mode.analytic,
-                              SHAPE * mode.row.pitch),
-                 f"overlap {mode.row.overlap:.4f}; {mode.row.loading}, state at "
-                 f"{100 * mode.row.state:.4g} %")
-        for n, mode in enumerate(study.overlays, start=1)
-    ]  # fmt: skip
+    overlays = [_overlay(mode, n) for n, mode in enumerate(study.overlays, start=1)]
     return {"curves": curves if study.ratios else [], "overlays": overlays}
+
+
+def _overlay(mode: PatternMode, n: int) -> Picture:
+    """Both modes on one cell, less enlarged where small holes would close."""
+    row = mode.row
+    size = min(SHAPE, 0.4 * row.ratio)
+    drawn = draw_overlay(mode.mesh, row.pitch, mode.shape, mode.analytic, size * row.pitch)
+    fact = f"overlap {row.overlap:.4f}; largest displacement {size:.3g} l; {row.loading}, state at "
+    fact += f"{100 * row.state:.4g} %" + ("" if row.is_first else ", where it is not critical")
+    return _picture(f"overlay-{n}", f"d/l = {row.ratio:.4g}", drawn, fact)

@@ -173,7 +173,7 @@ def _likeness(rows: Sequence[ModeRow], what: str, remark: str) -> list[str]:
     if not known:
         return []
     least = min(known)
-    number = f"1 − {1 - least:.1e}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
+    number = f"1 − {short(1 - least)}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
     text = f"Modes of other {what} overlap with the reference's by at least {number}"
     return [text + (f" ({remark})." if remark else ".")]
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from modeharvest.fem.modes import Branch
 from modeharvest.validation.mode_table import ModeRow
-from modeharvest.validation.plots_path import curve
+from modeharvest.validation.plots_path import curve, say
 from modeharvest.validation.style import BLUE, GOLD, GREEN, INK, MUTED, RED, style
 
 FloatArray = NDArray[np.float64]
@@ -114,7 +114,13 @@ def draw_overlaps(rows: Sequence[ModeRow]) -> Figure:
 
 def draw_captured(rows: Sequence[ModeRow]) -> Figure:
     """Draw the energy that the automatically found family captures against d/l."""
-    return _over_ratio(rows, "energy in the automatic family [%]", lambda r: 100.0 * r.captured)
+    drawn = _over_ratio(rows, "energy in the automatic family [%]", lambda r: 100.0 * r.captured)
+    for colour, loading in zip(_COLOURS, _loadings(rows), strict=False):
+        for row in _series(rows, loading):
+            if row.waves > 2:
+                say(drawn.axes[0], row.ratio, 100.0 * row.captured, str(row.waves), colour,
+                    (0, 5), "center")  # fmt: skip
+    return drawn
 
 
 def draw_critical_strains(rows: Sequence[ModeRow]) -> Figure:
@@ -130,6 +136,8 @@ def draw_critical_strains(rows: Sequence[ModeRow]) -> Figure:
             axes.plot(ratio, first, color=colour, lw=1.6, label=loading)
             _dots(axes, series, first, colour)
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         _legend(axes)
     return drawn
