@@ -12,16 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from modeharvest.errors import InputError
+from modeharvest.fem.branch_curve import BranchPoint, amplitude_at, flat, predicted
 from modeharvest.fem.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
 from modeharvest.fem.contact import overlaps
-from modeharvest.fem.continuation import hermite_weights
 from modeharvest.fem.modes import Branch, BranchState, ModeSet
 from modeharvest.progress import Progress, silent
 
@@ -101,22 +99,6 @@ def follow(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A point of the branch, seen as a function of the amplitude [mm].
-
-    ``values`` and ``rates`` (their derivatives by the amplitude) are flat: load, F̄, fluctuation.
-    """
-
-    amplitude: float
-    values: FloatArray
-    rates: FloatArray
-
-    @property
-    def load(self) -> float:
-        return float(self.values[0])
-
-
 class _Tracing:
     """One branch of one cell; ``points`` are those passed, ``stopped`` is why there are no more."""
 
@@ -127,19 +109,20 @@ class _Tracing:
         self.modes, self.mix, self.options = modes, mix, options
         self.pitch = float(np.linalg.norm(modes.primitive, axis=1).min())
         reduction, mass = self.cell.reduction, self.cell.nodal_mass
-        flat, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
+        shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
         # (m, size): times the fluctuation they are the amplitudes of the modes.
-        self.weights = reduction.gathered(np.asarray(mass @ flat.T)).T / material
+        self.weights = reduction.gathered(np.asarray(mass @ shapes.T)).T / material
         self.mass = self.cell.mass.at((0.0, 0.0)) / material
         below = path.at((1.0 - _BEFORE) * modes.load)
         self.primary = CellPath(self.cell, self.loading, [] if below is None else [below])
-        self.points: list[_Point] = []
+        self.points: list[BranchPoint] = []
         self.stopped = ""
 
     def run(self, loads: list[float], progress: Progress) -> Branch:
         """March along the branch, and report the loads asked for."""
         states: list[BranchState] = []
-        for here, there in pairwise(self._march()):
+        for _ in self._march():
+            here, there = self.points[-2:]
             progress(there.load, loads[-1], "buckled branch")
             low, high = sorted((here.load, there.load))
             met = [load for load in loads if low <= load <= high and load != here.load]
@@ -159,8 +142,8 @@ class _Tracing:
         start, last = self.points[0], self.points[-1]
         if len(self.points) == 1:
             return (
-                f"not followed from the load {start.load:.6g} on: {self.stopped}; perhaps no branch "
-                "starts along this combination of the modes"
+                f"not followed from the load {start.load:.6g} on: {self.stopped}; perhaps no "
+                "branch starts along this combination of the modes"
             )
         way = "rises" if self.points[1].load > start.load else "falls"
         text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
@@ -170,13 +153,12 @@ class _Tracing:
         missing = ", ".join(f"{load:.6g}" for load in loads if load not in met)
         return text + (f"; not met: {missing}" if missing else "")
 
-    def _march(self) -> Iterator[_Point]:
-        """Points of the branch by growing amplitude, the critical one first."""
+    def _march(self) -> Iterator[None]:
+        """Add to ``points`` by growing amplitude, pausing after each but the critical one."""
         start = self._start()
         if start is None:
             return
         self.points.append(start)
-        yield start
         options, step = self.options, self.options.first * self.pitch
         while self.points[-1].amplitude + step <= options.farthest * self.pitch:
             found = self._at_amplitude(self.points[-2:], self.points[-1].amplitude + step)
@@ -189,11 +171,11 @@ class _Tracing:
             if len(self.points) == 1:
                 self.points[0] = self._turned(start, found)
             self.points.append(found)
-            yield found
+            yield
             step = min(options.growth * step, options.longest * self.pitch)
         self.stopped = f"the largest amplitude asked for is {options.farthest} of the pitch"
 
-    def _start(self) -> _Point | None:
+    def _start(self) -> BranchPoint | None:
         """The critical point, extrapolated from where the tangent is regular, and the mode."""
         load = self.modes.load
         if not self.primary.states:
@@ -208,10 +190,10 @@ class _Tracing:
                 f"{largest:.3g} N/mm^4"
             )
             return None
-        values = _flat(below.load, below.gradient, below.fluctuation)
-        values += (load - below.load) * _flat(1.0, below.gradient_rate, below.fluctuation_rate)
+        values = flat(below.load, below.gradient, below.fluctuation)
+        values += (load - below.load) * flat(1.0, below.gradient_rate, below.fluctuation_rate)
         self.origin = values[5:]
-        return _Point(0.0, values, _flat(0.0, np.zeros((2, 2)), self._direction(self.mix)))
+        return BranchPoint(0.0, values, flat(0.0, np.zeros((2, 2)), self._direction(self.mix)))
 
     def _direction(self, mix: FloatArray) -> FloatArray:
         """A combination of the modes as a fluctuation; one master is held by a translation."""
@@ -220,15 +202,15 @@ class _Tracing:
         at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
         return np.asarray((at_masters - at_masters[0]).ravel()[order])
 
-    def _turned(self, start: _Point, first: _Point) -> _Point:
+    def _turned(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
         """The start with the direction in which the branch really leaves, to judge by a point."""
         amplitudes = self.weights @ (first.values[5:] - self.origin)
-        direction = self._direction(amplitudes) / first.amplitude
-        return replace(start, rates=_flat(0.0, np.zeros((2, 2)), direction))
+        direction = self._direction(amplitudes) * (1.0 / first.amplitude)
+        return replace(start, rates=flat(0.0, np.zeros((2, 2)), direction))
 
-    def _at_amplitude(self, points: Sequence[_Point], amplitude: float) -> _Point | str:
+    def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
         """The point of the branch at an amplitude, from one or two before it; or why not."""
-        weights, guess = self.mix @ self.weights, _predicted(points, amplitude)
+        weights, guess = self.mix @ self.weights, predicted(points, amplitude)
         wanted = Amplitude(weights, amplitude + float(weights @ self.origin))
         found = self._corrected(guess, wanted)
         if isinstance(found, Failure):
@@ -238,9 +220,9 @@ class _Tracing:
         off = found.fluctuation - guess[5:]
         if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
             return "another branch is nearer"
-        rates = _flat(1.0, found.gradient_rate, found.fluctuation_rate)
+        rates = flat(1.0, found.gradient_rate, found.fluctuation_rate)
         rates /= weights @ found.fluctuation_rate
-        return _Point(amplitude, _flat(found.load, found.gradient, found.fluctuation), rates)
+        return BranchPoint(amplitude, flat(found.load, found.gradient, found.fluctuation), rates)
 
     def _corrected(
         self, guess: FloatArray, amplitude: Amplitude | None = None
@@ -248,12 +230,12 @@ class _Tracing:
         load, F, w = float(guess[0]), guess[1:5].reshape(2, 2), guess[5:]
         return self.cell.corrected(self.loading, load, F, w, amplitude)
 
-    def _at_load(self, here: _Point, there: _Point, load: float) -> CellState | None:
+    def _at_load(self, here: BranchPoint, there: BranchPoint, load: float) -> CellState | None:
         """The state between two points at a load, which one of them is below and one above."""
         for _ in range(_REFINEMENTS):
             between = (here, there)
-            amplitude = _amplitude_at(load, between)
-            guess = _predicted(between, amplitude)
+            amplitude = amplitude_at(load, between)
+            guess = predicted(between, amplitude)
             guess[0] = load
             found = self._corrected(guess)
             if isinstance(found, CellState):
@@ -291,28 +273,6 @@ class _Tracing:
             displacement=u,
             amplitudes=self.weights @ (state.fluctuation - before),
         )
-
-
-def _flat(load: float, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
-    return np.concatenate([[load], gradient.ravel(), fluctuation])
-
-
-def _predicted(points: Sequence[_Point], amplitude: float) -> FloatArray:
-    """Values at an amplitude, by the tangent of one point or the cubic through two."""
-    if len(points) == 1:
-        return points[0].values + (amplitude - points[0].amplitude) * points[0].rates
-    p, q = points
-    a, b, c, d = hermite_weights(p.amplitude, q.amplitude, amplitude)
-    return a * p.values + b * p.rates + c * q.values + d * q.rates
-
-
-def _amplitude_at(load: float, between: tuple[_Point, _Point]) -> float:
-    """Where the cubic through two points, one below the load and one above, meets it."""
-
-    def excess(amplitude: float) -> float:
-        return float(_predicted(between, amplitude)[0]) - load
-
-    return float(brentq(excess, between[0].amplitude, between[1].amplitude))
 
 
 def _check(
