@@ -30,6 +30,7 @@ from modeharvest.validation.mode_table import ModeRow, Wave
 
 if TYPE_CHECKING:  # these need dolfinx
     from modeharvest.fem.bloch_critical import LatticeCritical
+    from modeharvest.fem.cell import CellPath
 
 FloatArray = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ EQ_MODE = square_family("hole")
 RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
 """Of d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
 
-_CLOSE = 0.002  # step of the load [-]
+_STEP, _CLOSE = 0.02, 0.002  # of the load [-]
 
 LOADINGS: dict[str, MacroLoading] = {
     "uniaxial": uniaxial(),
@@ -153,21 +154,16 @@ def mode_likeness(reference: PatternMode, other: PatternMode) -> float:
     return overlap_of_fields(reference.mesh, reference.shape, other.shape)
 
 
-def pattern_mode(lattice: Lattice) -> PatternMode:
-    """Find a lattice's first critical point and its lowest mode at (π, π).
+def pattern_row(lattice: Lattice) -> ModeRow:
+    """Find a lattice's first critical point, and what its lowest mode at (π, π) is like.
 
     The mode belongs to the first critical state, or without one to the last that was looked at.
     Where (π, π) is not what is critical there, its eigenvalue says how far off it is.
     """
     from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
-    from modeharvest.fem.cell import CellPath, PeriodicCell
     from modeharvest.fem.lattice_modes import real_modes
-    from modeharvest.fem.lattices import square
 
-    pitch = lattice.pitch
-    unit = square(pitch, lattice.ratio * pitch, pitch / lattice.divisions)
-    cell = PeriodicCell(unit, lattice.material)
-    path, search = CellPath(cell, lattice.loading), CriticalSearch(largest=lattice.largest)
+    path, search = _path(lattice), CriticalSearch(largest=lattice.largest)
     found = first_critical(path, search)
     if not found.found and found.load < lattice.largest:
         # The path ends within the next step, perhaps behind a critical point: look closely.
@@ -175,17 +171,47 @@ def pattern_mode(lattice: Lattice) -> PatternMode:
         found = first_critical(path, search)
     kind = kind_of(found, lattice.largest)
     alone = found if kind == "pattern" else critical_at(path, PATTERN, search)
-    modes = real_modes(cell, found.state, (PATTERN,))
-    automatic = mode_family(modes.mesh, modes.lattice, modes.shapes[0], pitch)
-    row = ModeRow(
+    modes = real_modes(path.cell, found.state, (PATTERN,))
+    pitch, shape = lattice.pitch, modes.shapes[0]
+    automatic = mode_family(modes.mesh, modes.lattice, shape, pitch)
+    return ModeRow(
         *lattice.key, found.found, found.load, kind, alone.load if alone.found else math.nan,
-        found.load, float(modes.eigenvalues[0]),
-        overlap(modes.mesh, modes.shapes[0], EQ_MODE, pitch), automatic.captured,
-        automatic.family.wave_count,
+        found.load, float(modes.eigenvalues[0]), overlap(modes.mesh, shape, EQ_MODE, pitch),
+        automatic.captured, automatic.family.wave_count,
     )  # fmt: skip
-    quarter = cKDTree(modes.mesh.nodes).query(unit.mesh.nodes)[1]
-    analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), unit.mesh.nodes, pitch)
-    return PatternMode(row, unit.mesh, *_alike(unit.mesh, modes.shapes[0][quarter], analytic))
+
+
+def pattern_mode(lattice: Lattice, row: ModeRow | None = None) -> PatternMode:
+    """The mode that a lattice's row is about; without a row, that is found first.
+
+    Raises
+    ------
+    InputError
+        If there is no equilibrium at the row's state: it is another lattice's.
+    """
+    from modeharvest.fem.lattice_modes import real_modes
+
+    row, path = row or pattern_row(lattice), _path(lattice)
+    for load in np.linspace(0.0, row.state, 2 + int(row.state / _STEP)):
+        state = path.at(float(load))
+    if state is None:
+        raise InputError(
+            f"mode study: expected an equilibrium at the load {row.state} of {lattice}, got none; "
+            "remove the table that this row is from"
+        )
+    modes, mesh = real_modes(path.cell, state, (PATTERN,)), path.cell.cell.mesh
+    quarter = cKDTree(modes.mesh.nodes).query(mesh.nodes)[1]
+    analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, lattice.pitch)
+    return PatternMode(row, mesh, *_alike(mesh, modes.shapes[0][quarter], analytic))
+
+
+def _path(lattice: Lattice) -> CellPath:
+    from modeharvest.fem.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattices import square
+
+    pitch = lattice.pitch
+    unit = square(pitch, lattice.ratio * pitch, pitch / lattice.divisions)
+    return CellPath(PeriodicCell(unit, lattice.material), lattice.loading)
 
 
 def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArray:

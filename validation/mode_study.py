@@ -16,6 +16,7 @@ from modeharvest.validation.independence import (
     PatternMode,
     mode_likeness,
     pattern_mode,
+    pattern_row,
     ratio_lattices,
 )
 from modeharvest.validation.mode_table import ModeRow, read_rows, write_rows
@@ -99,7 +100,7 @@ def study_modes(
     table, rows = table or Table(), []
     for n, lattice in enumerate(lattices):
         progress(n, len(lattices), "mode study")
-        rows.append(table.row(lattice, lambda it: pattern_mode(it).row))
+        rows.append(table.row(lattice, pattern_row))
     progress(1, 1, "mode study")
     return tuple(rows)
 
@@ -116,7 +117,7 @@ def study_likeness(
 
     def work(lattice: Lattice) -> ModeRow:
         if not made:
-            made.append(pattern_mode(reference))
+            made.append(pattern_mode(reference, table.row(reference, pattern_row)))
         mode = pattern_mode(lattice)
         return replace(mode.row, likeness=mode_likeness(made[0], mode))
 
@@ -171,7 +172,7 @@ def first_mode_limit(
     while high.ratio - low.ratio > tolerance:
         ratio = round(0.5 * (low.ratio + high.ratio), 6)
         lattice = replace(base, ratio=ratio, loading=LOADINGS[loading])
-        middle = table.row(lattice, lambda it: pattern_mode(it).row)
+        middle = table.row(lattice, pattern_row)
         low, high = (low, middle) if middle.is_first else (middle, high)
     return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
 
@@ -211,10 +212,11 @@ def run_study(
     limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
     scaled = [replace(base, pitch=pitch) for pitch in pitches]
     others = [replace(base, material=MATERIALS[name]) for name in materials]
+    overlaid = [replace(base, ratio=ratio) for ratio in shown]
     return ModeStudy(
         rows,
         study_likeness(base, scaled, kept, progress),
         study_likeness(base, others, kept, progress),
         tuple(limit for limit in limits if limit is not None),
-        tuple(pattern_mode(replace(base, ratio=ratio)) for ratio in shown),
+        tuple(pattern_mode(it, kept.row(it, pattern_row)) for it in overlaid),
     )

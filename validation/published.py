@@ -86,7 +86,7 @@ def _before(snapshot: Mapping[str, Any]) -> list[Expectation]:
 
 def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
     at = f" at {100 * snapshot['nominal_strain']:.1f} %"
-    worst = max(abs(v) for v in snapshot["mode_deviation_percent"])
+    worst = max((abs(v) for v in snapshot.get("mode_deviation_percent", ())), default=0.0)
     pattern, best = snapshot["pattern_amplitude_px"], snapshot["rms_best_fit_px"]
     loss = snapshot["rms_idic_to_best_fit_px"]
     length = snapshot["details_px"]["idic_to_best_fit"]["rms_length"]

@@ -16,8 +16,11 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
     ``mode_standard_error``, ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
     the full image), ``iterations_all_levels``, ``outcome``, ``outcome_why``,
-    ``condition_number``, ``undetermined``, ``pixels``, ``details_px`` (more statistics of w,
-    best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
+    ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
+    ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
+    ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
+    ``residual_verdict``, ``identifiability_warnings``, ``pixels``, ``details_px`` (more
+    statistics of w, best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
 ``expected``
     Rows of expected and obtained values.
 ``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
@@ -42,6 +45,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.files import write_json
 from modeharvest.idic.equivalents import mode_deviation, mode_equivalent
+from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.pattern import Pattern, read_pattern
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
@@ -164,12 +168,12 @@ def _spectrum(comparison: Comparison, specimen: Specimen) -> tuple[Spectrum, Pat
 
 def _compare(measured: Measured, strain: float) -> Comparison:
     result, how = measured.results[strain], measured.how
-    start = how.start(result.ansatz, measured.specimen, strain)
+    start = how.start(result.ansatz, strain)
     return compare(measured.images, strain, result, start, how.camera)
 
 
 def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> dict[str, Any]:
-    result, best, mask = comparison.result, comparison.best, comparison.mask
+    result, mask = comparison.result, comparison.mask
     specimen, state = measured.specimen, measured.solution.at(comparison.strain)
     size = pattern_size(comparison, specimen)
     parts = {
@@ -178,8 +182,7 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "idic_to_best_fit": comparison.idic_to_best,
     }
     px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
-    phi, pitch = result.ansatz.phi_slice(0), specimen.pitch
-    ideal = measured.how.start(result.ansatz, specimen, comparison.strain)[phi]
+    seen = identifiability(result, mask)
     return {
         "nominal_strain": comparison.strain,
         "branch": state.branch,
@@ -191,11 +194,14 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "rms_best_fit_px": px["best_fit"]["rms_per_component"],
         "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
         "rms_residual": result.residual_rms,
-        "mode": mode_equivalent(result.mode_parameters(), pitch, ideal)[0].tolist(),
-        "mode_ideal": ideal.tolist(),
-        "mode_standard_error": _plain(result.standard_errors()[phi]),
-        "mode_deviation_percent": mode_deviation(result.mode_parameters(), pitch, ideal).tolist(),
-        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
+        **_mode(comparison, measured),
+        "mode_observable": not seen.unobservable,
+        "leftover_estimate_px": seen.leftover_px,
+        "mode_polynomial_overlap": seen.overlap[0],
+        "worst_determined": [str(combination) for combination in seen.worst],
+        "residual_correlation": result.residual_correlation,
+        "identifiability_warnings": list(seen.warnings),
+        "residual_verdict": result.agreement().sentence,
         "iterations": result.iterations,
         "iterations_all_levels": len(result.history),
         "outcome": result.outcome.name.lower(),
@@ -205,6 +211,23 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "pixels": result.pixels,
         "details_px": px,
         "pattern_reading": list(pattern.sentences),
+    }
+
+
+def _mode(comparison: Comparison, measured: Measured) -> dict[str, Any]:
+    """The mode's parameters against the ideal ones; nothing where the mode was held."""
+    result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
+    phi = result.ansatz.phi_slice(0)
+    ideal = measured.how.start(result.ansatz, comparison.strain)[phi]
+    if not ideal.size:
+        return {}
+    found = result.mode_parameters()
+    return {
+        "mode": mode_equivalent(found, pitch, ideal)[0].tolist(),
+        "mode_ideal": ideal.tolist(),
+        "mode_standard_error": _plain(result.standard_errors()[phi]),
+        "mode_deviation_percent": mode_deviation(found, pitch, ideal).tolist(),
+        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
     }
 
 

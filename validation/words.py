@@ -22,6 +22,9 @@ _NUMBERS = (
     ("iterations on the full image", "–", "iterations"),
     ("iterations on all levels", "–", "iterations_all_levels"),
     ("condition number", "–", "condition_number"),
+    ("autocorrelation of the residual, 4 to 12 px", "–", "residual_correlation"),
+    ("w, estimated from the images alone, rms", "px", "leftover_estimate_px"),
+    ("overlap of the mode's part with v₀", "–", "mode_polynomial_overlap"),
     ("outcome", "", "outcome"),
 )
 _MODE = (("a₁", "–"), ("a₂", "–"), ("a₃", "–"), ("a₄", "–"), ("a₅", "–"), ("a₆", "mm"),
@@ -146,6 +149,10 @@ def _about(snapshot: Snapshot) -> list[str]:
                     f"{snapshot['outcome_why']}")  # fmt: skip
     if snapshot.get("undetermined"):
         said.append(f"{at} the images say nothing about {', '.join(snapshot['undetermined'])}.")
+    said += [f"{at} {warning}." for warning in snapshot.get("identifiability_warnings", ())]
+    if "residual_verdict" in snapshot:
+        verdict = snapshot["residual_verdict"]
+        said.append(f"{at} {verdict[0].lower()}{verdict[1:]}")
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
         said.append(
