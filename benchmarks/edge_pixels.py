@@ -23,7 +23,7 @@ def main() -> None:
     case, path = Case(), shipped_solution("paper-virtual")
     assert path is not None
     ansatz = case.correlation.ansatz(case.experiment.specimen)
-    start = case.correlation.start(ansatz, case.experiment.specimen, STRAIN)
+    start = case.correlation.start(ansatz, STRAIN)
     with tempfile.TemporaryDirectory() as folder:
         images = make_images(Solution.read(path), (STRAIN,), case.imaging, folder)
         grid, mask, f, g = images.grid, images.mask(), images.reference(), images.deformed(STRAIN)

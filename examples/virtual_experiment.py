@@ -22,7 +22,7 @@ def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
 
     errors = {}
     for strain in images.strains:
-        start = how.start(ansatz, experiment.specimen, strain)
+        start = how.start(ansatz, strain)
         f, g, g_mask = images.reference(), images.deformed(strain), images.deformed_mask(strain)
         result = correlate(f, g, grid, ansatz, start, mask, g_mask, how.options())
         truth = images.truth(strain).displacement

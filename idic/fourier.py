@@ -51,7 +51,7 @@ class ModeFamily:
     def __post_init__(self) -> None:
         for key in ("matrix", "offset", "start"):
             object.__setattr__(self, key, np.array(getattr(self, key), dtype=np.float64))
-        if self.matrix.ndim != 2 or len(self.matrix) % PER_WAVE or not self.matrix.size:
+        if self.matrix.ndim != 2 or len(self.matrix) % PER_WAVE or not len(self.matrix):
             raise InputError(
                 f"mode family {self.name!r}: expected a matrix of shape (5 waves, parameters), "
                 f"got {self.matrix.shape}"
@@ -87,6 +87,14 @@ class ModeFamily:
         full = self.matrix @ np.asarray(parameters, dtype=np.float64) + self.offset
         return full.reshape(-1, PER_WAVE)
 
+    def held(self) -> ModeFamily:
+        """The family whose only mode is this one's start: no parameters are left.
+
+        For images without a pattern, in which the mode's parameters can't be seen.
+        """
+        waves = self.waves(self.start).ravel()
+        return ModeFamily(f"{self.name}, held", np.zeros((waves.size, 0)), waves, np.zeros(0))
+
     def moved(self, shift: ArrayLike) -> ModeFamily:
         """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
 
@@ -97,11 +105,11 @@ class ModeFamily:
         InputError
             If the family's phases can't follow.
         """
-        full = self.waves(self.start)
-        full[:, 4] -= full[:, 2:4] @ np.asarray(shift, dtype=np.float64)
-        wanted = full.ravel() - self.offset
-        start = np.asarray(np.linalg.lstsq(self.matrix, wanted, rcond=None)[0], np.float64)
-        if not np.allclose(self.matrix @ start, wanted, atol=1e-9):
+        change = np.zeros((self.wave_count, PER_WAVE))
+        change[:, 4] = -self.waves(self.start)[:, 2:4] @ np.asarray(shift, dtype=np.float64)
+        step = np.linalg.lstsq(self.matrix, change.ravel(), rcond=None)[0]
+        start = np.asarray(self.start + step, np.float64)
+        if not np.allclose(self.matrix @ step, change.ravel(), atol=1e-9):
             raise InputError(f"mode family {self.name!r}: expected free phases, to move the mode")
         return replace(self, start=start)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions
 from modeharvest.idic.fourier import FourierMode, square_family
@@ -36,6 +37,10 @@ class Identification:
         Of the spline that samples the deformed image: 5 or 3.
     camera
         Correlate the quantised images instead of the float ones.
+    hold_mode
+        Hold phi1 at the ideal pattern, for images without a pattern to find it from.
+    gain_degree, offset_degree
+        Total degrees of a gain and of an offset between the images' grey levels; None for none.
     """
 
     v0_degree: int = 5
@@ -44,6 +49,9 @@ class Identification:
     edge_px: int = 2
     order: int = 5
     camera: bool = False
+    hold_mode: bool = False
+    gain_degree: int | None = None
+    offset_degree: int | None = None
 
     def __post_init__(self) -> None:
         if self.v0_degree < 1 or self.v_degree < 0:
@@ -57,30 +65,33 @@ class Identification:
                 "seen), got 0"
             )
         self.options()  # checks edge_px and order
+        self.brightness()
 
     def options(self) -> CorrelationOptions:
         """The options of :func:`modeharvest.idic.correlate.correlate`."""
         return CorrelationOptions(edge_px=self.edge_px, order=self.order)
 
-    def ansatz(self, specimen: Specimen) -> Ansatz:
-        """The paper's ansatz on a specimen."""
-        (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
-        taper = Taper(Box(-a, a, -b, b), 0.5 * specimen.pitch)
-        mode = FourierMode.scaled(square_family("junction"), specimen.pitch, taper)
-        domain = Box(-width, width, -height, height)
-        return Ansatz(domain, (mode,), self.v0_degree, self.v_degree)
+    def brightness(self) -> Brightness:
+        """Which of gain and offset are unknowns."""
+        return Brightness(self.gain_degree, self.offset_degree)
 
-    def start(self, ansatz: Ansatz, specimen: Specimen, strain: float) -> FloatArray:
-        """The unknowns to start from: the applied strain, and the mode with its right origin.
+    def ansatz(self, specimen: Specimen) -> Ansatz:
+        """The paper's ansatz on a specimen.
 
         The mode's phases put its origin on a solid junction between four holes, whatever the
         number of holes: [1, 1, 1, -1, 1, 0, 0] where it is even both ways.
         """
-        unknowns = ansatz.start(strain, self.start_amplitude)
-        a, b = specimen.cellular_half_size
+        (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
         x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
         y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.pitch
-        mode = unknowns[ansatz.phi_slice(0)]  # a view
-        mode[5] = -(mode[1] * x0 + mode[2] * y0)
-        mode[6] = -(mode[3] * x0 + mode[4] * y0)
-        return unknowns
+        family = square_family("junction").moved((x0, y0))
+        taper = Taper(Box(-a, a, -b, b), 0.5 * specimen.pitch)
+        mode = FourierMode.scaled(
+            family.held() if self.hold_mode else family, specimen.pitch, taper
+        )
+        domain = Box(-width, width, -height, height)
+        return Ansatz(domain, (mode,), self.v0_degree, self.v_degree, self.brightness())
+
+    def start(self, ansatz: Ansatz, strain: float) -> FloatArray:
+        """The unknowns to start from: the applied strain, and the mode as it should be."""
+        return ansatz.start(strain, self.start_amplitude)

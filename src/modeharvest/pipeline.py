@@ -224,7 +224,7 @@ class Run:
             images.deformed(strain, camera=how.camera),
             images.grid,
             ansatz,
-            how.start(ansatz, specimen, strain),
+            how.start(ansatz, strain),
             images.mask(),
             images.deformed_mask(strain),
             how.options(),
