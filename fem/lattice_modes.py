@@ -31,6 +31,7 @@ Turns = tuple[Fraction, Fraction]
 _SNAP = 1e-3  # rad: how near to a fraction a wave found by descent is
 _DEGENERATE = 1e-6  # of the eigenvalues' scale: values that far apart belong to one set
 _MULTIPLICITY = 4  # the most modes of one wave that are looked for
+_TOLERANCE = 1e-18  # of an eigenvalue; of a mode it is the root of this
 _LARGE = 0.9  # of the largest component: the first such fixes the phase
 
 
@@ -131,7 +132,7 @@ def _distinct(turns: Sequence[Turns]) -> list[Turns]:
 
 def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
     """The lowest eigenvalue at one wave with all of its eigenvectors."""
-    found = bloch.lowest(wave, _MULTIPLICITY)
+    found = bloch.lowest(wave, _MULTIPLICITY, tolerance=_TOLERANCE)
     cell = bloch.cell
     scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
     values = found.eigenvalues
