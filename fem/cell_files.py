@@ -61,14 +61,15 @@ def read_cell(
     path = Path(path)
     if not path.is_file():
         raise InputError(f"expected a cell (mesh or geometry) at {path}, found no such file")
-    if path.suffix.lower() in (*GEOMETRY, ".msh"):
-        with quiet_gmsh():
-            _merge(path)
-            return _from_model(lattice, size, path.suffix.lower() != ".msh", str(path))
-    if size is not None:
+    is_geometry = path.suffix.lower() in GEOMETRY
+    if size is not None and not is_geometry:
         raise InputError(
             f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not for meshes"
         )
+    if is_geometry or path.suffix.lower() == ".msh":
+        with quiet_gmsh():
+            _merge(path)
+            return _from_model(lattice, size, is_geometry, str(path))
     source = _read_meshio(path)
     cells: Cells = {}
     for block in source.cells:

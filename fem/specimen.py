@@ -64,7 +64,7 @@ class Specimen:
         smallest, largest = self.diameters.min(), self.diameters.max()
         if not 0 < smallest <= largest < self.pitch:
             raise InputError(
-                f"specimen: expected every hole with 0 < d < {self.pitch} mm, the pitch, got d from "
+                f"specimen: expected 0 < d < {self.pitch} mm, the pitch, of every hole, got d from "
                 f"{smallest:.5g} to {largest:.5g} mm; make grading_x and grading_y smaller"
             )
 

@@ -281,9 +281,9 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
         (lambda: Specimen(pitch=float("inf")), "finite"),
         (
             lambda: Specimen(grading_x=0.1),
-            r"0 < d < 1.9 mm, the pitch, got d from 1.025 to 1.975 mm",
+            r"0 < d < 1.9 mm.*got d from 1.025 to 1.975 mm",
         ),
-        (lambda: Specimen(grading_y=-0.2), "every hole with 0 < d < 1.9 mm"),
+        (lambda: Specimen(grading_y=-0.2), "0 < d < 1.9 mm"),
         (lambda: Specimen(grading_x=float("nan")), "got d from nan"),
         (
             lambda: perturb(mesh_specimen(GRADED, 0.25), GRADED, Imperfection(0.05)),
