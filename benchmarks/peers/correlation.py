@@ -1,0 +1,228 @@
+"""IDIC beside pyxel-dic: same images, same pixels, same start, the same step to stop at.
+
+pyxel's basis is linear, so it is given the mode's parameters, and so is modeharvest in the
+rows that compare like with like; in its first row it finds them, which is its usual task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyxel_side
+from laps import in_turn, use_threads
+from numpy.typing import NDArray
+from pairs import ImagePair, inside_the_ansatz, paper
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
+from modeharvest.idic.result import Result
+
+FloatArray = NDArray[np.float64]
+
+FREE, HELD = "modeharvest, mode free", "modeharvest, mode given"
+WAYS = {
+    "dense": "pyxel, basis per pixel (dense)",
+    "sparse": "pyxel, basis per pixel (sparse)",
+    "elements": "pyxel, elements and reduced basis",
+}
+QUANTISATION = 1.0 / np.sqrt(12.0)
+
+
+def rows(quick: bool) -> dict[str, dict[str, Any]]:
+    """Names of the rows and what :func:`measure` needs to know for each."""
+    inside = {"kind": "inside", "shape": (520, 416) if quick else (1040, 832), "seed": 1}
+    few = {"laps": 0 if quick else 1, "threads": 2}
+    of_paper = {"kind": "paper", "shape": None if quick else (2207, 2751),
+                "pixel_size": 0.03 if quick else 0.01}  # fmt: skip
+    return {
+        "correlation-inside-1": {**inside, **few, "threads": 1},
+        "correlation-inside-2": {**inside, **few},
+        "correlation-paper-2": {**of_paper, **few, "laps": 0},
+        "correlation-patterns": {
+            "shape": (520, 416) if quick else (1040, 832),
+            "seeds": 3 if quick else 8,
+            "threads": 2,
+        },
+    }
+
+
+def measure(options: dict[str, Any]) -> dict[str, Any]:
+    """One row, or a block of them."""
+    use_threads(options["threads"])
+    if "seeds" in options:
+        return _patterns(options)
+    if options["kind"] == "inside":
+        pair, name = inside_the_ansatz(options["shape"], options["seed"]), "inside the ansatz"
+    else:
+        pair, name = paper(options["shape"], options["pixel_size"]), "paper's specimen"
+    ways = _Ways(pair)
+    own = in_turn({FREE: ways.free, HELD: ways.held}, max(1, options["laps"]))
+    peers = in_turn({n: ways.pyxel(way) for way, n in WAYS.items()}, options["laps"])
+    found: dict[str, Any] = {}
+    for name_of, lap in (own | peers).items():
+        best = ways.best_free if name_of == FREE else ways.best
+        found[name_of] = ways.judged(lap.result, best) | {"first_s": lap.first_s}
+        if name_of in own:
+            found[name_of] |= {"seconds": lap.median_s, "setup_s": 0.0}
+    return {
+        "images": name,
+        "shape": pair.grid.shape,
+        "pixels": int(ways.pixels.sum()),
+        "threads": options["threads"],
+        "rms_displacement_px": pair.error_px(np.zeros_like(pair.truth)),
+        "found": found,
+    }
+
+
+class _Ways:
+    """All ways to correlate a pair."""
+
+    def __init__(self, pair: ImagePair) -> None:
+        self.pair = pair
+        self.edge_px = 0 if pair.deformed_mask is None else 2
+        self.best = self._best(*pair.held())
+        self.best_free = self._best(pair.ansatz, pair.start)
+        self.pixels = pair.pixels(self.best, self.edge_px)
+
+    def _best(self, ansatz: Ansatz, start: FloatArray) -> FloatArray:
+        """Fit an ansatz to the truth as well as it can."""
+        pair = self.pair
+        return fit_displacement(pair.truth, pair.grid, ansatz, start, pair.mask).displacement()
+
+    def free(self) -> Result:
+        """Ours, all 77 unknowns."""
+        return self._ours(self.pair.ansatz, self.pair.start)
+
+    def held(self) -> Result:
+        """Ours, with the unknowns that pyxel has."""
+        return self._ours(*self.pair.held())
+
+    def _ours(self, ansatz: Ansatz, start: FloatArray) -> Result:
+        pair = self.pair
+        return correlate(
+            pair.reference, pair.deformed, pair.grid, ansatz, start, pair.mask,
+            pair.deformed_mask, CorrelationOptions(edge_px=self.edge_px),
+        )  # fmt: skip
+
+    def pyxel(self, way: str) -> Callable[[], pyxel_side.Found]:
+        """pyxel's, in one of three ways."""
+        return lambda: pyxel_side.correlate(self.pair, way, self.pixels)
+
+    def judged(self, found: Any, best: FloatArray) -> dict[str, Any]:
+        """What to say of a result."""
+        if isinstance(found, Result):
+            displacement = found.displacement()
+            judged: dict[str, Any] = {
+                "unknowns": int(np.isfinite(np.diag(found.inverse)).sum()),
+                "iterations": [sum(h.factor == k for h in found.history) for k in (8, 4, 2, 1)],
+                "outcome": found.outcome.value,
+            }
+        else:
+            displacement = found.displacement
+            full = max(found.iterations) >= pyxel_side.MAX_ITERATIONS
+            judged = {
+                "unknowns": self.pair.ansatz.phi_offset(0),
+                "iterations": list(found.iterations),
+                "outcome": "max_iterations" if full else "converged",
+                "seconds": found.seconds,
+                "setup_s": found.setup_s,
+            }
+        judged["error_px"] = self.pair.error_px(displacement)
+        judged["from_best_px"] = self.pair.error_px(displacement, best)
+        return judged
+
+
+def _patterns(options: dict[str, Any]) -> dict[str, Any]:
+    """Errors over several speckle patterns, and what quantisation alone predicts."""
+    found: dict[str, list[dict[str, Any]]] = {FREE: [], HELD: [], WAYS["dense"]: []}
+    for seed in range(options["seeds"]):
+        pair = inside_the_ansatz(options["shape"], 100 + seed)
+        ways = _Ways(pair)
+        for name, way in zip(found, (ways.free, ways.held, ways.pyxel("dense")), strict=True):
+            result = way()
+            one = ways.judged(result, pair.truth)
+            if isinstance(result, Result):
+                one["predicted_px"] = _predicted_px(pair, result)
+            found[name].append(one)
+    return {
+        "shape": pair.grid.shape,
+        "pixels": int(pair.mask.sum()),
+        "patterns": options["seeds"],
+        "found": {name: _together(each) for name, each in found.items()},
+        "worst_ratio": max(
+            ours["error_px"] / theirs["error_px"]
+            for ours, theirs in zip(found[HELD], found[WAYS["dense"]], strict=True)
+        ),
+    }
+
+
+def _together(each: list[dict[str, Any]]) -> dict[str, Any]:
+    """Rms over the runs that converged, and how many did."""
+    converged = [one for one in each if one["outcome"] == "converged"]
+    together: dict[str, Any] = {"converged": len(converged)}
+    for key in ("error_px", "predicted_px"):
+        values = [one[key] for one in converged if key in one]
+        together[key] = float(np.sqrt(np.mean(np.square(values)))) if values else None
+    return together
+
+
+def _predicted_px(pair: ImagePair, result: Result) -> float:
+    """Rms length that the covariance predicts for quantisation noise in both images [px]."""
+    n = np.isfinite(np.diag(result.inverse))
+    x, y = pair.grid.x[None, ::8], pair.grid.y[::8, None]
+    S = result.ansatz.sensitivities(result.unknowns, x, y)[pair.mask[::8, ::8]][..., n]
+    A = np.einsum("pcn,pcm->nm", S, S) / len(S) / pair.grid.pixel_size**2
+    return float(np.sqrt(np.trace(result.covariance(noise_sd=QUANTISATION)[np.ix_(n, n)] @ A)))
+
+
+def table(found: dict[str, dict[str, Any]]) -> list[str]:
+    """Lines of Markdown."""
+    lines = [
+        "| images | | threads | unknowns | iterations, coarse to fine | basis made [s] |"
+        " start to convergence [s] | this ÷ ours, mode given | from truth [px rms] |"
+        " from best fit [px rms] |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in found.values():
+        if "images" not in row:
+            continue
+        ours = row["found"][HELD]["seconds"]
+        for name, one in row["found"].items():
+            iterations = " ".join(str(n) for n in one["iterations"])
+            if one["outcome"] != "converged":
+                iterations += f" ({one['outcome']})"
+            lines.append(
+                f"| {row['images']}, {row['shape'][0]} × {row['shape'][1]}, "
+                f"{row['pixels'] / 1e6:.2f} Mpx counted | {name} | {row['threads']} "
+                f"| {one['unknowns']} | {iterations} | {one['setup_s']:.1f} "
+                f"| {one['seconds']:.1f} | {one['seconds'] / ours:.1f} "
+                f"| {one['error_px']:.3g} | {one['from_best_px']:.3g} |"
+            )
+    return lines + _pattern_lines(found.get("correlation-patterns"))
+
+
+def _pattern_lines(row: dict[str, Any] | None) -> list[str]:
+    if row is None:
+        return []
+    lines = [
+        "",
+        f"Over {row['patterns']} speckle patterns of {row['shape'][0]} × {row['shape'][1]} px, 8 "
+        "bits, displacement inside the ansatz:",
+        "",
+        "| | converged | error [px rms] | that quantisation predicts [px rms] | ratio |",
+        "|---|---|---|---|---|",
+    ]
+    for name, one in row["found"].items():
+        # Whoever has the same unknowns has the same bound.
+        bound = one["predicted_px"] or row["found"][HELD]["predicted_px"]
+        if one["error_px"] is None:
+            lines.append(f"| {name} | 0 | – | – | – |")
+            continue
+        lines.append(
+            f"| {name} | {one['converged']} | {one['error_px']:.3g} | {bound:.3g} "
+            f"| {one['error_px'] / bound:.2f} |"
+        )
+    ratio = f"{row['worst_ratio']:.3f}"
+    return [*lines, "", f"On the worst of them, modeharvest (mode given) ÷ pyxel: {ratio}."]
