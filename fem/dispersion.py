@@ -91,12 +91,20 @@ class ZoneMap:
     lattice: FloatArray
 
     @property
-    def lowest(self) -> tuple[float, Wave]:
-        """The lowest eigenvalue of the grid but Γ [N/mm^4] and its phases [rad]."""
-        values = self.eigenvalues[1:, 1:].copy()  # -pi and pi are the same
-        values[len(values) // 2 - 1, len(values) // 2 - 1] = np.inf
+    def softest(self) -> tuple[float, Wave]:
+        """The eigenvalue [N/mm^4] and phases [rad] where lambda / |k|^2 is lowest, Γ left out.
+
+        |k| is that of the shortest of the equivalent wave vectors.
+        """
+        half = self.phases[1:]  # -pi and pi are the same
+        turns = 2.0 * _PI * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+        grid = np.stack(np.meshgrid(half, half, indexing="ij"), axis=-1)
+        k = (grid[:, :, None] + turns) @ np.linalg.inv(self.lattice).T
+        squared = np.sum(k**2, axis=-1).min(axis=-1)
+        values = self.eigenvalues[1:, 1:] / np.where(squared > 0, squared, np.inf)
+        values[squared == 0] = np.inf
         i, j = np.unravel_index(int(np.argmin(values)), values.shape)
-        return float(values[i, j]), (float(self.phases[i + 1]), float(self.phases[j + 1]))
+        return float(self.eigenvalues[i + 1, j + 1]), (float(half[i]), float(half[j]))
 
 
 @dataclass(frozen=True, eq=False)

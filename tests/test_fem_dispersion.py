@@ -67,8 +67,14 @@ def test_the_map_holds_the_path_and_is_its_own_opposite(path: CellPath, found: D
     stop = dict(zip(found.labels, found.stops, strict=True))["M"]
     assert part.eigenvalues[-1, -1] == pytest.approx(found.eigenvalues[1, stop, 0], rel=1e-6)
     assert part.eigenvalues[2, 2] == 0.0
-    assert part.lowest[0] > 0
-    assert part.lowest[1] != (0.0, 0.0)
+
+
+def test_the_softest_wave_of_the_square_s_grid_is_the_pattern(path: CellPath) -> None:
+    """Whose eigenvalue is not the lowest of the grid: long waves' are, but not over |k|^2."""
+    part = zone_map(path, LOADS[1], divisions=24)
+    value, wave = part.softest
+    assert wave == (math.pi, math.pi)
+    assert 0 < np.partition(part.eigenvalues.ravel(), 1)[1] < value
 
 
 def test_the_hexagon_s_corners_of_a_kind_are_alike_without_load() -> None:

@@ -88,7 +88,7 @@ def bloch(case: CaseName, out: OutFolder) -> None:
     Leaves the first critical load and waves with their proof, the lowest eigenvalues against the
     wave vector at several loads (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
-    print_lattice(_of_lattice(case, out, "bloch", lambda analysis: analysis.bloch()), out)
+    print_lattice(_of_lattice(case, out, lambda analysis: analysis.bloch()), out)
 
 
 @app.command()
@@ -98,7 +98,7 @@ def modes(case: CaseName, out: OutFolder) -> None:
     Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
     cell, branches with their energies, spectra, and the Fourier mode families found in them.
     """
-    print_lattice(_of_lattice(case, out, "modes", lambda analysis: analysis.all()), out)
+    print_lattice(_of_lattice(case, out, lambda analysis: analysis.all()), out)
 
 
 @app.command()
@@ -168,7 +168,7 @@ def _with_bars(case: str, out: Path, solution: Path | None, work: Callable[[Any]
         return work(Run(checked, out, bars, solution))
 
 
-def _of_lattice(case: str, out: Path, command: str, work: Callable[[Any], Any]) -> Any:
+def _of_lattice(case: str, out: Path, work: Callable[[Any], Any]) -> Any:
     """Read a lattice's case, then do some of its analysis under progress bars."""
     from modeharvest.lattice_case import read_lattice_case
 
@@ -176,8 +176,7 @@ def _of_lattice(case: str, out: Path, command: str, work: Callable[[Any], Any]) 
     from modeharvest.lattice_pipeline import LatticeAnalysis
 
     with _bars() as bars:
-        said = f"modeharvest {command} {case} --out {out}"
-        return work(LatticeAnalysis(checked, out, bars, said))
+        return work(LatticeAnalysis(checked, out, bars, case))
 
 
 @contextmanager

@@ -9,17 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
 from modeharvest.fem.modes import Branch, ModeSet
-from modeharvest.idic.automatic import FoundFamily, mode_family
+from modeharvest.idic.automatic import mode_family
 from modeharvest.idic.family_file import read_family, read_spectrum, write_family
-from modeharvest.idic.lattice_spectrum import LatticeSpectrum, lattice_spectrum
+from modeharvest.idic.lattice_spectrum import lattice_spectrum
 from modeharvest.lattice_tables import ModesPlan
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.lattice_report import CriticalPoint
+from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern
+from modeharvest.validation.plots_branches import combination_name
 
 if TYPE_CHECKING:  # it needs dolfinx
     from modeharvest.fem.cell import CellPath, CellState
@@ -36,42 +38,37 @@ class Pattern:
 
     Parameters
     ----------
+    file
+        Name of the family's file, such as "family_mode_1.json".
     name
-        For its file: "mode_1", "branch_1", "primary".
-    text
-        What it is.
+        What it is, such as "φ₁ at 8.8 %".
     mesh, lattice
         One period [mm], with its (2, 2) lattice vectors as rows [mm].
-    values
-        (n, 2) at the nodes, affine part removed: modes [-], displacements [mm].
+    displacement, gradient
+        (n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2).
     info
         Load and whatever else must be known of it, as plain JSON values.
+    stable
+        Whether it is a stable equilibrium; None for modes.
+    energy
+        Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches.
     """
 
+    file: str
     name: str
-    text: str
     mesh: Mesh
     lattice: FloatArray
-    values: FloatArray
+    displacement: FloatArray
+    gradient: FloatArray
     info: Mapping[str, Any]
+    stable: bool | None = None
+    energy: float = 0.0
 
-
-@dataclass(frozen=True, eq=False)
-class PatternFamily:
-    """What was found in a pattern.
-
-    Parameters
-    ----------
-    name, text
-        As :class:`Pattern` has them.
-    family, spectrum
-        The mode family, and the Fourier coefficients it comes from.
-    """
-
-    name: str
-    text: str
-    family: FoundFamily
-    spectrum: LatticeSpectrum
+    @property
+    def values(self) -> FloatArray:
+        """(n, 2) without the affine part."""
+        affine = self.mesh.nodes @ (self.gradient - np.eye(2)).T
+        return np.asarray(self.displacement - affine)
 
 
 def why_no_modes(critical: CriticalPoint, plan: ModesPlan) -> str:
@@ -177,40 +174,84 @@ def patterns(
     info
         Plain JSON values to keep with each of them.
     """
-    found: list[Pattern] = []
+    found = []
     if modes is not None:
-        place = (modes.mesh, modes.lattice)
-        for k, (wave, shape) in enumerate(zip(modes.waves, modes.shapes, strict=True), start=1):
-            known = {**info, "load": modes.load, "wave": list(wave)}
-            found.append(Pattern(f"mode_{k}", f"mode {k}", *place, shape, known))
-        for k, branch in enumerate(branches, start=1):
-            if branch.states:
-                last = branch.states[-1]
-                text = f"branch {k} at {100 * last.load:.3g} %"
-                known = {**info, "load": last.load, "combination": list(branch.combination)}
-                values = last.fluctuation(modes.mesh)
-                found.append(Pattern(f"branch_{k}", text, *place, values, known))
+        found += [_of_mode(modes, k, info) for k in range(len(modes.waves))]
+        ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
+        found += [_of_branch(modes, k, branch, info) for k, branch in ends]
+    return [*found, _of_primary(path, load, modes, info)]
+
+
+def _of_mode(modes: ModeSet, k: int, info: Mapping[str, Any]) -> Pattern:
+    name = combination_name([float(j == k) for j in range(len(modes.waves))])
+    known = {**info, "load": modes.load, "wave": list(modes.waves[k])}
+    place = (modes.mesh, modes.lattice, modes.shapes[k], np.eye(2))
+    return Pattern(f"family_mode_{k + 1}.json", f"mode {name}", *place, known)
+
+
+def _of_branch(modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any]) -> Pattern:
+    """The last state of a branch."""
+    last = branch.states[-1]
+    name = f"{combination_name(branch.combination)} at {100 * last.load:.4g} %"
+    known = {**info, "load": last.load, "combination": list(branch.combination)}
+    place = (modes.mesh, modes.lattice, last.displacement, last.gradient)
+    energy = last.energy - last.primary_energy
+    stable = last.negative_eigenvalues == 0
+    return Pattern(f"family_branch_{k}.json", name, *place, known, stable, energy)
+
+
+def _of_primary(
+    path: CellPath, load: float, modes: ModeSet | None, info: Mapping[str, Any]
+) -> Pattern:
+    """The unbuckled lattice, on the modes' cell where there is one."""
     state, unit = _state(path, load), path.cell.cell
-    affine = unit.mesh.nodes @ (state.gradient - np.eye(2)).T
-    text = f"primary path at {100 * load:.3g} %"
-    values = path.cell.displacement(state) - affine
-    found.append(Pattern("primary", text, unit.mesh, unit.lattice, values, {**info, "load": load}))
-    return found
+    mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
+    w = path.cell.displacement(state) - unit.mesh.nodes @ (state.gradient - np.eye(2)).T
+    inverse = np.linalg.inv(unit.lattice)
+    known = np.mod(np.mod(unit.mesh.nodes @ inverse, 1.0), 1.0)  # twice: -1e-17 becomes 1, then 0
+    wanted = np.mod(np.mod(mesh.nodes @ inverse, 1.0), 1.0)
+    u = (
+        w[cKDTree(known, boxsize=1.0).query(wanted)[1]]
+        + mesh.nodes @ (state.gradient - np.eye(2)).T
+    )
+    name = f"primary path at {100 * load:.4g} %"
+    return Pattern(
+        "family_primary.json", name, mesh, lattice, u, state.gradient, {**info, "load": load}, True
+    )
 
 
-def find_family(pattern: Pattern, pitch: float, path: Path) -> None:
+def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
+    """(n, 2) fractional coordinates in [0, 1)."""
+    fractional = np.mod(nodes @ np.linalg.inv(lattice), 1.0)
+    return np.asarray(np.mod(fractional, 1.0))  # -1e-17 has become 1
+
+
+def find_family(pattern: Pattern, pitch: float, folder: Path) -> None:
     """Find the family of a pattern and write it, with its Fourier coefficients, as JSON."""
     place = (pattern.mesh, pattern.lattice, pattern.values, pitch)
-    found = mode_family(*place, info={**pattern.info, "of": pattern.text, "name": pattern.name})
-    write_family(path, found, spectrum=lattice_spectrum(*place))
+    found = mode_family(*place, info={**pattern.info, "of": pattern.name})
+    write_family(folder / pattern.file, found, spectrum=lattice_spectrum(*place))
 
 
-def read_pattern_family(path: Path) -> PatternFamily:
-    """What :func:`find_family` left in a file."""
+def found_pattern(pattern: Pattern, folder: Path) -> FoundPattern:
+    """A pattern with the family and spectrum that :func:`find_family` left."""
+    path = folder / pattern.file
     family, spectrum = read_family(path), read_spectrum(path)
     if spectrum is None:
         raise InputError(f"expected Fourier coefficients in {path}, found none; make it again")
-    return PatternFamily(family.info["name"], family.info["of"], family, spectrum)
+    place = (pattern.displacement, pattern.gradient, spectrum, family)
+    return FoundPattern(pattern.name, *place, pattern.stable)
+
+
+def to_be_shown(
+    every: Sequence[Pattern], modes: ModeSet, pitch: float, folder: Path
+) -> list[FoundPattern]:
+    """Those for the report: branches from the lowest energy up, or modes; and the primary path."""
+    branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
+    found = [found_pattern(pattern, folder) for pattern in branches]
+    if not found:
+        found = [FoundPattern.of_mode(modes, k, pitch) for k in range(len(modes.waves))]
+    return [*found, found_pattern(every[-1], folder)]
 
 
 def _state(path: CellPath, load: float) -> CellState:

@@ -5,7 +5,7 @@
     critical.json                   critical    the first critical load over all wave vectors
     dispersion.h5 dispersion.csv    dispersion  lowest eigenvalues against the wave vector
     modes.h5 modes.vtu modes.xdmf   modes       real modes and buckled branches
-    family_*.json                   families    their spectra and mode families
+    family_*.json families.json     families    their spectra and mode families
     study.csv                       study       how the pattern depends on d/l and more
     report.html summary.json        report      everything of it that is there
     stages.json                                 which stages are finished, and what they took
@@ -28,19 +28,21 @@ from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice_case import LatticeCase, read_lattice_case
+from modeharvest.lattice_kinds import FileLattice
 from modeharvest.lattice_patterns import (
-    PatternFamily,
+    Pattern,
     find_family,
     find_modes,
+    found_pattern,
     patterns,
-    read_pattern_family,
+    to_be_shown,
     why_no_modes,
 )
 from modeharvest.lattice_summary import exports_in, summary_of
-from modeharvest.lattice_tables import FileLattice
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
-from modeharvest.validation.lattice_report import CriticalPoint, LatticeRun, write_lattice_report
+from modeharvest.validation.lattice_report import write_lattice_report
+from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
 from modeharvest.validation.mode_study import ModeStudy
 
 if TYPE_CHECKING:  # their modules need dolfinx
@@ -66,14 +68,14 @@ class LatticeAnalysis:
         Where; made if it does not exist.
     progress
         Listener.
-    command
-        That is running, for the report.
+    source
+        Name or file of the case, for the report.
     """
 
     case: LatticeCase
     folder: Path
     progress: Progress = silent
-    command: str = "modeharvest"
+    source: str = "CASE"
 
     @property
     def stages(self) -> Stages:
@@ -148,39 +150,34 @@ class LatticeAnalysis:
         self.stages.do("modes", self._keys["modes"], work, path, *others.values())
         return read_modes(path)
 
-    def families(self) -> list[PatternFamily]:
+    def families(self) -> None:
         """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
-        critical, plan = self.critical(), self.case.modes
-        modes, branches = self.modes()
+        self.modes()
         index = self.folder / "families.json"
 
         def work() -> None:
-            load = plan.load or critical.load
-            every = patterns(self._path(), load, modes, branches, self._info(critical))
-            for k, pattern in enumerate(every):
-                self.progress(k, len(every), "mode families")
-                path = self.folder / f"family_{pattern.name}.json"
-                find_family(pattern, self.case.lattice.pitch, path)
+            for path in self.folder.glob("family_*.json"):  # perhaps of other modes
+                path.unlink()
+            for k, pattern in enumerate(self._patterns):
+                self.progress(k, len(self._patterns), "mode families")
+                find_family(pattern, self.case.lattice.pitch, self.folder)
             self.progress(1, 1, "mode families")
-            write_json(index, [f"family_{pattern.name}.json" for pattern in every])
+            write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
 
         self.stages.do("families", self._keys["families"], work, index)
-        return [read_pattern_family(self.folder / name) for name in read_json(index)]
 
-    def study(self) -> ModeStudy | None:
+    def study(self) -> None:
         """Do the study, if the case has one; leaves ``study.csv``."""
         if self.case.study is None:
-            return None
+            return
         path, key = self.folder / "study.csv", self._keys["study"]
-        # Rows of this very study only, to go on from where it was broken off.
-        rows = self.folder / f"study-{key[:8]}.csv"
+        rows = self.folder / f"study-{key[:8]}.csv"  # of this very study, to go on from
 
         def work() -> None:
             self.case.run_study(rows, self.progress)
             rows.replace(path)
 
         self.stages.do("study", key, work, path)
-        return self.case.run_study(path, self.progress)
 
     def report(self) -> dict[str, Any]:
         """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
@@ -191,11 +188,10 @@ class LatticeAnalysis:
 
         def work() -> None:
             run = self._run()
-            families = self.families() if "families" in self._finished else []
             write_lattice_report(page, run, self.progress)
-            write_json(path, summary_of(run, self.case, families))
+            write_json(path, summary_of(run, self.case, self._found_patterns()))
 
-        key = digest([self._finished, self.case.title, self.command, __version__])
+        key = digest([self._finished, self.case.title, self.source, __version__])
         self.stages.do("report", key, work, path, page)
         content: dict[str, Any] = read_json(path)
         return content
@@ -220,16 +216,29 @@ class LatticeAnalysis:
         tables = {name: content[name] for name in ("title", "lattice", "material", "loading")}
         return {**tables, "critical": asdict(critical)}
 
+    @cached_property
+    def _patterns(self) -> list[Pattern]:
+        """All fields in which families are looked for."""
+        critical = self.critical()
+        load = self.case.modes.load or critical.load
+        return patterns(self._path(), load, *self.modes(), self._info(critical))
+
+    def _found_patterns(self) -> list[FoundPattern]:
+        if "families" not in self._finished:
+            return []
+        return [found_pattern(pattern, self.folder) for pattern in self._patterns]
+
     def _run(self) -> LatticeRun:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
 
         unit, done, critical = self._unit, self._finished, self.critical()
         modes, branches = self.modes() if "modes" in done else (None, ())
+        command = "modes" if "families" in done else "bloch"
         return LatticeRun(
             title=self.case.title or "An infinite lattice",
             case=self.case.plain(),
-            command=self.command,
+            command=f"modeharvest {command} {self.source} --out {self.folder}",
             mesh=unit.mesh,
             lattice=unit.lattice,
             pitch=self.case.lattice.pitch,
@@ -237,12 +246,22 @@ class LatticeAnalysis:
             dispersion=self.dispersion() if "dispersion" in done else None,
             modes=modes,
             branches=branches,
-            study=self.study() if "study" in done else None,
+            patterns=self._shown(modes) if modes else (),
+            study=self._study() if "study" in done else None,
             notes=[note for note in (why_no_modes(critical, self.case.modes),) if note],
             exports=exports_in(self.folder),
             timings={name: self.stages.finished(name)["seconds"] for name in done},
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )
+
+    def _shown(self, modes: ModeSet) -> list[FoundPattern]:
+        if "families" not in self._finished:
+            return []
+        return to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
+
+    def _study(self) -> ModeStudy | None:
+        """The study of which the rows are all there."""
+        return self.case.run_study(self.folder / "study.csv", self.progress)
 
     @cached_property
     def _keys(self) -> dict[str, str]:
@@ -308,23 +327,22 @@ def bloch(
     dict
         The content of ``summary.json``.
     """
-    return _analysis(case, folder, progress, "bloch").bloch()
+    return _analysis(case, folder, progress).bloch()
 
 
 def modes(
     case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
 ) -> dict[str, Any]:
     """Do all of a lattice's analysis; what ``modeharvest modes`` does. Parameters as ``bloch``."""
-    return _analysis(case, folder, progress, "modes").all()
+    return _analysis(case, folder, progress).all()
 
 
 def _analysis(
-    case: str | Path | LatticeCase, folder: Path | str, progress: Progress, command: str
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress
 ) -> LatticeAnalysis:
-    name = "CASE" if isinstance(case, LatticeCase) else case
-    case = case if isinstance(case, LatticeCase) else read_lattice_case(case)
-    said = f"modeharvest {command} {name} --out {folder}"
-    return LatticeAnalysis(case, Path(folder), progress, said)
+    if isinstance(case, LatticeCase):
+        return LatticeAnalysis(case, Path(folder), progress)
+    return LatticeAnalysis(read_lattice_case(case), Path(folder), progress, str(case))
 
 
 def _point(content: Mapping[str, Any]) -> CriticalPoint:

@@ -16,9 +16,10 @@ density [N/mm^4]:
     grid that are unstable already below).
 ``dispersion``
     A list, one entry for each load: ``load``, ``corners`` (names and lowest eigenvalues of the
-    path's corners), ``lowest`` eigenvalue of the path and its ``wave``, Γ left out.
+    path's corners).
 ``zone``
-    For each map of the whole zone: ``load``, ``lowest`` and its ``wave``, Γ left out.
+    For each map of the whole zone: ``load``, the ``wave`` of its grid with the lowest λ / k², and
+    its ``eigenvalue``.
 ``modes``
     Null without, else: ``load`` (whose tangent they belong to), ``copies`` (m, n: of the primitive
     cell), ``waves`` and ``eigenvalues`` of each mode.
@@ -28,9 +29,9 @@ density [N/mm^4]:
     unbuckled lattice at the same load [MPa]), ``negative_eigenvalues`` (0: stable against the
     branch's own period) and ``amplitudes`` of the modes [mm].
 ``families``
-    A list: ``name`` (of ``family_*.json``), ``of`` (which field), ``family``, ``captured`` (share
-    of the field's energy [-]), ``waves`` (rows A, B, kx, ky [-], c [mm]), ``parameters`` (number),
-    ``found`` (sentences), ``peaks`` (wave vectors [1/l], S_xx + S_yy [mm^6], shares).
+    A list: ``of`` (which field), ``family``, ``captured`` (share of the field's energy [-]),
+    ``waves`` (rows A, B, kx, ky [-], c [mm]), ``parameters`` (number), ``found`` (sentences),
+    ``peaks`` (wave vectors [1/l], S_xx + S_yy [mm^6], shares).
 ``study``
     Null without, else: ``rows`` (number of lattices in ``study.csv``) and ``limits`` (between
     which d/l the pattern stops being what buckles first, by loading).
@@ -49,13 +50,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from modeharvest.fem.dispersion import Dispersion
 from modeharvest.fem.modes import Branch, ModeSet
+from modeharvest.files import read_json
 from modeharvest.lattice_case import LatticeCase
-from modeharvest.lattice_patterns import PatternFamily
-from modeharvest.validation.lattice_report import CriticalPoint, LatticeRun
+from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
 from modeharvest.validation.mode_study import ModeStudy
 
 _EXPORTS = {
@@ -64,24 +63,22 @@ _EXPORTS = {
     "modes.h5": "modes and branches on their mesh (HDF5), without loss",
     "modes.vtu": "the same for ParaView",
     "modes.xdmf": "the same as XDMF",
-    "family_*.json": "mode family and Fourier coefficients of {}",
     "study.csv": "every lattice of the study",
 }
+_FAMILY = "mode family and Fourier coefficients"
 _PEAKS = 8
 
 
 def exports_in(folder: Path) -> dict[str, str]:
     """Files for further use that are in a folder, and what they hold."""
-    found = {}
-    for pattern, text in _EXPORTS.items():
-        for path in sorted(folder.glob(pattern)):
-            name = path.stem.removeprefix("family_").replace("_", " ")
-            found[path.name] = text.format("the primary path" if name == "primary" else name)
-    return found
+    known = {name: text for name, text in _EXPORTS.items() if (folder / name).is_file()}
+    index = folder / "families.json"
+    families = read_json(index) if index.is_file() else {}
+    return {**known, **{file: f"{_FAMILY}: {of}" for file, of in families.items()}}
 
 
 def summary_of(
-    run: LatticeRun, case: LatticeCase, families: Sequence[PatternFamily]
+    run: LatticeRun, case: LatticeCase, families: Sequence[FoundPattern]
 ) -> dict[str, Any]:
     """The content of ``summary.json``."""
     (critical,) = run.critical
@@ -120,11 +117,10 @@ def _branch(branch: Branch) -> dict[str, Any]:
     return {"combination": list(branch.combination), "outcome": branch.outcome, "states": states}
 
 
-def _family(found: PatternFamily) -> dict[str, Any]:
+def _family(found: FoundPattern) -> dict[str, Any]:
     family = found.family
     return {
-        "name": found.name,
-        "of": found.text,
+        "of": found.name,
         "family": family.family.name,
         "captured": family.captured,
         "waves": family.waves.tolist(),
@@ -149,13 +145,11 @@ def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
         return {"dispersion": [], "zone": []}
     along = []
     for load, values in zip(found.loads, found.eigenvalues[..., 0], strict=True):
-        away = np.where(np.all(found.waves == 0, axis=1), np.inf, values)
-        k = int(np.argmin(away))
-        corners = [[n, float(values[i])] for n, i in zip(found.labels, found.stops, strict=True)]
-        lowest = {"lowest": float(away[k]), "wave": found.waves[k].tolist()}
-        along.append({"load": float(load), "corners": corners, **lowest})
+        pairs = zip(found.labels, found.stops, strict=True)
+        corners = [[label, float(values[stop])] for label, stop in pairs]
+        along.append({"load": float(load), "corners": corners})
     zone = [
-        {"load": part.load, "lowest": part.lowest[0], "wave": list(part.lowest[1])}
+        {"load": part.load, "wave": list(part.softest[1]), "eigenvalue": part.softest[0]}
         for part in found.zone
     ]
     return {"dispersion": along, "zone": zone}

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from modeharvest.validation.plots_branches import combination_name
+
 
 def print_lattice(summary: dict[str, Any], out: Path) -> None:
     """Print what was found, the file of the report last."""
@@ -19,6 +21,11 @@ def print_lattice(summary: dict[str, Any], out: Path) -> None:
     for line in _critical(summary["critical"], summary["outcome"]):
         console.print(escape(line), soft_wrap=True)
     console.print(_dispersion(summary))
+    for part in summary["zone"]:
+        console.print(
+            f"softest wave at {100 * part['load']:.3f} %, of the whole zone: "
+            f"{wave_in_pi(part['wave'])}, eigenvalue {part['eigenvalue']:.4g} N/mm⁴"
+        )
     if summary["branches"]:
         console.print(_branches(summary["branches"]))
     for family in summary["families"]:
@@ -59,22 +66,19 @@ def _dispersion(summary: dict[str, Any]) -> Table:
     names = dict.fromkeys(name for name, _ in rows[0]["corners"] if name != "Γ")
     for name in names:
         table.add_row(name, *(f"{dict(row['corners'])[name]:.4g}" for row in rows))
-    for part in summary["zone"]:
-        where = f"zone, {100 * part['load']:.3f} %: {wave_in_pi(part['wave'])}"
-        table.add_row(where, *[""] * (len(rows) - 1), f"{part['lowest']:.4g}")
     return table
 
 
 def _branches(branches: Sequence[dict[str, Any]]) -> Table:
     """Energies of the branches above that of the unbuckled lattice."""
-    title = escape("energy beyond the unbuckled lattice's [kPa]")
+    title = escape("energy beyond the unbuckled lattice's [kPa]; * unstable")
     table = Table(title=title, title_justify="left")
     table.add_column("branch along")
     loads = sorted({state["load"] for branch in branches for state in branch["states"]})
     for load in loads:
         table.add_column(f"{100 * load:.3f} %", justify="right")
     for branch in branches:
-        start = " ".join(f"{c:+.3g} φ{k}" for k, c in enumerate(branch["combination"], 1) if c)
+        start = combination_name(branch["combination"])
         cells = {state["load"]: _excess(state) for state in branch["states"]}
         table.add_row(start, *(cells.get(load, "–") for load in loads))
     return table
@@ -82,7 +86,7 @@ def _branches(branches: Sequence[dict[str, Any]]) -> Table:
 
 def _excess(state: dict[str, Any]) -> str:
     excess = 1e3 * (state["energy"] - state["primary_energy"])
-    return f"{excess:.4g}" + ("" if state["negative_eigenvalues"] == 0 else " (unstable)")
+    return f"{excess:.4g}" + ("" if state["negative_eigenvalues"] == 0 else "*")
 
 
 def _family(family: dict[str, Any]) -> str:
