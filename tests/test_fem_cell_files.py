@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -276,3 +277,17 @@ def test_what_is_asked_for_must_make_sense(tmp_path: Path) -> None:
             read_cell(path, lattice)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="overlap"):
         read_cell(path, [[1.0, 0.0], [0.0, 1.9]])
+
+
+def test_the_recipes_work_as_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "lattices.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, space)
+    assert "Poisson's ratio -0.84" in capfd.readouterr().out
+    assert area(space["again"]) == pytest.approx(area(space["oval"]), rel=1e-12)
+    assert area(space["oval"]) == pytest.approx(3.2 - math.pi * 0.4, rel=1e-3)
+    assert area(space["slotted"]) == pytest.approx(3.2 - 0.48 + (4 - math.pi) * 0.15**2, rel=1e-3)

@@ -14,7 +14,6 @@ from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
 
-
 STRAINS = (0.05, 0.082, 0.09)
 
 
