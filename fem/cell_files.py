@@ -92,6 +92,7 @@ def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) 
 
 
 def _merge(path: Path) -> None:
+    unit = gmsh.option.getString("Geometry.OCCTargetUnit")
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     try:
         gmsh.merge(str(path))
@@ -99,6 +100,8 @@ def _merge(path: Path) -> None:
         raise InputError(
             f"expected a file that gmsh reads at {path}, got: {_said(error)}"
         ) from error
+    finally:
+        gmsh.option.setString("Geometry.OCCTargetUnit", unit)
 
 
 def _from_model(

@@ -55,7 +55,7 @@ def chiral(
         Distance of neighbouring rings' centres, the lattice constant [mm].
     size
         Target edge length of the elements [mm]; where walls are thinner than that, elements
-        are as long as the wall is thick.
+        are as long as the wall is thick. Half of that thickness is a good choice.
     ligaments
         Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
     ring_radius
