@@ -1,7 +1,8 @@
 """Guards the folder of images: finished or not, never taken for what it isn't."""
 
+import hashlib
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
+from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import SpeckleSpec
 from modeharvest.imaging.truth import read_truth
@@ -125,6 +127,99 @@ def test_key_depends_on_the_displacement() -> None:
     other.snapshots[1].displacement[3, 1] += 1e-15
     assert image_key(one, STRAINS, SPEC) != image_key(other, STRAINS, SPEC)
     assert image_key(one, STRAINS[:1], SPEC) == image_key(other, STRAINS[:1], SPEC)
+
+
+def test_key_without_a_sensor_is_the_one_from_before_there_were_sensors() -> None:
+    """The digest as version 1 of the format defined it: finished sets stay finished."""
+    spec, solution = asdict(SPEC), plate()
+    del spec["sensor"]
+    wanted = {"format": "modeharvest-images-1", "spec": spec, "element": "Q4",
+              "strains": list(STRAINS)}  # fmt: skip
+    digest = hashlib.sha256(json.dumps(wanted, sort_keys=True).encode())
+    for array in (solution.mesh.nodes, solution.mesh.cells):
+        digest.update(array.tobytes())
+    for snapshot in solution.snapshots:
+        digest.update(snapshot.displacement.tobytes())
+    assert image_key(solution, STRAINS, SPEC) == digest.hexdigest()
+    other = replace(SPEC, sensor=Sensor(read_noise=0.01))
+    assert image_key(solution, STRAINS, other) != digest.hexdigest()
+
+
+def test_a_sidecar_without_a_sensor_reads_as_the_default_one(made: ImageSet) -> None:
+    path = made.folder / "images.json"
+    content = json.loads(path.read_text())
+    del content["spec"]["sensor"]
+    path.write_text(json.dumps(content))
+    assert ImageSet.read(made.folder).spec == SPEC
+
+
+NOISY = replace(SPEC, bits=12, sensor=Sensor(gain=0.9, offset=0.02, full_well=1e4, read_noise=0.01))
+
+
+def test_a_sensor_is_told_of_and_its_noise_is_the_predicted_one(tmp_path: Path) -> None:
+    made = make_images(plate(), STRAINS, NOISY, tmp_path / "noisy")
+    assert ImageSet.read(made.folder).spec == NOISY
+    clean = make_images(plate(), STRAINS, SPEC, tmp_path / "clean")
+    for strain in (None, *STRAINS):
+        if strain is None:
+            pair, mask = [made.reference(camera=c) for c in (False, True)], made.mask()
+            irradiance, entry = clean.reference(), made.info["reference"]
+        else:
+            pair = [made.deformed(strain, camera=c) for c in (False, True)]
+            mask, irradiance = made.deformed_mask(strain), clean.deformed(strain)
+            entry = made.info["snapshots"][STRAINS.index(strain)]
+        np.testing.assert_allclose(pair[0], 0.9 * irradiance + 0.02, atol=1e-7)
+        sd = made.noise_sd(strain)
+        error = ((pair[1] - pair[0]) / sd)[mask]
+        assert abs(error.mean()) < 4 / np.sqrt(error.size)
+        assert abs(error.var() - 1) < 4 * np.sqrt(2 / error.size)
+        assert entry["noise_sd"] == pytest.approx(float(np.sqrt((sd[mask] ** 2).mean())))
+        assert entry["saturated_px"] == 0
+        law = made.info["noise"]
+        predicted = np.sqrt(law["constant"] + law["slope"] * (pair[0] - law["offset"]))
+        np.testing.assert_allclose(predicted[mask], sd[mask], rtol=1e-5)
+
+
+def test_noise_is_an_image_s_own_and_does_not_depend_on_the_others(tmp_path: Path) -> None:
+    both = make_images(plate(), STRAINS, NOISY, tmp_path / "both")
+    alone = make_images(plate(), STRAINS[1:], NOISY, tmp_path / "alone")
+    name = "deformed_1280_12bit.tif"
+    assert both.info["files"][name] == alone.info["files"][name]
+    noise = [both.reference(camera=True) - both.reference()]
+    noise += [both.deformed(s, camera=True) - both.deformed(s) for s in STRAINS]
+    mask = both.mask() & both.deformed_mask(STRAINS[0]) & both.deformed_mask(STRAINS[1])
+    correlation = np.corrcoef([n[mask] for n in noise]) - np.eye(3)
+    assert np.abs(correlation).max() < 4 / np.sqrt(mask.sum())
+
+
+def test_averaging_pixels_tell_how_they_were_averaged(tmp_path: Path) -> None:
+    spec = replace(SPEC, sensor=Sensor(fill_factor=1.0))
+    made = make_images(plate(), STRAINS[:1], spec, tmp_path / "areas")
+    plain = make_images(plate(), STRAINS[:1], SPEC, tmp_path / "points")
+    assert made.info["reference"]["quadrature"]["points"] == 0
+    deformed = made.info["snapshots"][0]["quadrature"]
+    assert deformed["points"] == 9
+    assert deformed["rms_bound"] <= 1e-7
+    assert "quadrature" not in plain.info["reference"]
+    # An average over an area loses contrast: sinc(f) at the pattern's 0.05 cycles/px and more.
+    inside = np.s_[10:-10, 10:-10]
+    loss = made.reference()[inside].std() / plain.reference()[inside].std()
+    assert 0.95 < loss < 1.0
+    np.testing.assert_array_equal(made.mask(), plain.mask())
+
+
+def test_a_specimen_that_overlaps_is_told_of(made: ImageSet, tmp_path: Path) -> None:
+    assert made.info["warnings"] == []
+    solution = plate()
+    apart = Mesh(solution.mesh.nodes[[0, 1, 4, 3, 1, 2, 5, 4]], np.arange(8).reshape(2, 4), "Q4")
+    slid = np.repeat([[0.2, 0.0], [0.0, 0.0]], 4, axis=0)  # the left half by 4 px to the right
+    moved = Solution(apart, (Snapshot(0.1, slid),), {})
+    overlapping = make_images(moved, (0.1,), SPEC, tmp_path / "overlap")
+    # Strictly inside both: 3 columns; of 21 rows, 2 lie on the outline.
+    assert overlapping.info["snapshots"][0]["doubly_covered_px"] == 3 * 19
+    assert overlapping.info["reference"]["doubly_covered_px"] == 0
+    (warning,) = overlapping.info["warnings"]
+    assert warning.startswith("deformed_1000.tif: 57 px lie inside more than one element")
 
 
 @pytest.mark.parametrize("at", [0, 1, 2])
