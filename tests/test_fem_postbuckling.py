@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from modeharvest.fem.lattice_modes import real_modes
 from modeharvest.fem.lattices import UnitCell, hexagonal, square
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.fem.mode_file import read_modes
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.fem.postbuckling import BranchOptions, follow
 
@@ -233,3 +235,16 @@ def test_the_pattern_is_that_of_the_middle_of_a_finite_specimen() -> None:
     # Two rows of holes away from the clamped edges: alike, if not the same.
     assert abs(np.sum(measured * lattice)) > 0.995 * sizes[0] * sizes[1]
     assert sizes[0] == pytest.approx(sizes[1], rel=0.05)
+
+
+def test_the_recipe_works_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parent.parent / "docs/modes.md").read_text(encoding="utf-8")
+    recipe = page.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, Any] = {}
+    exec(compile(recipe, "docs/modes.md", "exec", dont_inherit=True), namespace)
+    assert [state.negative_eigenvalues for state in namespace["flower"].states] == [0, 0]
+    modes, (flower,) = read_modes("flower.h5")
+    assert modes.info["copies"] == [2, 2]
+    assert np.ptp(flower.states[-1].amplitudes) < 1e-5 * flower.states[-1].amplitudes[0]
+    assert Path("flower.vtu").exists()
