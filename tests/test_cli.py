@@ -9,7 +9,7 @@ import pytest
 
 from modeharvest import __version__, cli
 
-COMMANDS = ("run", "fem", "image", "correlate", "validate", "cases")
+COMMANDS = ("run", "bloch", "modes", "fem", "image", "correlate", "validate", "cases")
 
 
 def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
