@@ -64,8 +64,7 @@ def test_everything_of_a_full_run_is_there(text: str) -> None:
 
 def test_the_paper_s_family_is_recognised_and_its_waves_are_written(text: str) -> None:
     # The made-up pattern is Eq. (mode) itself: two waves along the diagonals, seven parameters.
-    assert "Eq. (mode) of the paper: seven parameters" in text
-    assert "square, origin at a hole" in text
+    assert "This is Eq. (mode) of the paper (square, origin at a hole): seven parameters" in text
 
 
 def test_what_a_run_does_not_have_is_left_out(tmp_path: Path) -> None:
@@ -82,6 +81,7 @@ def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
     run = made_up.run(critical=(point,), modes=None, branches=(), patterns=())
     text = page(run, tmp_path)
     assert "stable so far" in text
+    assert "critical wave</dt>" not in text
     assert "lowest measure 0.3 MPa, above zero" in text
     assert "no critical point was found up to 28 %" in text
 
@@ -116,7 +116,7 @@ def test_a_mode_is_no_equilibrium_and_a_small_pattern_is_magnified(tmp_path: Pat
     assert mode.stable is None
     small = replace(mode, displacement=0.1 * mode.displacement, stable=True)
     text = page(replace(run, patterns=(mode, small)), tmp_path)
-    assert "no equilibrium; true to scale" in text
+    assert "a mode, no equilibrium; largest displacement 0.16 l" in text
     # drawn with 0.12 l instead of 0.016 l
     assert "stable; fluctuation × 7.5" in text
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from modeharvest.files import atomic
@@ -105,11 +106,15 @@ def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> Picture:
     assert run.modes is not None
     nodes = run.modes.mesh.nodes
     fluctuation = found.fluctuation(nodes)
-    factor = max(1.0, VISIBLE * run.pitch / float(np.linalg.norm(fluctuation, axis=1).max()))
+    largest = float(np.linalg.norm(fluctuation, axis=1).max()) / run.pitch
+    factor = SHAPE / largest if found.stable is None else max(1.0, VISIBLE / largest)
     u = found.displacement + (factor - 1.0) * fluctuation
     drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch, u, found.gradient)
-    fact = {True: "stable", False: "unstable", None: "no equilibrium"}[found.stable]
-    fact += f"; fluctuation × {factor:.3g}" if factor > 1.005 else "; true to scale"
+    if found.stable is None:
+        fact = f"a mode, no equilibrium; largest displacement {SHAPE} l"
+    else:
+        fact = "stable; " if found.stable else "unstable; "
+        fact += f"fluctuation × {factor:.3g}" if factor > 1.005 else "true to scale"
     return _picture(f"deformed-{n}", "Deformed", drawn, fact)
 
 
@@ -121,9 +126,10 @@ def _densities(found: FoundPattern, n: int) -> list[Picture]:
     for name, S in both.items():
         up = np.where(upward(spectrum.xi), S, 0.0)
         xi = [float(x) for x in spectrum.xi[int(np.argmax(up))]]
-        fact = f"largest {short(float(S.max()))} mm⁶, at ±({short(xi[0])}, {short(xi[1])})"
-        drawn = draw_lattice_spectrum(spectrum.xi, S, largest)
-        pictures.append(_picture(f"S{name}-{n}", f"S_{name}", drawn, fact))
+        of = "" if found.stable is None else f" {short(float(S.max()))} mm⁶"  # a mode has no size
+        fact = f"largest{of} at ±({short(xi[0])}, {short(xi[1])})"
+        svg = to_svg(draw_lattice_spectrum(spectrum.xi, S, largest), f"S{name}-{n}", f"S_{name}")
+        pictures.append(Picture(f"S{name}-{n}", Markup(f"S<sub>{name}</sub>"), svg, fact))
     return pictures
 
 

@@ -82,7 +82,8 @@ def key_numbers(run: LatticeRun) -> list[dict[str, str]]:
         keys += [
             _key("critical strain" if point.found else "stable up to", percent(point.load), "%",
                  point.loading),
-            _waves_key(point, run),
+            _waves_key(point, run) if point.found else
+            _key("lowest measure", short(point.value), "MPa", "filling · λ / k², above zero"),
         ]  # fmt: skip
         if point.found and point.angle is None:
             before = f"{sum(point.below)} → {sum(point.above)}"
