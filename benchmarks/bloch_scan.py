@@ -1,39 +1,46 @@
-"""Bloch analysis of infinite lattices: its cost, and its critical strains by mesh size.
+"""Bloch analysis of infinite lattices: its cost, its critical strains by mesh size, its rates.
 
-Run ``scripts/env python benchmarks/bloch_scan.py``. The first table compares, in one run, a scan of
-60 wave vectors along the zone's boundary with 60 sparse factorisations of the reduced matrix (their
-order of elimination being known, and found anew each time); the second is the one of docs/bloch.md.
+``scripts/env python benchmarks/bloch_scan.py cost`` compares a scan of 60 wave vectors along the
+zone's boundary, assembly and all, with 60 sparse factorisations of the reduced complex matrix whose
+order of elimination is known, or found anew each time. They take turns in one process, and the
+ratios are medians over the turns.
+``… critical`` prints the table of docs/bloch.md, ``… rates`` the order of convergence on nested
+meshes, and ``… study`` ten lattices under three loadings with the time and the memory they take.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from modeharvest.fem.bloch import BlochWaves, scan
-from modeharvest.fem.bloch_critical import first_critical
+from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
 from modeharvest.fem.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattices import SQUARE_ZONE, UnitCell, hexagonal, square
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
-from modeharvest.fem.materials import TwoTermI1
+from modeharvest.fem.materials import Material, TwoTermI1
 from modeharvest.fem.reduction import factorise
+from modeharvest.fem.refinement import refined_cell
 from modeharvest.fem.zone import zone_path
 
 POINTS = 60
+TURNS = 7
 RATIOS = (0.8696, 0.7895, 0.95)
+STUDY = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
 LOADINGS = {"uniaxial": uniaxial(), "strain": uniaxial_strain(), "equibiaxial": equibiaxial()}
 HEXAGONAL = {"equibiaxial": equibiaxial(), "y": uniaxial(1), "x": uniaxial(0)}
+M = (np.pi, np.pi)
 
 
-def seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+def seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
 
 
 def cost(per_pitch: int, ratio: float) -> str:
@@ -43,17 +50,29 @@ def cost(per_pitch: int, ratio: float) -> str:
     points, _ = zone_path(SQUARE_ZONE, cell.cell.lattice, POINTS)
     matrix = BlochWaves(cell, state).stiffness.at((0.7, 2.1))
 
-    def factorisations(order: str) -> None:
-        for _ in range(POINTS):
-            factorise(matrix, order)
+    def factorisations(order: str) -> Callable[[], None]:
+        return lambda: [factorise(matrix, order) for _ in range(POINTS)] and None
 
-    whole = seconds(lambda: scan(BlochWaves(cell, state), points))
-    known = seconds(lambda: factorisations("NATURAL"))
-    anew = seconds(lambda: factorisations("MMD_AT_PLUS_A"))
-    return (
-        f"| {ratio} | 1/{per_pitch} | {cell.reduction.size} | {1e3 * whole:.0f} ms "
-        f"| {whole / known:.2f} | {whole / anew:.2f} |"
+    works = (
+        lambda: scan(BlochWaves(cell, state), points),
+        factorisations("NATURAL"),
+        factorisations("MMD_AT_PLUS_A"),
     )
+    turns = np.array([[seconds(work) for work in works] for _ in range(TURNS)])
+    known, anew = (statistics.median(turns[:, 0] / turns[:, k]) for k in (1, 2))
+    milliseconds = 1e3 * statistics.median(turns[:, 0])
+    return (
+        f"| {ratio} | 1/{per_pitch} | {cell.reduction.size} | {milliseconds:.0f} ms "
+        f"| {known:.2f} | {anew:.2f} |"
+    )
+
+
+def costs(sizes: Sequence[int]) -> None:
+    print("| d/l | h/l | unknowns | scan | over 60 known orders | over 60 new orders |")
+    print("|---|---|---|---|---|---|")
+    for ratio in RATIOS:
+        for n in sizes:
+            print(cost(n, ratio), flush=True)
 
 
 def critical(cell: UnitCell, loading: MacroLoading) -> str:
@@ -62,16 +81,8 @@ def critical(cell: UnitCell, loading: MacroLoading) -> str:
     return f"{100 * found.load:.4f} ({waves})"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=(12, 24), help="elements a pitch")
-    sizes = parser.parse_args().sizes
-    print("| d/l | h/l | unknowns | scan | over 60 known orders | over 60 new orders |")
-    print("|---|---|---|---|---|---|")
-    for ratio in RATIOS:
-        for n in sizes:
-            print(cost(n, ratio), flush=True)
-    print("\n| lattice | loading | " + " | ".join(f"h = l/{n} [%]" for n in sizes) + " |")
+def criticals(sizes: Sequence[int]) -> None:
+    print("| lattice | loading | " + " | ".join(f"h = l/{n} [%]" for n in sizes) + " |")
     print("|---|---|" + "---|" * len(sizes))
     for ratio in RATIOS:
         cells = [square(1.0, ratio, 1 / n) for n in sizes]
@@ -82,6 +93,72 @@ def main() -> None:
     for name, loading in HEXAGONAL.items():
         values = " | ".join(critical(cell, loading) for cell in cells)
         print(f"| hexagonal 0.924 | {name} | {values} |", flush=True)
+
+
+def nested(cell: UnitCell, diameter: float, count: int) -> list[UnitCell]:
+    cells = [cell]
+    while len(cells) < count:
+        cells.append(refined_cell(cells[-1], diameter))
+    return cells
+
+
+def rate(cells: Sequence[UnitCell], loading: MacroLoading, material: Material) -> str:
+    """Critical strain at M mesh by mesh, and the orders of its convergence."""
+    search = CriticalSearch(tolerance=1e-12)
+    paths = [CellPath(PeriodicCell(cell, material), loading) for cell in cells]
+    loads = np.array([critical_at(path, M, search).load for path in paths])
+    changes = np.abs(np.diff(loads))
+    values = " | ".join(f"{100 * load:.4f}" for load in loads)
+    return f"{values} | {', '.join(f'{o:.2f}' for o in np.log2(changes[:-1] / changes[1:]))} |"
+
+
+def rates(count: int) -> None:
+    print(
+        "| lattice | material | loading | h = l/6 and halved [%] |"
+        + " |" * (count - 1)
+        + " order |"
+    )
+    print("|---|---|---|" + "---|" * (count + 1))
+    families = [(f"square {r}", nested(square(1.0, r, 1 / 6), r, count), LOADINGS) for r in RATIOS]
+    families.append(
+        ("hexagonal 0.924", nested(hexagonal(1.0, 0.924, 1 / 6), 0.924, count), HEXAGONAL)
+    )
+    for name, cells, loadings in families:
+        for loading_name, loading in loadings.items():
+            values = rate(cells, loading, TwoTermI1())
+            print(f"| {name} | ν = 0.49 | {loading_name} | {values}", flush=True)
+    values = rate(families[0][1], equibiaxial(), TwoTermI1(bulk=1.0))
+    print(f"| {families[0][0]} | compressible | equibiaxial | {values}", flush=True)
+
+
+def study() -> None:
+    start = time.perf_counter()
+    print("| d/l | loading | critical | s |")
+    print("|---|---|---|---|")
+    for ratio in STUDY:
+        cell = square(1.0, ratio, 1 / 12)
+        for name, loading in LOADINGS.items():
+            begun = time.perf_counter()
+            value = critical(cell, loading)
+            print(f"| {ratio} | {name} | {value} | {time.perf_counter() - begun:.1f} |", flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\n{time.perf_counter() - start:.0f} s, {peak:.0f} MiB at the most, one process")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("what", choices=["cost", "critical", "rates", "study"])
+    parser.add_argument("--sizes", type=int, nargs="+", default=(12, 24), help="elements a pitch")
+    parser.add_argument("--meshes", type=int, default=4, help="number of nested meshes")
+    asked = parser.parse_args()
+    if asked.what == "cost":
+        costs(asked.sizes)
+    elif asked.what == "critical":
+        criticals(asked.sizes)
+    elif asked.what == "rates":
+        rates(asked.meshes)
+    else:
+        study()
 
 
 if __name__ == "__main__":

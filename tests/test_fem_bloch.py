@@ -28,6 +28,7 @@ from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uni
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.meshing import join, rectangle
 from modeharvest.fem.reduction import factorise, negative_pivots
+from modeharvest.fem.refinement import refined_cell
 from modeharvest.fem.zone import Zone, folded, is_same, zone_path
 
 M: Wave = (math.pi, math.pi)
@@ -158,6 +159,23 @@ def test_long_waves_see_the_effective_medium(kind: str) -> None:
         wave = tuple(waves.cell.cell.lattice @ k)
         value = waves.lowest((wave[0], wave[1])).eigenvalues[0] * waves.cell.filling / (k @ k)
         assert value == pytest.approx(waves.acoustic(angle), rel=1e-3)  # corrections of k^2
+
+
+def test_nested_meshes_converge_at_the_rate_of_quadratic_elements() -> None:
+    # Twice the elements' degree, four, for eigenvalues and for the area; the geometry is good to
+    # that order because a side's middle lies on the circle. The eigenvalue still rises to it.
+    cell, areas, values = square(1.0, HOLES, 1 / 6), [], []
+    for _ in range(3):
+        made = PeriodicCell(cell, TwoTermI1(bulk=1.0))
+        state = made.equilibrium(uniaxial(), 0.0)
+        assert state is not None
+        areas.append(made.filling - (1.0 - math.pi / 4 * HOLES**2))
+        values.append(float(BlochWaves(made, state).lowest(M).eigenvalues[0]))
+        cell = refined_cell(cell, HOLES)
+    area_rates = np.log2(np.divide(areas[:-1], areas[1:]))
+    assert np.all(area_rates > 3.9)
+    assert values[0] > values[1] > values[2]
+    assert math.log2((values[0] - values[1]) / (values[1] - values[2])) > 3.4
 
 
 def test_waves_of_the_enlarged_cell_are_those_that_fold_onto_them() -> None:
