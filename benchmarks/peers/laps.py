@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +33,7 @@ class Laps:
     first_s
         Seconds of the first call; it compiles where there is something to compile.
     median_s
-        Median of the seconds of the laps after it; of the first where there was only one.
+        Median of the seconds of the laps.
     """
 
     result: Any
@@ -41,16 +41,30 @@ class Laps:
     median_s: float
 
 
-def in_turn(contestants: dict[str, Work], laps: int) -> dict[str, Laps]:
-    """Run all in turn, ``laps`` times after a first one, so that a busy machine hits all alike."""
+def in_turn(
+    contestants: dict[str, Work], laps: int, warm_up: Collection[str] | None = None
+) -> dict[str, Laps]:
+    """Run all in turn, ``laps`` times, so that a busy machine hits all alike.
+
+    Before that, those named in ``warm_up`` (all by default) run once, to compile.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    first: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for _ in range(laps + 1):
+    for name, work in contestants.items():
+        if warm_up is None or name in warm_up:
+            first[name] = _timed(work)[1]
+    for _ in range(laps):
         for name, work in contestants.items():
-            begin = time.perf_counter()
-            results[name] = work()
-            seconds[name].append(time.perf_counter() - begin)
+            results[name], took = _timed(work)
+            seconds[name].append(took)
     return {
-        name: Laps(results[name], s[0], statistics.median(s[1:] or s))
+        name: Laps(results[name], first.get(name, s[0]), statistics.median(s))
         for name, s in seconds.items()
     }
+
+
+def _timed(work: Work) -> tuple[Any, float]:
+    begin = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - begin

@@ -43,6 +43,8 @@ class Found:
 
     Parameters
     ----------
+    way
+        "dense", "sparse" or "elements".
     displacement
         (rows, cols, 2) at the reference's pixels [mm].
     seconds
@@ -53,6 +55,7 @@ class Found:
         From the coarsest scale to the finest.
     """
 
+    way: str
     displacement: FloatArray
     seconds: float
     setup_s: float
@@ -80,7 +83,7 @@ def correlate(pair: ImagePair, way: str, pixels: BoolArray) -> Found:
     unknowns, clock = over(pair, pixels, scaling, unknowns)
     a = np.concatenate([scaling @ unknowns, pair.start[n:]])
     displacement = pair.ansatz.displacement(a, pair.grid.x, pair.grid.y)
-    return Found(displacement, clock.solve_s, clock.setup_s, tuple(clock.iterations))
+    return Found(way, displacement, clock.solve_s, clock.setup_s, tuple(clock.iterations))
 
 
 class _Clock:
