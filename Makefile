@@ -5,7 +5,7 @@ ENV := scripts/env
 OUT := out/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint test-next bench shipped clean
+.PHONY: help demo lattices test lint test-next bench shipped clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | \
@@ -13,6 +13,10 @@ help: ## Show this list
 
 demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
 	$(ENV) python -m modeharvest run paper-virtual --out $(OUT)
+
+lattices: ## Analyse the infinite lattices that are shipped in out/lattices (minutes)
+	for case in square-lattice hexagonal-lattice chiral-lattice mode-study; do \
+	  $(ENV) python -m modeharvest modes $$case --out out/lattices/$$case || exit; done
 
 test: lint ## Lint, type-check and run the tests: all that must pass before a commit
 	$(ENV) python -m pytest

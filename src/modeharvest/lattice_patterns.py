@@ -19,7 +19,7 @@ from modeharvest.idic.automatic import mode_family
 from modeharvest.idic.family_file import read_family, read_spectrum, write_family
 from modeharvest.idic.lattice_spectrum import lattice_spectrum
 from modeharvest.lattice_tables import ModesPlan
-from modeharvest.progress import Progress, silent
+from modeharvest.progress import Progress, named, silent
 from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern
 from modeharvest.validation.plots_branches import combination_name
 
@@ -84,6 +84,7 @@ def find_modes(
     material: Material,
     critical: CriticalPoint,
     plan: ModesPlan,
+    step: float,
     info: Mapping[str, Any],
     progress: Progress = silent,
 ) -> tuple[ModeSet, tuple[Branch, ...]]:
@@ -99,6 +100,8 @@ def find_modes(
         Its first critical point.
     plan
         Which modes and branches.
+    step
+        Largest step of the load along primary paths [-].
     info
         Plain JSON values to keep with the modes.
     progress
@@ -118,11 +121,16 @@ def find_modes(
     progress(1, 1, "modes")
     if not critical.found or state.load != critical.load:
         return modes, ()
-    return modes, tuple(_branches(path, material, modes, plan, progress))
+    return modes, tuple(_branches(path, material, modes, plan, step, progress))
 
 
 def _branches(
-    path: CellPath, material: Material, modes: ModeSet, plan: ModesPlan, progress: Progress
+    path: CellPath,
+    material: Material,
+    modes: ModeSet,
+    plan: ModesPlan,
+    step: float,
+    progress: Progress,
 ) -> list[Branch]:
     """A branch for each combination of modes, on their commensurate cell."""
     from modeharvest.fem.cell import CellPath, PeriodicCell
@@ -133,19 +141,10 @@ def _branches(
     cell = PeriodicCell(path.cell.cell.enlarged(*modes.info["copies"]), material)
     found = []
     for k, combination in enumerate(combinations, start=1):
-        listener = _named(progress, f"branch {k} of {len(combinations)}")
-        enlarged = CellPath(cell, path.loading)
+        listener = named(progress, f"branch {k} of {len(combinations)}")
+        enlarged = marched(CellPath(cell, path.loading), 0.98 * modes.load, step)
         found.append(follow(enlarged, modes, combination, loads, progress=listener))
     return found
-
-
-def _named(progress: Progress, name: str) -> Progress:
-    """The same listener, told another name of the step."""
-
-    def listener(done: float, total: float, what: str) -> None:
-        progress(done, total, name)
-
-    return listener
 
 
 def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
@@ -252,6 +251,14 @@ def to_be_shown(
     if not found:
         found = [FoundPattern.of_mode(modes, k, pitch) for k in range(len(modes.waves))]
     return [*found, found_pattern(every[-1], folder)]
+
+
+def marched(path: CellPath, load: float, step: float) -> CellPath:
+    """The same path with its states up to a load, in steps so small that none is jumped over."""
+    for k in range(int(load / step) + 1):
+        if path.at(k * step) is None:
+            break
+    return path
 
 
 def _state(path: CellPath, load: float) -> CellState:

@@ -19,16 +19,17 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from modeharvest import __version__
-from modeharvest.errors import MissingDependencyError
+from modeharvest.errors import InputError
 from modeharvest.fem.dispersion import Dispersion, ZoneMap, dispersion, zone_map
 from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_xdmf
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice_case import LatticeCase, read_lattice_case
 from modeharvest.lattice_kinds import FileLattice
+from modeharvest.lattice_model import LatticeModel
 from modeharvest.lattice_patterns import (
     Pattern,
     find_family,
@@ -39,21 +40,11 @@ from modeharvest.lattice_patterns import (
     why_no_modes,
 )
 from modeharvest.lattice_summary import exports_in, summary_of
-from modeharvest.progress import Progress, silent
+from modeharvest.progress import Progress, named, silent
 from modeharvest.stages import Stages, digest, file_digest
 from modeharvest.validation.lattice_report import write_lattice_report
 from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
 from modeharvest.validation.mode_study import ModeStudy
-
-if TYPE_CHECKING:  # their modules need dolfinx
-    from modeharvest.fem.cell import CellPath, PeriodicCell
-    from modeharvest.fem.lattices import UnitCell
-
-_NO_DOLFINX = (
-    "infinite lattices need dolfinx >= 0.9, slepc4py and gmsh: install them with 'conda install "
-    "-c conda-forge fenics-dolfinx slepc4py python-gmsh' or, on Debian 13, 'apt install "
-    "python3-dolfinx python3-slepc4py python3-gmsh python3-h5py-mpi'"
-)
 
 
 @dataclass(frozen=True)
@@ -98,7 +89,8 @@ class LatticeAnalysis:
             from modeharvest.fem.bloch_critical import CriticalSearch, first_critical
 
             search = CriticalSearch(**asdict(self.case.search))
-            found = first_critical(self._path(), search, self.progress)
+            listener = named(self.progress, "first critical load")
+            found = first_critical(self._model.path(), search, listener)
             point = CriticalPoint.of(self.case.loading.name, found)
             history = [asdict(least) for least in found.history]
             write_json(path, {"point": asdict(point), "history": history})
@@ -113,9 +105,9 @@ class LatticeAnalysis:
         table = path.with_suffix(".csv")
 
         def work() -> None:
-            cell_path, zone = self._path(), list[ZoneMap]()
-            tour = plan.tour(self.case.lattice, self.case.loading)
             loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
+            cell_path, zone = self._model.path(max(loads)), list[ZoneMap]()
+            tour = plan.tour(self.case.lattice, self.case.loading)
             found = dispersion(cell_path, tour, loads, plan.points, plan.bands, self.progress)
             if plan.map_divisions:
                 divisions = plan.map_divisions
@@ -141,8 +133,10 @@ class LatticeAnalysis:
         others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
 
         def work() -> None:
-            cell_path, info = self._path(), self._info(critical)
-            found = find_modes(cell_path, self.case.material, critical, plan, info, self.progress)
+            cell_path = self._model.path(max(plan.load, critical.load))
+            step = self.case.search.largest_step
+            how = (self.case.material, critical, plan, step, self._info(critical))
+            found = find_modes(cell_path, *how, self.progress)
             write_modes(path, *found)
             for write, other in others.items():
                 write(other, *found)
@@ -202,10 +196,20 @@ class LatticeAnalysis:
         return self.report()
 
     def all(self) -> dict[str, Any]:
-        """All stages that are not finished; returns the content of ``summary.json``."""
+        """All stages that are not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If modes can't be had; what there is is reported before.
+        """
         self.dispersion()
-        self.families()
-        self.study()
+        try:
+            self.families()
+            self.study()
+        except InputError:
+            self.report()
+            raise
         return self.report()
 
     # -- parts --------------------------------------------------------------------------
@@ -217,11 +221,15 @@ class LatticeAnalysis:
         return {**tables, "critical": asdict(critical)}
 
     @cached_property
+    def _model(self) -> LatticeModel:
+        return LatticeModel(self.case)
+
+    @cached_property
     def _patterns(self) -> list[Pattern]:
         """All fields in which families are looked for."""
         critical = self.critical()
         load = self.case.modes.load or critical.load
-        return patterns(self._path(), load, *self.modes(), self._info(critical))
+        return patterns(self._model.path(load), load, *self.modes(), self._info(critical))
 
     def _found_patterns(self) -> list[FoundPattern]:
         if "families" not in self._finished:
@@ -232,7 +240,7 @@ class LatticeAnalysis:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
 
-        unit, done, critical = self._unit, self._finished, self.critical()
+        unit, done, critical = self._model.unit, self._finished, self.critical()
         modes, branches = self.modes() if "modes" in done else (None, ())
         command = "modes" if "families" in done else "bloch"
         return LatticeRun(
@@ -284,28 +292,6 @@ class LatticeAnalysis:
     def _finished(self) -> dict[str, str]:
         """The keys of the stages that are finished for this very case."""
         return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
-
-    @cached_property
-    def _unit(self) -> UnitCell:
-        try:
-            return self.case.lattice.cell()
-        except ImportError as error:
-            raise MissingDependencyError(_NO_DOLFINX) from error
-
-    @cached_property
-    def _cell(self) -> PeriodicCell:
-        try:
-            from modeharvest.fem.cell import PeriodicCell
-        except ImportError as error:
-            raise MissingDependencyError(_NO_DOLFINX) from error
-        return PeriodicCell(self._unit, self.case.material)
-
-    def _path(self) -> CellPath:
-        """The primary path from its beginning, so that no stage depends on another's steps."""
-        cell = self._cell  # first: without dolfinx it says what is missing
-        from modeharvest.fem.cell import CellPath
-
-        return CellPath(cell, self.case.loading.macro())
 
 
 def bloch(

@@ -14,3 +14,12 @@ class Progress(Protocol):
 
 def silent(done: float, total: float, what: str) -> None:
     """The listener that shows nothing: the default of every function."""
+
+
+def named(progress: Progress, name: str) -> Progress:
+    """The same listener, told another name of the step."""
+
+    def listener(done: float, total: float, what: str) -> None:
+        progress(done, total, name)
+
+    return listener
