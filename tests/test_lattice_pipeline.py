@@ -261,6 +261,17 @@ def test_the_commands_print_a_short_table(
     assert str(folder / "report.html") in text.replace("\n", "")
 
 
+def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], case: Path, tmp_path: Path
+) -> None:
+    def interrupted(self: LatticeAnalysis) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LatticeAnalysis, "critical", interrupted)
+    assert command(monkeypatch, "bloch", case, "--out", tmp_path) == 130
+    assert "run the same command again" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
