@@ -107,11 +107,11 @@ class Aperture:
         """
         a, s = max(self.side_px, _THIN), max(self.psf_px, _THIN)
 
-        def integral(z: FloatArray) -> FloatArray:  # of the normal distribution's cumulative one
-            return np.asarray(z * ndtr(z) + np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi))
-
         t = np.linspace(-1.0, 1.0, 20_001) * (0.5 * a + 6.0 * s)
-        upto = s / a * (integral((t + 0.5 * a) / s) - integral((t - 0.5 * a) / s))
+        high, low = (t + 0.5 * a) / s, (t - 0.5 * a) / s
+        # The normal distribution's cumulative one, integrated: z ndtr(z) + exp(-z^2 / 2) / ...
+        bell = (np.exp(-0.5 * high**2) - np.exp(-0.5 * low**2)) / math.sqrt(2.0 * math.pi)
+        upto = s / a * (high * ndtr(high) - low * ndtr(low) + bell)
         k = np.arange(EDGE_POINTS)
         unit = np.stack([k, k * _FIBONACCI_BEFORE % EDGE_POINTS], axis=1) + 0.5
         return np.asarray(np.interp(unit / EDGE_POINTS, upto, t))
