@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.agreement import autocorrelation
+from modeharvest.idic.agreement import TRAPPED, autocorrelation, unmatched
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.gauss_newton import (
@@ -36,6 +36,7 @@ BoolArray = NDArray[np.bool_]
 
 _BAND = 64
 """Rows that are looked at in one go."""
+_WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
 _ROUNDS, _SETTLED = 5, 1e-2
 """The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 
@@ -141,12 +142,17 @@ def correlate(
         clock.lap(f"iterate level {level.factor}")
         history += found.history
         a, before = (np.concatenate([x, a[x.size :]]) for x in (found.unknowns, before))
-        if found.outcome in (Outcome.LEFT_IMAGE, Outcome.SINGULAR):
+        if found.outcome in _WITHOUT_RESULT:
             break
-    correlation = autocorrelation(_residual(pair, model, found.unknowns))
+    residual = _residual(pair, model, found.unknowns)
+    lost = unmatched(pair.reference, residual)
+    if lost > TRAPPED and found.outcome not in _WITHOUT_RESULT:
+        found = replace(found, outcome=Outcome.TRAPPED)
+    correlation = autocorrelation(residual)
     clock.lap("judge the residual")
     progress(len(levels), len(levels), "correlate")
-    return _result(model, grid, found, history, clock.laps, correlation)
+    result = _result(model, grid, found, history, clock.laps)
+    return replace(result, residual_correlation=correlation, unmatched=lost)
 
 
 def fit_displacement(
@@ -304,7 +310,6 @@ def _result(
     found: Minimum,
     history: tuple[Iteration, ...],
     timings_s: dict[str, float],
-    residual_correlation: float = float("nan"),
 ) -> Result:
     eigen = ScaledEigen.of(found.equations.matrix)
     return Result(
@@ -319,7 +324,6 @@ def _result(
         condition_number=eigen.condition_number,
         history=history,
         timings_s=timings_s,
-        residual_correlation=residual_correlation,
     )
 
 

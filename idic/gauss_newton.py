@@ -34,6 +34,7 @@ class Outcome(Enum):
     STAGNATED = "stagnated"
     SINGULAR = "singular"
     LEFT_IMAGE = "left_image"
+    TRAPPED = "trapped"
 
     @property
     def explanation(self) -> str:
@@ -57,6 +58,10 @@ _EXPLANATIONS = {
     Outcome.LEFT_IMAGE: (
         "Too many pixels are mapped outside the deformed image; check the sign of the start, "
         "the pixel size and the origin of the grid."
+    ),
+    Outcome.TRAPPED: (
+        "The iteration ended where parts of the images don't match at all: a local minimum; "
+        "start closer, or with other mode parameters."
     ),
 }
 

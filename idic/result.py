@@ -56,6 +56,9 @@ class Result:
     residual_correlation
         Rms autocorrelation of the residual 4 to 12 px apart [-]: near 0 for noise; NaN for a
         fit to a displacement. See :meth:`agreement`.
+    unmatched
+        Share of the image in which f and g(x + u) have little to do with each other [-]; above
+        0.1 the outcome is TRAPPED. NaN for a fit to a displacement.
     """
 
     ansatz: Ansatz
@@ -70,6 +73,7 @@ class Result:
     history: tuple[Iteration, ...] = ()
     timings_s: Mapping[str, float] = field(default_factory=dict)
     residual_correlation: float = float("nan")
+    unmatched: float = float("nan")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -244,6 +248,7 @@ class Result:
             "history": [{k: _to_json(v) for k, v in vars(s).items()} for s in self.history],
             "timings_s": dict(self.timings_s),
             "residual_correlation": _to_json(self.residual_correlation),
+            "unmatched": _to_json(self.unmatched),
             "grid": vars(self.grid),
             "ansatz": ansatz_to_dict(self.ansatz),
             "inverse": [[_to_json(float(v)) for v in row] for row in self.inverse],
@@ -276,7 +281,8 @@ class Result:
                 condition_number=_from_json(content["condition_number"]),
                 history=tuple(Iteration(**step) for step in steps),
                 timings_s=content["timings_s"],
-                residual_correlation=content["residual_correlation"] or np.nan,
+                residual_correlation=_or_nan(content["residual_correlation"]),
+                unmatched=_or_nan(content["unmatched"]),
             )
         except InputError:
             raise
@@ -293,6 +299,10 @@ def _to_json(value: Any) -> Any:
 
 def _from_json(value: Any) -> Any:
     return np.inf if value is None else value
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
 
 
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:

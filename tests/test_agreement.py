@@ -13,7 +13,7 @@ from manufactured import GRID
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.agreement import Agreement, autocorrelation, spline_noise
+from modeharvest.idic.agreement import Agreement, autocorrelation, spline_noise, unmatched
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.identifiability import identifiability
@@ -78,6 +78,20 @@ def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:
     expected = np.sqrt(np.mean([*(lags**2), *np.ones(5)]))
     assert autocorrelation(wave) == pytest.approx(expected, rel=2e-3)
     assert autocorrelation(np.zeros((20, 20))) == 0.0
+
+
+def test_unmatched_blocks_are_counted() -> None:
+    rng = np.random.default_rng(4)
+    f = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
+    other = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
+    g = 0.5 * f - 3.0 + 0.1 * other  # darker and flatter, but the same speckle
+    assert unmatched(f, f - g) == 0.0
+    g[:, :64] = other[:, :64]  # a fifth of the columns: 64 of 320 px
+    # Of 8 x 8 independent speckles a chance correlation has a standard deviation of 1/8.
+    assert unmatched(f, f - g) == pytest.approx(0.2, abs=0.02)
+    g[:, :32] = np.nan
+    assert unmatched(f, f - g) == pytest.approx(1 / 9, abs=0.02)
+    assert unmatched(f, np.full_like(f, np.nan)) == 0.0
 
 
 def test_bad_noise() -> None:

@@ -95,6 +95,19 @@ def test_two_modes(seed: int) -> None:
     np.testing.assert_allclose(result.mode_parameters(1), truth[-4:], atol=1e-5)
 
 
+def test_a_trapped_iteration_says_so() -> None:
+    ansatz, truth, f, g = case()
+    start = ansatz.start(STRAIN, 1.0)
+    start[ansatz.v0_slice(1)][0] += 0.25  # 25 px, two speckles and a half
+    fine = CorrelationOptions(levels=(Level(1, 0.0),))
+    result = correlate(f, g, GRID, ansatz, start, MASK, options=fine)
+    assert error_px(result, truth) > 5.0
+    assert result.outcome is Outcome.TRAPPED
+    from_coarse = correlate(f, g, GRID, ansatz, start, MASK)
+    assert from_coarse.outcome is Outcome.CONVERGED
+    assert from_coarse.unmatched == 0.0
+
+
 def test_before_buckling_the_mode_stays_small() -> None:
     """Without a pattern its parameters mean nothing; the displacement must not suffer."""
     ansatz = square()
