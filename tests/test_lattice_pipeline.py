@@ -21,6 +21,7 @@ from modeharvest.files import read_json
 from modeharvest.lattice_case import LatticeCase, StudyPlan, read_lattice_case
 from modeharvest.lattice_kinds import SquareLattice
 from modeharvest.lattice_pipeline import LatticeAnalysis, bloch, modes
+from modeharvest.lattice_table import print_lattice
 from modeharvest.lattice_tables import DispersionPlan, Loading, ModesPlan, Search
 
 pytestmark = pytest.mark.dolfinx
@@ -224,7 +225,9 @@ def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
     assert summary["branches"] == []
 
 
-def test_a_study_goes_on_from_where_it_was(tmp_path: Path) -> None:
+def test_a_study_goes_on_from_where_it_was(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     plan = StudyPlan(
         ratios=(0.8, 0.8696), loadings=("equibiaxial",), overlays=(0.8696,), divisions=5
     )
@@ -245,8 +248,13 @@ def test_a_study_goes_on_from_where_it_was(tmp_path: Path) -> None:
     assert not part.exists()
     assert len((tmp_path / "study.csv").read_text("utf-8").splitlines()) == 3
     other = coarse(study=replace(plan, ratios=(0.8,), overlays=()))
-    LatticeAnalysis(other, tmp_path).study()  # none of the other study's rows
+    summary = modes(other, tmp_path)
+    # None of the other study's rows.
     assert len((tmp_path / "study.csv").read_text("utf-8").splitlines()) == 2
+    assert summary["study"]["lattices"] == 1
+    assert 0.9 < summary["study"]["overlap"][0] <= 1.0
+    print_lattice(summary, tmp_path)
+    assert "study of 1 lattice" in capsys.readouterr().out
 
 
 def test_the_commands_print_a_short_table(

@@ -170,6 +170,8 @@ class LatticeAnalysis:
         def work() -> None:
             self.case.run_study(rows, self.progress)
             rows.replace(path)
+            for other in self.folder.glob("study-*.csv"):  # of studies given up
+                other.unlink()
 
         self.stages.do("study", key, work, path)
 

@@ -33,8 +33,9 @@ density [N/mm^4]:
     ``waves`` (rows A, B, kx, ky [-], c [mm]), ``parameters`` (number), ``found`` (sentences),
     ``peaks`` (wave vectors [1/l], S_xx + S_yy [mm^6], shares).
 ``study``
-    Null without, else: ``rows`` (number of lattices in ``study.csv``) and ``limits`` (between
-    which d/l the pattern stops being what buckles first, by loading).
+    Null without, else: ``lattices`` (how many; ``study.csv`` has them all), ``overlap`` (smallest
+    and largest with the analytic mode) and ``limits``: for each ``loading`` between which d/l
+    (``without``, ``with_``) the pattern stops being what buckles first, and what does ``instead``.
 ``notes``
     What a reader should know.
 ``files``
@@ -132,7 +133,12 @@ def _family(found: FoundPattern) -> dict[str, Any]:
 
 def _study(study: ModeStudy) -> dict[str, Any]:
     rows = (*study.ratios, *study.scales, *study.materials)
-    return {"rows": len(rows), "limits": [asdict(limit) for limit in study.limits]}
+    overlaps = [row.overlap for row in rows]
+    return {
+        "lattices": len(rows),
+        "overlap": [min(overlaps), max(overlaps)],
+        "limits": [asdict(limit) for limit in study.limits],
+    }
 
 
 def _critical(point: CriticalPoint) -> dict[str, Any]:

@@ -23,13 +23,15 @@ def print_lattice(summary: dict[str, Any], out: Path) -> None:
     console.print(_dispersion(summary))
     for part in summary["zone"]:
         console.print(
-            f"softest wave at {100 * part['load']:.3f} %, of the whole zone: "
+            f"softest wave of the whole zone at {100 * part['load']:.3f} %: "
             f"{wave_in_pi(part['wave'])}, eigenvalue {part['eigenvalue']:.4g} N/mm⁴"
         )
     if summary["branches"]:
         console.print(_branches(summary["branches"]))
     for family in summary["families"]:
         console.print(escape(_family(family)), soft_wrap=True)
+    for line in _study(summary["study"]):
+        console.print(escape(line), soft_wrap=True)
     for note in summary["notes"]:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
     console.print(f"report: {out / 'report.html'}")
@@ -94,6 +96,21 @@ def _family(family: dict[str, Any]) -> str:
         f"{family['of']}: family '{family['family']}', {len(family['waves'])} waves, "
         f"{family['parameters']} parameters, captures {100 * family['captured']:.2f} %"
     )
+
+
+def _study(study: dict[str, Any] | None) -> list[str]:
+    if study is None:
+        return []
+    low, high = study["overlap"]
+    return [
+        f"study of {study['lattices']} lattices: overlap with the analytic mode {low:.4f} to "
+        f"{high:.4f}",
+        *(
+            f"  {limit['loading']}: the pattern buckles first from d/l = {limit['with_']:.4g} on; "
+            f"at {limit['without']:.4g} {limit['instead']}"
+            for limit in study["limits"]
+        ),
+    ]
 
 
 def wave_in_pi(wave: Sequence[float]) -> str:
