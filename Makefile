@@ -33,6 +33,9 @@ test-next: ## Run the tests on the next dolfinx (Debian unstable, in a root of i
 bench: ## Run every program in benchmarks/ (minutes; ratios within one run are what counts)
 	for program in benchmarks/*.py; do $(ENV) python $$program || exit; done
 
+peers: ## Measure beside riley-raster and pyxel-dic, in an environment of their own (15 min)
+	benchmarks/peers/run
+
 shipped: ## Make the solution anew that ships with the package
 	$(ENV) python -m modeharvest fem paper-virtual --out out/shipped
 	cp out/shipped/solution.h5 src/modeharvest/cases/paper-virtual.h5
