@@ -13,7 +13,6 @@ from typing import Any
 
 import dolfinx
 import numpy as np
-import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -22,11 +21,10 @@ from modeharvest.errors import InputError
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.experiment import EDGES
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.hyperelastic import Hyperelastic
 from modeharvest.fem.materials import Material
 
 FloatArray = NDArray[np.float64]
-# Degree-2 quadrature on a triangle: the three-point Gauss rule of the paper.
-_THREE_POINTS = {"quadrature_degree": 2}
 
 
 @dataclass(frozen=True)
@@ -106,19 +104,17 @@ class Structure:
     def __init__(
         self, mesh: Mesh, material: Material, loading: Loading, comm: MPI.Comm = MPI.COMM_WORLD
     ) -> None:
-        if mesh.element != "T6":
-            raise InputError(f"finite elements: expected a T6 mesh, got {mesh.element}")
         self.mesh, self.comm = mesh, comm
-        domain = dolfinx_api.create_mesh(mesh, comm)
-        self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
-        self._u = dolfinx.fem.Function(self.V)
+        self._forms = Hyperelastic(mesh, material, comm)
+        self.V = self._forms.V
+        self._u = self._forms.u
         self._direction = dolfinx.fem.Function(self.V)
-        self._constrain(domain, loading)
-        self._define_forms(domain, material)
+        self._constrain(loading)
+        self._load_form = self._forms.stiffness_along(self._direction)
         self.factorisations = 0
         self.tangent: Any = None
 
-    def _constrain(self, domain: dolfinx.mesh.Mesh, loading: Loading) -> None:
+    def _constrain(self, loading: Loading) -> None:
         tolerance = 1e-8 * loading.half_width
 
         def on_edge(x: FloatArray) -> NDArray[np.bool_]:
@@ -156,22 +152,6 @@ class Structure:
         x = self.V.tabulate_dof_coordinates()
         return 2 * np.flatnonzero(where(x.T)).astype(np.int64) + component
 
-    def _define_forms(self, domain: dolfinx.mesh.Mesh, material: Material) -> None:
-        u, form = self._u, dolfinx.fem.form
-        test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
-        dx = ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
-        F = ufl.Identity(2) + ufl.grad(u)
-        energy = material.energy(F) * dx
-        residual = ufl.derivative(energy, u, test)
-        self._energy = form(energy)
-        self._residual = form(residual)
-        self._tangent_form = form(ufl.derivative(residual, u, trial))
-        self._load_form = form(ufl.derivative(residual, u, self._direction))
-        self._mass_form = form(ufl.inner(trial, test) * ufl.dx(domain))
-        det_f = dolfinx.fem.Expression(ufl.det(F), _THREE_POINT_LOCATIONS)
-        count = domain.topology.index_map(2).size_local
-        self._det_f = (det_f, np.arange(count, dtype=np.int32))
-
     # -- states -------------------------------------------------------------------------
 
     def zero(self) -> PETSc.Vec:
@@ -208,7 +188,7 @@ class Structure:
 
     def residual(self, u: PETSc.Vec) -> PETSc.Vec:
         """Internal forces [N/mm], zero at the constrained components."""
-        vector = self._assemble(self._residual, u)
+        vector = self._assemble(self._forms.forces, u)
         vector.array[self._held_owned] = 0.0
         return vector
 
@@ -224,7 +204,9 @@ class Structure:
         The matrix is the same object at every call, assembled anew.
         """
         self._load(u)
-        self.tangent = dolfinx_api.assemble_matrix(self._tangent_form, self._bcs, 1.0, self.tangent)
+        self.tangent = dolfinx_api.assemble_matrix(
+            self._forms.stiffness, self._bcs, 1.0, self.tangent
+        )
         self.tangent.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return self.tangent
 
@@ -235,19 +217,19 @@ class Structure:
 
     def mass(self) -> PETSc.Mat:
         """Mass matrix of unit density, constrained rows zero [mm^2]."""
-        return dolfinx_api.assemble_matrix(self._mass_form, self._bcs, 0.0)
+        return dolfinx_api.assemble_matrix(self._forms.mass, self._bcs, 0.0)
 
     def energy(self, u: PETSc.Vec) -> float:
         """Stored energy per unit thickness [N]."""
         self._load(u)
-        return float(self.comm.allreduce(dolfinx.fem.assemble_scalar(self._energy)))
+        return float(self.comm.allreduce(dolfinx.fem.assemble_scalar(self._forms.energy)))
 
     def reaction(self, u: PETSc.Vec, length: float) -> float:
         """Compressive force on a loaded edge per unit thickness [N/mm].
 
         By virtual work: d(energy)/d(strain) = force * length at equilibrium.
         """
-        forces = self._assemble(self._residual, u)
+        forces = self._assemble(self._forms.forces, u)
         held = self._held_owned
         work = float(forces.array[held] @ self._direction.x.array[held])
         return float(self.comm.allreduce(work)) / length
@@ -255,9 +237,7 @@ class Structure:
     def smallest_jacobian(self, u: PETSc.Vec) -> float:
         """Smallest det F at the corners and mid-sides of all elements [-]."""
         self._load(u)
-        expression, cells = self._det_f
-        values = expression.eval(self.V.mesh, cells)
-        return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), MPI.MIN))
+        return float(self.comm.allreduce(self._forms.smallest_jacobian(), MPI.MIN))
 
     def _load(self, u: PETSc.Vec) -> None:
         count = len(u.array)
@@ -269,8 +249,3 @@ class Structure:
         vector = u.duplicate()
         dolfinx_api.assemble_vector(form, vector)
         return vector
-
-
-_THREE_POINT_LOCATIONS = np.array(
-    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]
-)

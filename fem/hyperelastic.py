@@ -1,0 +1,75 @@
+"""The weak form of a hyperelastic body: what dolfinx assembles, for specimens and cells alike.
+
+Total Lagrangian, plane strain, six-node triangles with the three-point Gauss rule, as in the
+paper's section "Virtual Experiments". A material states its energy; the rest is derived.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dolfinx
+import numpy as np
+import ufl
+from mpi4py import MPI
+
+from modeharvest.errors import InputError
+from modeharvest.fem import dolfinx_api
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import Material
+
+_THREE_POINTS = {"quadrature_degree": 2}  # on a triangle: the three-point Gauss rule
+_CORNERS_AND_MIDDLES = np.array(
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]
+)
+
+
+class Hyperelastic:
+    """Space, displacement and compiled forms of a meshed body.
+
+    ``V`` is the space and ``u`` the displacement [mm] at which everything is assembled;
+    ``energy``, ``forces``, ``stiffness`` and ``mass`` (of unit density) are dolfinx forms.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh [mm] (needed on rank 0 only).
+    material
+        Strain energy density [MPa].
+    comm
+        The communicator to distribute over.
+
+    Raises
+    ------
+    InputError
+        If the mesh has other elements.
+    """
+
+    def __init__(self, mesh: Mesh, material: Material, comm: MPI.Comm) -> None:
+        if mesh.element != "T6":
+            raise InputError(f"finite elements: expected a T6 mesh, got {mesh.element}")
+        domain = dolfinx_api.create_mesh(mesh, comm)
+        self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
+        self.u = dolfinx.fem.Function(self.V)
+        test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
+        dx = ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
+        F = ufl.Identity(2) + ufl.grad(self.u)
+        energy = material.energy(F) * dx
+        self._forces: Any = ufl.derivative(energy, self.u, test)
+        form = dolfinx.fem.form
+        self.energy: Any = form(energy)
+        self.forces: Any = form(self._forces)
+        self.stiffness: Any = form(ufl.derivative(self._forces, self.u, trial))
+        self.mass: Any = form(ufl.inner(trial, test) * ufl.dx(domain))
+        self._det_f = dolfinx.fem.Expression(ufl.det(F), _CORNERS_AND_MIDDLES)
+        count = domain.topology.index_map(2).size_local
+        self._own_cells = np.arange(count, dtype=np.int32)
+
+    def stiffness_along(self, direction: dolfinx.fem.Function) -> Any:
+        """The form of the stiffness times a displacement: how forces change along it."""
+        return dolfinx.fem.form(ufl.derivative(self._forces, self.u, direction))
+
+    def smallest_jacobian(self) -> float:
+        """Smallest det F at the corners and mid-sides of this rank's elements [-]."""
+        values = self._det_f.eval(self.V.mesh, self._own_cells)
+        return float(np.min(values, initial=np.inf))
