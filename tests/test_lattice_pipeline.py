@@ -17,9 +17,10 @@ import pytest
 from modeharvest import cli
 from modeharvest.fem.dispersion import Dispersion
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.fem.mode_file import read_modes
 from modeharvest.files import read_json
 from modeharvest.lattice_case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.lattice_kinds import SquareLattice
+from modeharvest.lattice_kinds import HexagonalLattice, SquareLattice
 from modeharvest.lattice_pipeline import LatticeAnalysis, bloch, modes
 from modeharvest.lattice_table import print_lattice
 from modeharvest.lattice_tables import DispersionPlan, Loading, ModesPlan, Search
@@ -337,3 +338,19 @@ def test_without_dolfinx_the_commands_say_how_to_get_it(
     assert command(monkeypatch, "bloch", "square-lattice", "--out", tmp_path / "out") == 2
     assert "conda" in (line := error_line(capsys))
     assert "dolfinx" in line
+
+
+def test_degenerate_waves_are_in_the_order_of_their_phases(tmp_path: Path) -> None:
+    """Three at once, whichever of them rounding makes the least stable: combinations need it."""
+    case = coarse(lattice=HexagonalLattice(1.0, 0.92, 0.2), modes=ModesPlan(branch_loads=(0.012,)))
+    LatticeAnalysis(case, tmp_path).modes()
+    point = read_json(tmp_path / "critical.json")["point"]
+    np.testing.assert_allclose(point["waves"], math.pi * np.array([[1, 1], [1, 0], [0, 1]]))
+    found, branches = read_modes(tmp_path / "modes.h5")
+    np.testing.assert_allclose(found.waves, point["waves"])
+    assert [branch.combination for branch in branches] == [
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, 1.0),
+        pytest.approx((3**-0.5,) * 3),
+    ]

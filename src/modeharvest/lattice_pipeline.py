@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +27,7 @@ from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice_case import LatticeCase, read_lattice_case
+from modeharvest.lattice_critical import find_critical, read_critical, write_critical
 from modeharvest.lattice_kinds import FileLattice
 from modeharvest.lattice_model import LatticeModel
 from modeharvest.lattice_patterns import (
@@ -40,7 +40,7 @@ from modeharvest.lattice_patterns import (
     why_no_modes,
 )
 from modeharvest.lattice_summary import exports_in, summary_of
-from modeharvest.progress import Progress, named, silent
+from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
 from modeharvest.validation.lattice_report import write_lattice_report
 from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
@@ -86,17 +86,11 @@ class LatticeAnalysis:
         path = self.folder / "critical.json"
 
         def work() -> None:
-            from modeharvest.fem.bloch_critical import CriticalSearch, first_critical
-
-            search = CriticalSearch(**asdict(self.case.search))
-            listener = named(self.progress, "first critical load")
-            found = first_critical(self._model.path(), search, listener)
-            point = CriticalPoint.of(self.case.loading.name, found)
-            history = [asdict(least) for least in found.history]
-            write_json(path, {"point": asdict(point), "history": history})
+            found = find_critical(self._model.path(), self.case.search, self.progress)
+            write_critical(path, self.case.loading.name, found)
 
         self.stages.do("critical", self._keys["critical"], work, path)
-        return _point(read_json(path)["point"])
+        return read_critical(path)
 
     def dispersion(self) -> Dispersion:
         """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
@@ -331,9 +325,3 @@ def _analysis(
     if isinstance(case, LatticeCase):
         return LatticeAnalysis(case, Path(folder), progress)
     return LatticeAnalysis(read_lattice_case(case), Path(folder), progress, str(case))
-
-
-def _point(content: Mapping[str, Any]) -> CriticalPoint:
-    waves = {name: tuple(map(tuple, content[name])) for name in ("waves", "earlier")}
-    signs = {name: tuple(content[name]) for name in ("below", "above")}
-    return CriticalPoint(**{**content, **waves, **signs})

@@ -179,8 +179,9 @@ class ModesPlan:
         At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
         another load than the critical one have no branches.
     combinations
-        One row of coefficients for each branch to follow, as many as there are modes; none: each
-        mode alone, and the sum of all.
+        One row of coefficients for each branch to follow, as many as there are modes, in the order
+        of their waves (critical ones by phases, the largest first); none: each mode alone, and
+        the sum of all.
     branch_loads
         At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
         critical load.
