@@ -354,3 +354,20 @@ def test_degenerate_waves_are_in_the_order_of_their_phases(tmp_path: Path) -> No
         (0.0, 0.0, 1.0),
         pytest.approx((3**-0.5,) * 3),
     ]
+
+
+@pytest.mark.parametrize(
+    "victim", ["critical.json", "dispersion.h5", "modes.h5", "family_branch_1.json"]
+)
+def test_a_truncated_file_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    case: Path,
+    folder: Path,
+    victim: str,
+) -> None:
+    (folder / "summary.json").unlink()
+    path = folder / victim
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert command(monkeypatch, "modes", case, "--out", folder) == 2
+    assert victim in error_line(capsys)
