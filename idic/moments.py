@@ -63,10 +63,19 @@ IMAGES = -1
 """``component`` of a pair of images."""
 
 
-class Pixels(NamedTuple):
-    """Columns of the pixels that count, row after row, and (rows + 1,) where each row starts."""
+class Runs(NamedTuple):
+    """The pixels that count, as runs of neighbours along the rows.
 
-    columns: NDArray[Any]
+    Parameters
+    ----------
+    first, stop
+        (runs,) column of the first pixel of each and of the one after its last, row after row.
+    row_start
+        (rows + 1,) number of the first run of each row.
+    """
+
+    first: NDArray[Any]
+    stop: NDArray[Any]
     row_start: NDArray[Any]
 
 
@@ -75,8 +84,11 @@ class Tables(NamedTuple):
 
     Parameters
     ----------
-    xi, eta
-        (cols,), (rows,): normalised coordinates.
+    eta
+        (rows,): normalised coordinate.
+    along_x
+        (1 + 2 w + n, cols): xi, then for each wave sin and cos of pi/l kx x, then for each mode
+        s tau_x.
     v0, v
         (2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm].
     brightness
@@ -85,14 +97,14 @@ class Tables(NamedTuple):
         Numbers of their base fields; 0 where they are no unknowns.
     waves, mode_of_wave
         (w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to.
-    sin_x, cos_x, sin_y, cos_y
-        (w, cols) of pi/l kx x, (w, rows) of pi/l (ky y + c).
-    taper_x, taper_y
-        (n, cols) s tau_x and (n, rows) tau_y.
+    sin_y, cos_y
+        (w, rows) of pi/l (ky y + c).
+    taper_y
+        (n, rows) tau_y.
     """
 
-    xi: NDArray[Any]
     eta: NDArray[Any]
+    along_x: NDArray[Any]
     v0: NDArray[Any]
     v: NDArray[Any]
     brightness: NDArray[Any]
@@ -100,20 +112,43 @@ class Tables(NamedTuple):
     offset_field: int
     waves: NDArray[Any]
     mode_of_wave: NDArray[Any]
-    sin_x: NDArray[Any]
-    cos_x: NDArray[Any]
     sin_y: NDArray[Any]
     cos_y: NDArray[Any]
-    taper_x: NDArray[Any]
     taper_y: NDArray[Any]
 
 
 @compiled(relaxed=True)
-def _chebyshev_block(xi: Any, columns: Any, n: int, T: Any) -> None:
-    """T_0 ... T_K at the block's columns."""
+def _gather(
+    target: Any, row: int, first: int, n: int, at: int, tables: Any, f: Any, columns: Any, X: Any
+) -> None:
+    """Append a run to a block, from its place ``at`` on: f, columns, and the tables along x.
+
+    Runs are copied rather than pixels picked one by one: that goes by whole vectors.
+    """
+    # Through views whose indices begin at 0: others might be negative for all the compiler knows.
+    columns, f = columns[at : at + n], f[at : at + n]
+    for m in range(n):
+        columns[m] = first + m
+    if target.component >= 0:
+        known = target.displacement[row, first : first + n]
+        for m in range(n):
+            f[m] = known[m]
+    else:
+        reference = target.reference[row, first : first + n]
+        for m in range(n):
+            f[m] = reference[m]
+    for k in range(X.shape[0]):
+        along, to = tables.along_x[k, first : first + n], X[k, at : at + n]
+        for m in range(n):
+            to[m] = along[m]
+
+
+@compiled(relaxed=True)
+def _chebyshev_block(xi: Any, n: int, T: Any) -> None:
+    """T_0 ... T_K along the block."""
     for m in range(n):
         T[0, m] = 1.0
-        T[1, m] = xi[columns[m]]
+        T[1, m] = xi[m]
     for a in range(2, T.shape[0]):
         for m in range(n):
             T[a, m] = 2.0 * T[1, m] * T[a - 1, m] - T[a - 2, m]
@@ -135,31 +170,34 @@ def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
 
 @compiled(relaxed=True)
 def _modes_block(
-    row: int, columns: Any, n: int, tables: Any, v: Any, phi: Any, sines: Any, cosines: Any
+    row: int, n: int, tables: Any, X: Any, v: Any, phi: Any, sines: Any, cosines: Any
 ) -> None:
     """phi_i, S sin theta_w and S cos theta_w pi/l along the block, from one-dimensional tables."""
-    for i in range(phi.shape[0]):
-        for m in range(n):
-            phi[i, 0, m] = phi[i, 1, m] = 0.0
-    for w in range(tables.waves.shape[0]):
+    waves = tables.waves.shape[0]
+    phi[:, :, :n] = 0.0
+    for w in range(waves):
         i = tables.mode_of_wave[w]
         A, B, per_mm = tables.waves[w, 0], tables.waves[w, 1], tables.waves[w, 5]
-        sy, cy = tables.sin_y[w, row], tables.cos_y[w, row]
-        sin_x, cos_x = tables.sin_x[w], tables.cos_x[w]
-        taper_x, tau_y = tables.taper_x[i], tables.taper_y[i, row]
+        tau_y = tables.taper_y[i, row]
+        sy, cy = tau_y * tables.sin_y[w, row], tau_y * tables.cos_y[w, row]
+        sin_x, cos_x, tau_x = X[1 + 2 * w], X[2 + 2 * w], X[1 + 2 * waves + i]
+        sine, cosine, phi_x, phi_y, v_i = sines[w], cosines[w], phi[i, 0], phi[i, 1], v[i]
+        # Short loops with few arrays each: those the compiler turns into vectors.
         for m in range(n):
-            k = columns[m]
-            tau = taper_x[k] * tau_y
-            sine = tau * (sin_x[k] * cy + cos_x[k] * sy)
-            phi[i, 0, m] += A * sine
-            phi[i, 1, m] += B * sine
-            sines[w, m] = v[i, m] * sine
-            cosines[w, m] = per_mm * v[i, m] * tau * (cos_x[k] * cy - sin_x[k] * sy)
+            sine[m] = tau_x[m] * (sin_x[m] * cy + cos_x[m] * sy)
+        for m in range(n):
+            cosine[m] = per_mm * tau_x[m] * (cos_x[m] * cy - sin_x[m] * sy)
+        for m in range(n):
+            phi_x[m] += A * sine[m]
+            phi_y[m] += B * sine[m]
+        for m in range(n):
+            sine[m] *= v_i[m]
+            cosine[m] *= v_i[m]
 
 
 @compiled(relaxed=True)
 def _model_block(
-    target: Any, row: int, columns: Any, n: int, u: Any, b: Any, c: Any, work: Any, E: Any
+    target: Any, row: int, columns: Any, f: Any, n: int, u: Any, bc: Any, work: Any, E: Any
 ) -> int:
     """Gradient into E[0], E[1], residual into E[-1], g into work[2]; returns how many left.
 
@@ -172,7 +210,7 @@ def _model_block(
             E[0, m] = 1.0 - component
             E[1, m] = component
             work[2, m] = work[5, m] = 0.0
-            E[last, m] = target.displacement[row, columns[m]] - u[component, m]
+            E[last, m] = f[m] - u[component, m]
         return 0
     per_px = 1.0 / target.pixel_size
     at_row, at_col, value, d_row, d_col = work[0], work[1], work[2], work[3], work[4]
@@ -187,10 +225,10 @@ def _model_block(
             E[0, m] = E[1, m] = E[last, m] = value[m] = work[5, m] = 0.0
         else:
             work[5, m] = 1.0
-            gain = 1.0 + b[m]
+            gain = 1.0 + bc[0, m]
             E[0, m] = gain * d_col[m] * per_px
             E[1, m] = -gain * d_row[m] * per_px
-            E[last, m] = target.reference[row, columns[m]] - gain * value[m] - c[m]
+            E[last, m] = f[m] - gain * value[m] - bc[1, m]
     return off
 
 
@@ -266,14 +304,14 @@ def _brightness_block(n: int, tables: Any, work: Any, E: Any) -> None:
 
 @compiled(parallel=True, relaxed=True)
 def accumulate(
-    target: Any, pixels: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any
+    target: Any, runs: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any
 ) -> None:
     """Sum the moments of pairs of base fields over the pixels.
 
     Parameters
     ----------
-    target, pixels, tables
-        :class:`Target`, :class:`Pixels` and :class:`Tables`.
+    target, runs, tables
+        :class:`Target`, :class:`Runs` and :class:`Tables`.
     pairs
         (pairs, 3): numbers of two base fields and the sum of their degrees.
     fields
@@ -283,39 +321,48 @@ def accumulate(
     left
         (bands,), zero on entry: how many pixels are mapped outside the image.
     """
-    rows, bands = pixels.row_start.size - 1, moments.shape[0]
+    rows, bands = runs.row_start.size - 1, moments.shape[0]
     modes, waves = tables.v.shape[0], tables.waves.shape[0]
     for band in prange(bands):
         T = np.empty((max(2, moments.shape[2]), BLOCK))
         eta_T = np.empty(T.shape[0])
         E = np.empty((fields, BLOCK))
+        columns, f, X = np.empty(BLOCK), np.empty(BLOCK), np.empty((tables.along_x.shape[0], BLOCK))
         u, v, bc = np.empty((2, BLOCK)), np.empty((modes, BLOCK)), np.empty((2, BLOCK))
         phi = np.empty((modes, 2, BLOCK))
         sines, cosines = np.empty((waves, BLOCK)), np.empty((waves, BLOCK))
         work, product = np.empty((6, BLOCK)), np.empty(BLOCK)
         row_moments = np.zeros((pairs.shape[0], T.shape[0]))
         for row in range(band * rows // bands, (band + 1) * rows // bands):
-            first, last = pixels.row_start[row], pixels.row_start[row + 1]
-            if first == last:
+            run, last = runs.row_start[row], runs.row_start[row + 1]
+            if run == last:
                 continue
             eta_T[0], eta_T[1] = 1.0, tables.eta[row]
             for b in range(2, eta_T.size):
                 eta_T[b] = 2.0 * eta_T[1] * eta_T[b - 1] - eta_T[b - 2]
-            for begin in range(first, last, BLOCK):
-                n = min(BLOCK, last - begin)
-                block = pixels.columns[begin : begin + n]
-                _chebyshev_block(tables.xi, block, n, T)
+            begin = runs.first[run]
+            while run < last:
+                n = 0
+                while n < BLOCK and run < last:
+                    length = min(BLOCK - n, runs.stop[run] - begin)
+                    _gather(target, row, begin, length, n, tables, f, columns, X)
+                    n += length
+                    begin += length
+                    if begin == runs.stop[run]:
+                        run += 1
+                        begin = runs.first[run] if run < last else 0
+                _chebyshev_block(X[0], n, T)
                 for k in range(2):
                     _series_block(tables.v0[k], eta_T, T, n, u[k])
                     _series_block(tables.brightness[k], eta_T, T, n, bc[k])
                 for i in range(modes):
                     _series_block(tables.v[i], eta_T, T, n, v[i])
-                _modes_block(row, block, n, tables, v, phi, sines, cosines)
+                _modes_block(row, n, tables, X, v, phi, sines, cosines)
                 for i in range(modes):
                     for m in range(n):
                         u[0, m] += v[i, m] * phi[i, 0, m]
                         u[1, m] += v[i, m] * phi[i, 1, m]
-                left[band] += _model_block(target, row, block, n, u, bc[0], bc[1], work, E)
+                left[band] += _model_block(target, row, columns, f, n, u, bc, work, E)
                 _base_fields_block(n, tables.waves, phi, sines, cosines, E)
                 _brightness_block(n, tables, work, E)
                 _moments_block(n, pairs, T, E, product, row_moments)

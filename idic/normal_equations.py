@@ -21,7 +21,7 @@ from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.fourier import PER_WAVE
-from modeharvest.idic.moments import IMAGES, Pixels, Tables, Target, accumulate
+from modeharvest.idic.moments import IMAGES, Runs, Tables, Target, accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -96,12 +96,13 @@ class Assembly:
             )
 
     @cached_property
-    def _pixels(self) -> Pixels:
-        row_start = np.concatenate([[0], np.cumsum(self.mask.sum(axis=1, dtype=np.int64))])
-        columns = np.empty(row_start[-1], dtype=np.int32)
-        for row, (first, last) in enumerate(pairwise(row_start)):
-            columns[first:last] = np.flatnonzero(self.mask[row])
-        return Pixels(columns, row_start)
+    def _runs(self) -> Runs:
+        edges = np.zeros((self.mask.shape[0], self.mask.shape[1] + 1), dtype=np.bool_)
+        edges[:, 1:-1] = self.mask[:, 1:] != self.mask[:, :-1]
+        edges[:, 0], edges[:, -1] = self.mask[:, 0], self.mask[:, -1]
+        columns = np.nonzero(edges)[1].astype(np.int32)  # where runs begin and end, in turns
+        per_row = edges.sum(axis=1, dtype=np.int64) // 2
+        return Runs(columns[::2], columns[1::2], np.concatenate([[0], np.cumsum(per_row)]))
 
     @cached_property
     def _degrees(self) -> list[int]:
@@ -204,15 +205,15 @@ class Assembly:
         return along(0) + along(1)
 
     def _assemble(self, a: FloatArray, target: Target, with_matrix: bool) -> NormalEquations:
-        pairs, degrees, pixels = self._pairs(with_matrix), self._degrees, self._pixels
+        pairs, degrees, runs = self._pairs(with_matrix), self._degrees, self._runs
         top = max(int(pairs[:, 2].max()), *degrees) + 1
         moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
         tables = _tables(self.ansatz, self.grid, self.ansatz.checked(a))
         kernel: Callable[..., None] = accumulate
-        kernel(target, pixels, tables, pairs, len(degrees), moments, left)
-        off = int(left.sum())
-        return self._from_moments(pairs, moments.sum(axis=0), pixels.columns.size - off, off)
+        kernel(target, runs, tables, pairs, len(degrees), moments, left)
+        off, pixels = int(left.sum()), int((runs.stop - runs.first).sum())
+        return self._from_moments(pairs, moments.sum(axis=0), pixels - off, off)
 
     def _from_moments(
         self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int
@@ -252,16 +253,19 @@ def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:
         taper_y[i] = mode.taper.along_y(grid.y)
     tx = waves[:, 5:] * waves[:, 2:3] * grid.x
     ty = waves[:, 5:] * (waves[:, 3:4] * grid.y + waves[:, 4:5])
+    xi, eta = ansatz.domain.normalised(grid.x, grid.y)
+    trig_x = np.stack([np.sin(tx), np.cos(tx)], axis=1).reshape(-1, grid.cols)
     first = 2 + n + 3 * len(waves)
     return Tables(
-        *ansatz.domain.normalised(grid.x, grid.y),
+        eta,
+        np.vstack([xi, trig_x, taper_x]),
         v0,
         v,
         ansatz.brightness.squares(a[ansatz.phi_offset(n) :]),
         *ansatz.brightness.fields(first),
         waves,
         np.array(mode_of_wave, dtype=np.int64),
-        *(np.sin(tx), np.cos(tx), np.sin(ty), np.cos(ty)),
-        taper_x,
+        np.sin(ty),
+        np.cos(ty),
         taper_y,
     )
