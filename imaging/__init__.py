@@ -6,12 +6,12 @@ speckle          the pattern: a thresholded Gaussian field, blurred, exact at an
 elements         reference elements, polynomials over them
 jacobian         proof that an element's map is one to one
 isoparametric    inverse mapping: element and local coordinates of every pixel
-rasterise        its compiled kernels
+rasterise        its compiled kernels: bands of rows, their elements, who covers a pixel
+inversion        the inverse of one element's map, for a batch of pixels
 render           reference and deformed images, and the truth behind them
 aperture         what one pixel averages: its area, behind the lens's blur
 integrate        images whose pixels average over it
 sensor           gain, offset, noise, saturation, rounding, and the noise foretold
-overlap          pixels inside more than one element
 spec, imageset   what to image, and the folder of files that comes of it
 truth, io        truth files; images and masks from and to files
 interpolation    values and gradients of a measured image between its pixels

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,11 +47,14 @@ class Located:
     residual_px
         (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px]; NaN
         where no element is.
+    doubly_covered
+        How many pixels lie inside more than one element: the mesh overlaps there.
     """
 
     element: NDArray[np.int32]
     xi: FloatArray
     residual_px: NDArray[np.float32]
+    doubly_covered: int = 0
 
     @property
     def mask(self) -> BoolArray:
@@ -95,31 +99,43 @@ def locate(
         If a Jacobian isn't positive everywhere in some element.
     """
     require_positive_jacobian(nodes, cells, element, where)
-    reference = reference_element(element)
+    elements = _elements(nodes, cells, element, grid)
+    visit_start, visits = rasterise.bands(elements.row_from, elements.row_to, grid.rows)
+    threads = numba.get_num_threads()
+    in_turn = [np.arange(k, visit_start.size - 1, threads) for k in range(threads)]
+    size = grid.rows * grid.cols
+    pixels = rasterise.Pixels(
+        np.empty(size, dtype=np.int32), np.empty((size, 2)), np.empty(size, dtype=np.float32),
+        grid.cols, float(grid.x0), float(grid.y0), float(grid.pixel_size),
+    )  # fmt: skip
+    everywhere = np.empty(0, dtype=np.bool_)
+    twice = rasterise.rasterise(
+        elements, pixels, everywhere if wanted is None else np.ascontiguousarray(wanted).ravel(),
+        visit_start, visits, np.concatenate(in_turn),
+    )  # fmt: skip
+    return Located(
+        pixels.element.reshape(grid.shape), pixels.xi.reshape(*grid.shape, 2),
+        pixels.residual.reshape(grid.shape), int(twice),
+    )  # fmt: skip
+
+
+def _elements(
+    nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid
+) -> rasterise.Elements:
+    """Lay the mesh over the pixels."""
+    triangular = reference_element(element).triangular
+    absolute = polynomials(element, cells, nodes)
     position_px = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)
     centres = np.rint(position_px[cells].mean(axis=1))
     relative = polynomials(element, np.arange(cells.size).reshape(cells.shape),
                            (position_px[cells] - centres[:, None]).reshape(-1, 2))  # fmt: skip
-    bezier = bezier_matrix(reference.triangular)
+    bezier = bezier_matrix(triangular)
     hulls = np.ascontiguousarray((relative @ bezier.T).transpose(0, 2, 1))
     row_from, row_to = _row_ranges(hulls, centres, grid.rows)
-    visit_start, visits = rasterise.bands(row_from, row_to, grid.rows)
-    owner = np.full(grid.shape, -1, dtype=np.int32)
-    if wanted is not None:
-        owner[~wanted] = 0  # whose pixels the kernel leaves alone
-    xi = np.full((*grid.shape, 2), np.nan)
-    rasterise.rasterise(
-        relative, hulls, centres, _one_to_one(relative, reference.triangular), bezier,
-        sub_elements(reference.triangular), reference.triangular,
-        visit_start, visits, row_from, row_to, owner, xi,
+    return rasterise.Elements(
+        relative, absolute, hulls, centres, _one_to_one(relative, triangular), row_from, row_to,
+        bezier, sub_elements(triangular), triangular,
     )  # fmt: skip
-    if wanted is not None:
-        owner[~wanted] = -1
-    x, y = _evaluate(polynomials(element, cells, nodes), reference.triangular, owner, xi)
-    row, col = grid.to_px(x, y)
-    row -= np.arange(grid.rows)[:, None]
-    col -= np.arange(grid.cols)[None, :]
-    return Located(owner, xi, np.hypot(row, col).astype(np.float32))
 
 
 def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArray) -> FloatArray:
@@ -170,8 +186,8 @@ def _one_to_one(relative: FloatArray, triangular: bool) -> BoolArray:
     factor = 2.0 if triangular else 1.25
     middle = np.full(2, _MIDDLE[triangular])
     points = middle + factor * (lattice(triangular, 2) - middle)
-    at_points = np.einsum("ecm,pmi->epci", relative, monomial_gradients(points))
-    control = np.einsum("qp,epci->eqci", to_bernstein(triangular, 2), at_points)
-    centre = relative @ monomial_gradients(middle)
-    deviation = np.linalg.solve(centre[:, None], control) - np.eye(2)
-    return np.asarray(np.linalg.norm(deviation, axis=(2, 3)).max(axis=1) < 1.0)
+    to_control = np.einsum("qp,pmi->miq", to_bernstein(triangular, 2), monomial_gradients(points))
+    local = np.linalg.inv(relative @ monomial_gradients(middle)) @ relative
+    control = (local.reshape(-1, 9) @ to_control.reshape(9, -1)).reshape(len(local), 2, 2, -1)
+    deviation = control - np.eye(2)[..., None]
+    return np.asarray(np.einsum("eciq,eciq->eq", deviation, deviation).max(axis=1) < 1.0)

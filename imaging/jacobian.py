@@ -48,10 +48,11 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     triangular = reference_element(element).triangular
     degree = 2 if triangular else 3
     points = lattice(triangular, degree)
-    gradients = polynomials(element, cells, positions) @ monomial_gradients(points)[:, None]
-    jacobians = gradients.transpose(1, 0, 2, 3)  # (cells, points, component, direction)
+    slopes = monomial_gradients(points).transpose(1, 2, 0).reshape(9, -1)
+    jacobians = polynomials(element, cells, positions).reshape(-1, 9) @ slopes
+    (x_s, x_t), (y_s, y_t) = jacobians.reshape(len(cells), 2, 2, -1).transpose(1, 2, 0, 3)
     convert = to_bernstein(triangular, degree)
-    coefficients = np.linalg.det(jacobians) @ convert.T
+    coefficients = (x_s * y_t - x_t * y_s) @ convert.T
     corners = _corners(triangular, degree)
     split = np.stack(
         [convert @ bernstein(triangular, degree, s[:2] + s[2] * points)

@@ -3,7 +3,8 @@
 The image is cut into bands of rows. A band visits, in ascending order, the elements that reach
 into it, and writes its own pixels only: no races, and the same result for any number of
 threads. Within an element, a row's pixels are limited to the convex hull of the Bézier control
-points, which holds the whole element however curved it is.
+points, which holds the whole element however curved it is. They are collected over the rows and
+inverted together.
 
 Coordinates are (row, col) in px relative to the element's ``centre``, a whole number of pixels,
 so rounding is that of the element's size and not of the image's.
@@ -11,147 +12,238 @@ so rounding is that of the element's size and not of the image's.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.inversion import (
+    ACCEPTED_PX,
+    ON_EDGE,
+    coefficients,
+    invert,
+    outside,
+    search,
+    value,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-BAND = 16  # rows
-ON_EDGE = 1e-9  # pixels this far outside in xi, eta still belong to the element
-_NEWTON_STEPS = 25
-_DEEPEST = 9  # quarters of quarters in the exhaustive search
-_ROUNDING_PX = 1e-13
-_ACCEPTED_PX = 1e-10
+BAND = 32  # rows
+_BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache
+_CLEAR_OF_EDGES = 1e-6  # in xi, eta; pixels on an edge come out within some 1e-9
+_NOT_WANTED = 2**31 - 1
 
 
-@compiled(inline=True)
-def _position(
-    a: FloatArray, curved: bool, s: float, t: float
-) -> tuple[float, float, float, float, float, float]:
-    """Position and its derivatives (p, q, p_s, p_t, q_s, q_t) at local coordinates (s, t)."""
-    p = a[0, 0] + s * (a[0, 1] + s * a[0, 3] + t * a[0, 4]) + t * (a[0, 2] + t * a[0, 5])
-    q = a[1, 0] + s * (a[1, 1] + s * a[1, 3] + t * a[1, 4]) + t * (a[1, 2] + t * a[1, 5])
-    p_s = a[0, 1] + 2.0 * s * a[0, 3] + t * a[0, 4]
-    q_s = a[1, 1] + 2.0 * s * a[1, 3] + t * a[1, 4]
-    p_t = a[0, 2] + s * a[0, 4] + 2.0 * t * a[0, 5]
-    q_t = a[1, 2] + s * a[1, 4] + 2.0 * t * a[1, 5]
-    if curved:
-        st = s * t
-        p += st * (s * a[0, 6] + t * a[0, 7] + st * a[0, 8])
-        q += st * (s * a[1, 6] + t * a[1, 7] + st * a[1, 8])
-        p_s += t * (2.0 * s * a[0, 6] + t * a[0, 7] + 2.0 * st * a[0, 8])
-        q_s += t * (2.0 * s * a[1, 6] + t * a[1, 7] + 2.0 * st * a[1, 8])
-        p_t += s * (s * a[0, 6] + 2.0 * t * a[0, 7] + 2.0 * st * a[0, 8])
-        q_t += s * (s * a[1, 6] + 2.0 * t * a[1, 7] + 2.0 * st * a[1, 8])
-    return p, q, p_s, p_t, q_s, q_t
+class Elements(NamedTuple):
+    """A mesh as the kernels see it: m elements.
+
+    polynomials : (m, 2, 9) (row, col) relative to the centre [px].
+    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
+    hulls : (m, p, 2) Bézier control points (row, col) relative to the centre [px].
+    centres : (m, 2) whole pixels (row, col).
+    one_to_one : (m,) whether the map is so, well beyond the element's edges.
+    row_from, row_to : (m,) the image rows row_from ... row_to - 1 may hold pixels of it.
+    bezier : (p, 9) from polynomials to control points.
+    quarters : (4, 3) sub-elements.
+    triangular : triangles or quadrilaterals.
+    """
+
+    polynomials: FloatArray
+    absolute: FloatArray
+    hulls: FloatArray
+    centres: FloatArray
+    one_to_one: BoolArray
+    row_from: IntArray
+    row_to: IntArray
+    bezier: FloatArray
+    quarters: FloatArray
+    triangular: bool
 
 
-@compiled(inline=True)
-def _outside(triangular: bool, s: float, t: float) -> float:
-    """How far (s, t) lies outside the reference domain; 0 or negative inside."""
-    if triangular:
-        return max(-s, -t, s + t - 1.0)
-    return max(abs(s), abs(t)) - 1.0
+class Pixels(NamedTuple):
+    """What is found, over the pixels in the order of memory.
+
+    element : (rows * cols,) int32 element, -1 where none is.
+    xi : (rows * cols, 2) local coordinates, NaN where no element is.
+    residual : (rows * cols,) float32 [px], NaN where no element is.
+    cols : how many a row.
+    x0, y0, pixel_size : of the grid [mm].
+    """
+
+    element: NDArray[np.int32]
+    xi: FloatArray
+    residual: NDArray[np.float32]
+    cols: int
+    x0: float
+    y0: float
+    pixel_size: float
 
 
-@compiled()
-def _newton(
-    a: FloatArray, curved: bool, row: float, col: float, s: float, t: float
-) -> tuple[bool, float, float]:
-    """Solve position(s, t) = (row, col) from a start; (converged, s, t)."""
-    before = np.inf
-    for _ in range(_NEWTON_STEPS):
-        p, q, p_s, p_t, q_s, q_t = _position(a, curved, s, t)
-        p -= row
-        q -= col
-        residual = p * p + q * q
-        if residual <= _ROUNDING_PX**2 or (
-            residual <= _ACCEPTED_PX**2 and residual >= 0.25 * before
-        ):
-            return True, s, t
-        before = residual
-        determinant = p_s * q_t - p_t * q_s
-        if determinant == 0.0:
-            return False, s, t
-        ds = (p_t * q - q_t * p) / determinant
-        dt = (q_s * p - p_s * q) / determinant
-        longest = max(abs(ds), abs(dt))
-        if longest > 2.0:  # a leap this long is no use of a local model
-            ds *= 2.0 / longest
-            dt *= 2.0 / longest
-        s += ds
-        t += dt
-    return False, s, t
+@compiled(parallel=True)
+def rasterise(
+    elements: Elements,
+    pixels: Pixels,
+    wanted: BoolArray,
+    visit_start: IntArray,
+    visits: IntArray,
+    order: IntArray,
+) -> int:
+    """Fill ``pixels``, and count those that lie inside more than one element.
 
-
-@compiled()
-def _may_hold(
-    a: FloatArray, bezier: FloatArray, s: float, t: float, scale: float, row: float, col: float
-) -> bool:
-    """Whether the control points' box of the part (s, t) + scale (s', t') holds the pixel."""
-    b = np.empty(9)
-    for k in range(2):
-        c = a[k]
-        b[0] = c[0] + s * (c[1] + s * c[3] + t * c[4]) + t * (c[2] + t * c[5])
-        b[0] += s * t * (s * c[6] + t * c[7] + s * t * c[8])
-        b[1] = scale * (c[1] + 2.0 * s * c[3] + t * c[4])
-        b[1] += scale * t * (2.0 * s * c[6] + t * c[7] + 2.0 * s * t * c[8])
-        b[2] = scale * (c[2] + s * c[4] + 2.0 * t * c[5])
-        b[2] += scale * s * (s * c[6] + 2.0 * t * c[7] + 2.0 * s * t * c[8])
-        b[3] = scale**2 * (c[3] + t * c[6] + t * t * c[8])
-        b[4] = scale**2 * (c[4] + 2.0 * s * c[6] + 2.0 * t * c[7] + 4.0 * s * t * c[8])
-        b[5] = scale**2 * (c[5] + s * c[7] + s * s * c[8])
-        b[6] = scale**3 * (c[6] + 2.0 * t * c[8])
-        b[7] = scale**3 * (c[7] + 2.0 * s * c[8])
-        b[8] = scale**4 * c[8]
-        low, high = np.inf, -np.inf
-        for i in range(bezier.shape[0]):
-            value = 0.0
-            for m in range(9):
-                value += bezier[i, m] * b[m]
-            low, high = min(low, value), max(high, value)
-        target = row if k == 0 else col
-        slack = 1e-9 * (1.0 + high - low)
-        if target < low - slack or target > high + slack:
-            return False
-    return True
+    ``wanted`` (rows * cols,) tells where to look, everywhere if it is empty.
+    ``visits[visit_start[b]:visit_start[b + 1]]`` are the elements of band b, ascending;
+    ``order`` is that of the bands.
+    """
+    twice = 0
+    for i in prange(order.size):
+        band = order[i]
+        twice += _fill_band(
+            elements, pixels, wanted, visits[visit_start[band] : visit_start[band + 1]], band
+        )
+    return twice
 
 
 @compiled()
-def _search(
-    a: FloatArray,
-    bezier: FloatArray,
-    quarters: FloatArray,
-    triangular: bool,
-    row: float,
-    col: float,
-) -> tuple[bool, float, float]:
-    """Exhaustive search: halve the element, drop parts that can't hold the pixel, try the rest."""
-    stack = np.empty((4 * _DEEPEST + 4, 4))
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0.0, 0.0, 1.0, 0.0
-    top = 1
-    while top > 0:
-        top -= 1
-        s0, t0, scale, depth = stack[top]
-        if not _may_hold(a, bezier, s0, t0, scale, row, col):
+def _fill_band(
+    elements: Elements, pixels: Pixels, wanted: BoolArray, visits: IntArray, band: int
+) -> int:
+    cols = pixels.cols
+    rows = pixels.element.size // cols
+    top, bottom = band * BAND, min((band + 1) * BAND, rows)
+    for at in range(top * cols, bottom * cols):
+        pixels.element[at] = -1 if wanted.size == 0 or wanted[at] else _NOT_WANTED
+    again = np.zeros((bottom - top) * cols, dtype=np.bool_)
+    work, where = np.empty((6, _BATCH)), np.empty(_BATCH, dtype=np.int64)
+    for e in visits:
+        first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
+        _fill_element(elements, pixels, e, first, last, again, top * cols, work, where)
+    for at in range(top * cols, bottom * cols):
+        if pixels.element[at] == _NOT_WANTED:
+            pixels.element[at] = -1
+        if pixels.element[at] < 0:
+            pixels.xi[at, 0] = pixels.xi[at, 1] = np.nan
+            pixels.residual[at] = np.nan
+    return np.count_nonzero(again)
+
+
+@compiled()
+def _fill_element(
+    elements: Elements,
+    pixels: Pixels,
+    e: int,
+    first: int,
+    last: int,
+    again: BoolArray,
+    band_start: int,
+    work: FloatArray,
+    where: IntArray,
+) -> None:
+    """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
+    cols = pixels.cols
+    hull = elements.hulls[e]
+    centre_row, centre_col = elements.centres[e]
+    row, col = work[0], work[1]
+    count = 0
+    for image_row in range(first, last):
+        low, high = _row_range(hull, image_row - centre_row)
+        if low > high:
             continue
-        middle = scale / 3.0 if triangular else 0.0
-        converged, s, t = _newton(a, not triangular, row, col, s0 + middle, t0 + middle)
-        if converged and _outside(triangular, s, t) <= ON_EDGE:
-            return True, s, t
-        if depth < _DEEPEST:
-            for i in range(4):
-                stack[top, 0] = s0 + scale * quarters[i, 0]
-                stack[top, 1] = t0 + scale * quarters[i, 1]
-                stack[top, 2] = scale * quarters[i, 2]
-                stack[top, 3] = depth + 1.0
-                top += 1
-    return False, 0.0, 0.0
+        from_col = max(0, int(np.ceil(low - 1e-9 + centre_col)))
+        to_col = min(cols - 1, int(np.floor(high + 1e-9 + centre_col)))
+        for image_col in range(from_col, to_col + 1):
+            at = image_row * cols + image_col
+            if pixels.element[at] == _NOT_WANTED:
+                continue
+            if count == _BATCH:
+                _claim(elements, pixels, e, again, band_start, work, where, count)
+                count = 0
+            row[count], col[count] = image_row - centre_row, image_col - centre_col
+            where[count] = at
+            count += 1
+    _claim(elements, pixels, e, again, band_start, work, where, count)
+
+
+@compiled()
+def _claim(
+    elements: Elements,
+    pixels: Pixels,
+    e: int,
+    again: BoolArray,
+    band_start: int,
+    work: FloatArray,
+    where: IntArray,
+    count: int,
+) -> None:
+    """Invert a batch; claim those of its pixels that are inside and nobody's yet."""
+    triangular = elements.triangular
+    row, col, s, t, off, residual = work[0], work[1], work[2], work[3], work[4], work[5]
+    polynomial, absolute = elements.polynomials[e], elements.absolute[e]
+    invert(polynomial, triangular, row, col, s, t, count)
+    centre_row, centre_col = elements.centres[e]
+    h = pixels.pixel_size
+    start = (pixels.y0 - h * centre_row, pixels.x0 + h * centre_col, h)
+    _check(polynomial, absolute, not triangular, row, col, s, t, start, off, residual, count)
+    for k in range(count):
+        at = where[k]
+        depth = -outside(triangular, s[k], t[k])
+        converged = off[k] <= ACCEPTED_PX**2
+        if not converged or (depth < -ON_EDGE and not (elements.one_to_one[e] and depth > -0.25)):
+            # On an element that is one to one well beyond its edges, a root found outside is
+            # the only one; here there may be another inside.
+            found, s[k], t[k] = search(
+                polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
+            )
+            if not found:
+                continue
+            depth = -outside(triangular, s[k], t[k])
+            _check(polynomial, absolute, not triangular, row[k:], col[k:], s[k:], t[k:], start,
+                   off[k:], residual[k:], 1)  # fmt: skip
+        if depth < -ON_EDGE:
+            continue
+        if pixels.element[at] < 0:
+            pixels.element[at] = e
+            pixels.xi[at, 0] = s[k]
+            pixels.xi[at, 1] = t[k]
+            pixels.residual[at] = residual[k]
+        elif depth > _CLEAR_OF_EDGES:
+            owner_depth = -outside(triangular, pixels.xi[at, 0], pixels.xi[at, 1])
+            again[at - band_start] |= owner_depth > _CLEAR_OF_EDGES
+
+
+@compiled(relaxed=True)
+def _check(
+    polynomial: FloatArray,
+    absolute: FloatArray,
+    curved: bool,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    start: tuple[float, float, float],
+    off: FloatArray,
+    residual: FloatArray,
+    count: int,
+) -> None:
+    """Compute the residuals of the first ``count`` pixels, two ways.
+
+    ``off`` is squared, by the kernel's own coordinates [px^2]; ``residual`` is the distance in
+    the physical plane, by the nodes' own [px].
+    """
+    a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+    x, y = coefficients(absolute[0]), coefficients(absolute[1])
+    y0, x0, h = start
+    for k in range(count):
+        p = value(a, curved, s[k], t[k]) - row[k]
+        q = value(b, curved, s[k], t[k]) - col[k]
+        off[k] = p * p + q * q
+        down = y0 - h * row[k] - value(y, curved, s[k], t[k])
+        right = x0 + h * col[k] - value(x, curved, s[k], t[k])
+        residual[k] = np.sqrt(down * down + right * right) / h
 
 
 @compiled()
@@ -169,88 +261,7 @@ def _row_range(hull: FloatArray, row: float) -> tuple[float, float]:
     return low, high
 
 
-@compiled()
-def _fill(
-    number: int,
-    a: FloatArray,
-    hull: FloatArray,
-    centre: FloatArray,
-    one_to_one: bool,
-    bezier: FloatArray,
-    quarters: FloatArray,
-    triangular: bool,
-    first: int,
-    last: int,
-    element: NDArray[np.int32],
-    xi: FloatArray,
-) -> None:
-    """Claim the element's unowned pixels in image rows ``first`` ... ``last`` - 1."""
-    cols = element.shape[1]
-    middle = 1.0 / 3.0 if triangular else 0.0
-    row_s = row_t = middle
-    for image_row in range(first, last):
-        row = image_row - centre[0]
-        low, high = _row_range(hull, row)
-        if low > high:
-            continue
-        from_col = max(0, int(np.ceil(low - 1e-9 + centre[1])))
-        to_col = min(cols - 1, int(np.floor(high + 1e-9 + centre[1])))
-        s, t = row_s, row_t
-        first_of_row = True
-        for image_col in range(from_col, to_col + 1):
-            if element[image_row, image_col] >= 0:
-                continue
-            col = image_col - centre[1]
-            converged, s, t = _newton(a, not triangular, row, col, s, t)
-            outside = _outside(triangular, s, t)
-            found = converged and outside <= ON_EDGE
-            # On an element that is one to one well beyond its edges, the root found outside
-            # is the only one; elsewhere there may be another inside.
-            if not found and not (converged and one_to_one and outside < 0.25):
-                found, s, t = _search(a, bezier, quarters, triangular, row, col)
-            if found:
-                element[image_row, image_col] = number
-                xi[image_row, image_col, 0] = s
-                xi[image_row, image_col, 1] = t
-                if first_of_row:
-                    row_s, row_t, first_of_row = s, t, False
-            else:
-                s, t = row_s, row_t
-
-
-@compiled(parallel=True)
-def rasterise(
-    polynomials: FloatArray,
-    hulls: FloatArray,
-    centres: FloatArray,
-    one_to_one: BoolArray,
-    bezier: FloatArray,
-    quarters: FloatArray,
-    triangular: bool,
-    visit_start: IntArray,
-    visits: IntArray,
-    row_from: IntArray,
-    row_to: IntArray,
-    element: NDArray[np.int32],
-    xi: FloatArray,
-) -> None:
-    """Fill ``element`` (rows, cols) and ``xi`` (rows, cols, 2), which start as -1 and NaN.
-
-    ``visits[visit_start[b]:visit_start[b + 1]]`` are the elements of band b, ascending;
-    ``row_from`` ... ``row_to`` - 1 are the image rows of each element.
-    """
-    for band in prange(visit_start.size - 1):
-        top = band * BAND
-        bottom = min(top + BAND, element.shape[0])
-        for v in range(visit_start[band], visit_start[band + 1]):
-            e = visits[v]
-            _fill(
-                e, polynomials[e], hulls[e], centres[e], one_to_one[e], bezier, quarters,
-                triangular, max(top, row_from[e]), min(bottom, row_to[e]), element, xi,
-            )  # fmt: skip
-
-
-@compiled(parallel=True)
+@compiled(parallel=True, relaxed=True)
 def evaluate(
     polynomials: FloatArray,
     curved: bool,
@@ -259,19 +270,22 @@ def evaluate(
     out: FloatArray,
 ) -> None:
     """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols)."""
+    cols = element.shape[1]
     for row in prange(element.shape[0]):
-        for col in range(element.shape[1]):
-            e = element[row, col]
-            s, t = xi[row, col, 0], xi[row, col, 1]
+        begin = 0
+        while begin < cols:
+            e = element[row, begin]
+            end = begin + 1
+            while end < cols and element[row, end] == e:
+                end += 1
             for k in range(out.shape[0]):
                 if e < 0:
-                    out[k, row, col] = np.nan
-                    continue
-                a = polynomials[e, k]
-                value = a[0] + s * (a[1] + s * a[3] + t * a[4]) + t * (a[2] + t * a[5])
-                if curved:
-                    value += s * t * (s * a[6] + t * a[7] + s * t * a[8])
-                out[k, row, col] = value
+                    out[k, row, begin:end] = np.nan
+                else:
+                    a = coefficients(polynomials[e, k])
+                    for col in range(begin, end):
+                        out[k, row, col] = value(a, curved, xi[row, col, 0], xi[row, col, 1])
+            begin = end
 
 
 @compiled()

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import Located, interpolate, locate
-from modeharvest.imaging.overlap import doubly_covered
 from modeharvest.imaging.speckle import Speckle
 
 FloatArray = NDArray[np.float64]
@@ -76,7 +75,8 @@ def render_reference(located: Located, speckle: Speckle, background: float) -> R
     ``located`` is the undeformed mesh on the image's grid.
     """
     mask = located.mask
-    return Rendering(np.where(mask, speckle.image(), background).astype(np.float32), mask)
+    image = np.where(mask, speckle.image(), background).astype(np.float32)
+    return Rendering(image, mask, located.doubly_covered)
 
 
 def render_deformed(
@@ -122,5 +122,4 @@ def render_deformed(
     mask = located.mask
     image = np.full(grid.shape, background, dtype=np.float32)
     image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
-    overlap = doubly_covered(located, mesh.nodes + displacement, mesh.cells, mesh.element, grid)
-    return Rendering(image, mask, overlap), truth
+    return Rendering(image, mask, located.doubly_covered), truth

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from modeharvest.imaging.elements import reference_element
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import locate
-from modeharvest.imaging.overlap import doubly_covered
 
 FloatArray = NDArray[np.float64]
 H = 0.125  # mm/px, a binary fraction: edges and nodes lie exactly on pixel centres
@@ -16,7 +15,7 @@ GRID = PixelGrid.centred(81, 81, H)
 
 def count(nodes: FloatArray, element: str, grid: PixelGrid = GRID) -> int:
     cells = np.arange(len(nodes)).reshape(-1, len(reference_element(element).nodes))
-    return doubly_covered(locate(nodes, cells, element, grid), nodes, cells, element, grid)
+    return locate(nodes, cells, element, grid).doubly_covered
 
 
 @pytest.mark.parametrize("element", ["Q4", "Q8", "Q9"])
