@@ -207,10 +207,12 @@ def pattern_mode(lattice: Lattice, row: ModeRow | None = None) -> PatternMode:
 
 def _path(lattice: Lattice) -> CellPath:
     from modeharvest.fem.cell import CellPath, PeriodicCell
-    from modeharvest.fem.lattices import square
+    from modeharvest.fem.lattices import UnitCell, square
 
-    pitch = lattice.pitch
-    unit = square(pitch, lattice.ratio * pitch, pitch / lattice.divisions)
+    # Meshed for l = 1 mm and scaled: gmsh's tolerances are lengths, its meshes of other l others.
+    one = square(1.0, lattice.ratio, 1.0 / lattice.divisions)
+    mesh = Mesh(lattice.pitch * one.mesh.nodes, one.mesh.cells, one.mesh.element)
+    unit = UnitCell(mesh, lattice.pitch * one.lattice)
     return CellPath(PeriodicCell(unit, lattice.material), lattice.loading)
 
 
