@@ -20,7 +20,8 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
     ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
     ``residual_verdict``, ``identifiability_warnings``, ``pixels``, ``details_px`` (more
-    statistics of w, best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
+    statistics of w, best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral
+    densities, in words).
 ``expected``
     Rows of expected and obtained values.
 ``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
