@@ -2,7 +2,8 @@
 
 ===============  =============================================================================
 grid             pixels and millimetres, the one place for the y flip
-speckle          the pattern: a thresholded Gaussian field, blurred, exact at any point
+speckle          the pattern: a thresholded Gaussian field, blurred, known at any point
+periodic_spline  its fast evaluation, with a proved bound of the error
 elements         reference elements, polynomials over them
 jacobian         proof that an element's map is one to one
 isoparametric    inverse mapping: element and local coordinates of every pixel
