@@ -152,4 +152,6 @@ def test_a_study_says_where_the_pattern_stops_coming_first() -> None:
     assert "from d/l = 0.69 on; at 0.67 it is long waves" in said
     assert "between 0.930 (d/l = 0.3" in said
     every = replace(made_up.study(), ratios=(made_up.row(0.7), made_up.row(0.9)), limits=())
-    assert "first for every d/l from 0.7 to 0.9" in " ".join(words.study_sentences(every))
+    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(
+        words.study_sentences(every)
+    )
