@@ -153,7 +153,7 @@ def study_sentences(study: ModeStudy) -> list[str]:
         rows = [row for row in study.ratios if row.loading == loading]
         if loading not in limited and all(row.is_first for row in rows):
             ratios = [row.ratio for row in rows]
-            said.append(f"Under {loading} loading it is the first for every d/l looked at, from "
+            said.append(f"Under {loading} loading it is the first for every d/l "
                         f"looked at, from {min(ratios):.4g} to {max(ratios):.4g}.")  # fmt: skip
     if study.ratios:
         best = max(study.ratios, key=lambda row: row.overlap)
