@@ -160,10 +160,16 @@ class _Search:
             self.progress(load, largest, "lattice")
             target = min(load + step, largest)
             least = self._measured(self.path.at(target))
-            if least is None:
-                return self._stable(load, f"Newton's method did not converge beyond {load:.6g}")
+            path_ends = least is None
+            if least is None:  # somewhere between: what of the path is before its end?
+                target = max(state.load for state in self.path.states)
+                least = self._measured(self.path.at(target))
+            assert least is not None, "a state that is known"
             if least.value <= 0:
                 return self._root(load, target)
+            if path_ends:
+                text = f"Newton's method did not converge beyond {target:.6g}"
+                return self._stable(target, text)
             rate = (previous.value - least.value) / (target - load)
             ahead = 1.05 * least.value / rate if rate > 0 else math.inf
             step = min(max(ahead, 0.2 * step), 3.0 * step, self.search.largest_step)

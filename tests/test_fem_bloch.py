@@ -21,7 +21,7 @@ from modeharvest.fem.bloch_critical import (
     critical_at,
     first_critical,
 )
-from modeharvest.fem.cell import CellPath, PeriodicCell
+from modeharvest.fem.cell import CellPath, CellState, PeriodicCell
 from modeharvest.fem.condensation import Condensation
 from modeharvest.fem.lattices import HEXAGONAL_ZONE, SQUARE_ZONE, UnitCell, hexagonal, square
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
@@ -310,6 +310,35 @@ def test_a_stable_lattice_is_an_outcome_not_a_failure() -> None:
     assert found.load == 0.01
     assert found.least.value > 0
     assert "stable up to 0.01" in found.outcome
+
+
+class EndingPath(CellPath):
+    """A path that can't be followed beyond a load, as where a hole's edge folds."""
+
+    end = 0.0
+
+    def at(self, load: float) -> CellState | None:
+        """Go as far as there is a path."""
+        found = super().at(min(load, self.end))
+        return found if load <= self.end else None
+
+
+@pytest.mark.parametrize("end", [0.024, 0.02])
+def test_a_path_that_ends_is_looked_at_up_to_there(end: float) -> None:
+    """The critical strain is 2.27 %; the step that would pass it fails."""
+    cell = PeriodicCell(cell_of("square", 8), TwoTermI1())
+    path = EndingPath(cell, uniaxial_strain())
+    path.end = end
+    found = first_critical(path)
+    assert found.found == (end > 0.0227)
+    if found.found:
+        whole = first_critical(CellPath(cell, uniaxial_strain()))
+        assert found.load == pytest.approx(whole.load, rel=1e-8)
+        assert 0.02 < whole.load < end
+    else:
+        assert found.load == end
+        assert "did not converge beyond 0.02" in found.outcome
+        assert found.least.value > 0
 
 
 def test_a_lattice_that_is_a_mechanism_is_refused() -> None:
