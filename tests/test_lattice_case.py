@@ -13,15 +13,15 @@ from modeharvest.errors import InputError
 from modeharvest.fem.dispersion import ZONES
 from modeharvest.fem.macroscopic import equibiaxial, simple_shear, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.lattice_case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.lattice_kinds import (
+from modeharvest.lattice.case import LatticeCase, StudyPlan, read_lattice_case
+from modeharvest.lattice.kinds import (
     ChiralLattice,
     FileLattice,
     HexachiralLattice,
     HexagonalLattice,
     SquareLattice,
 )
-from modeharvest.lattice_tables import DispersionPlan, Loading, ModesPlan
+from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan
 
 SHIPPED = ("chiral-lattice", "hexagonal-lattice", "mode-study", "square-lattice")
 

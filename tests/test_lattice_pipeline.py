@@ -19,11 +19,11 @@ from modeharvest.fem.dispersion import Dispersion
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.mode_file import read_modes
 from modeharvest.files import read_json
-from modeharvest.lattice_case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.lattice_kinds import HexagonalLattice, SquareLattice
-from modeharvest.lattice_pipeline import LatticeAnalysis, bloch, modes
-from modeharvest.lattice_table import print_lattice
-from modeharvest.lattice_tables import DispersionPlan, Loading, ModesPlan, Search
+from modeharvest.lattice.case import LatticeCase, StudyPlan, read_lattice_case
+from modeharvest.lattice.kinds import HexagonalLattice, SquareLattice
+from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan, Search
+from modeharvest.lattice.pipeline import LatticeAnalysis, bloch, modes
+from modeharvest.lattice.terminal import print_lattice
 
 pytestmark = pytest.mark.dolfinx
 

@@ -12,7 +12,7 @@ Python objects use the same names and units::
     [imaging.speckle]         # imaging.speckle.SpeckleSpec
     [correlation]             # idic.setup.Identification
 
-Infinite lattices have cases of their own: :mod:`modeharvest.lattice_case`.
+Infinite lattices have cases of their own: :mod:`modeharvest.lattice.case`.
 """
 
 from __future__ import annotations

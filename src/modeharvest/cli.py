@@ -19,7 +19,7 @@ from modeharvest.case import case_text, read_case, shipped_cases
 from modeharvest.case_file import lattice_cases
 from modeharvest.console import ProgressBars
 from modeharvest.errors import InputError, MissingDependencyError
-from modeharvest.lattice_table import print_lattice
+from modeharvest.lattice.terminal import print_lattice
 from modeharvest.ranks import is_first
 
 app = typer.Typer(
@@ -170,10 +170,10 @@ def _with_bars(case: str, out: Path, solution: Path | None, work: Callable[[Any]
 
 def _of_lattice(case: str, out: Path, work: Callable[[Any], Any]) -> Any:
     """Read a lattice's case, then do some of its analysis under progress bars."""
-    from modeharvest.lattice_case import read_lattice_case
+    from modeharvest.lattice.case import read_lattice_case
 
     checked = read_lattice_case(case)
-    from modeharvest.lattice_pipeline import LatticeAnalysis
+    from modeharvest.lattice.pipeline import LatticeAnalysis
 
     with _bars() as bars:
         return work(LatticeAnalysis(checked, out, bars, case))

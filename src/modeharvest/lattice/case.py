@@ -11,8 +11,8 @@
     [modes]        # which modes, which branches
     [study]        # optional: how the pattern depends on d/l, l, material and loading
 
-The tables are the dataclasses of :mod:`modeharvest.lattice_kinds` and
-:mod:`modeharvest.lattice_tables`. In Python::
+The tables are the dataclasses of :mod:`modeharvest.lattice.kinds` and
+:mod:`modeharvest.lattice.options`. In Python::
 
     case = LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))
 """
@@ -38,8 +38,8 @@ from modeharvest.case_file import (
 )
 from modeharvest.errors import InputError
 from modeharvest.fem.materials import Material, Ogden
-from modeharvest.lattice_kinds import LATTICES, Lattice, SquareLattice
-from modeharvest.lattice_tables import DispersionPlan, Loading, ModesPlan, Search
+from modeharvest.lattice.kinds import LATTICES, Lattice, SquareLattice
+from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan, Search
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.independence import LOADINGS, RATIOS
 from modeharvest.validation.independence import MATERIALS as MATERIALS_BY_NAME

@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from modeharvest.errors import MissingDependencyError
-from modeharvest.lattice_case import LatticeCase
-from modeharvest.lattice_patterns import marched
+from modeharvest.lattice.case import LatticeCase
+from modeharvest.lattice.patterns import marched
 
 if TYPE_CHECKING:  # their modules need dolfinx
     from modeharvest.fem.cell import CellPath, PeriodicCell

@@ -18,7 +18,7 @@ from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.idic.automatic import mode_family
 from modeharvest.idic.family_file import read_family, read_spectrum, write_family
 from modeharvest.idic.lattice_spectrum import lattice_spectrum
-from modeharvest.lattice_tables import ModesPlan
+from modeharvest.lattice.options import ModesPlan
 from modeharvest.progress import Progress, named, silent
 from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern
 from modeharvest.validation.plots_branches import combination_name

@@ -54,7 +54,7 @@ from typing import Any
 from modeharvest.fem.dispersion import Dispersion
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json
-from modeharvest.lattice_case import LatticeCase
+from modeharvest.lattice.case import LatticeCase
 from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
 from modeharvest.validation.mode_study import ModeStudy
 

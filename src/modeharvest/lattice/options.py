@@ -20,7 +20,7 @@ from modeharvest.fem.macroscopic import (
     uniaxial,
     uniaxial_strain,
 )
-from modeharvest.lattice_kinds import Lattice
+from modeharvest.lattice.kinds import Lattice
 
 Component = float | Literal["free"]
 _ZERO = ((0.0, 0.0), (0.0, 0.0))

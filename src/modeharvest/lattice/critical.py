@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
-from modeharvest.lattice_tables import Search
+from modeharvest.lattice.options import Search
 from modeharvest.progress import Progress, named, silent
 from modeharvest.validation.lattice_run import CriticalPoint
 

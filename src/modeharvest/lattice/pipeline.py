@@ -26,11 +26,11 @@ from modeharvest.fem.dispersion import Dispersion, ZoneMap, dispersion, zone_map
 from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_xdmf
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json, write_json
-from modeharvest.lattice_case import LatticeCase, read_lattice_case
-from modeharvest.lattice_critical import find_critical, read_critical, write_critical
-from modeharvest.lattice_kinds import FileLattice
-from modeharvest.lattice_model import LatticeModel
-from modeharvest.lattice_patterns import (
+from modeharvest.lattice.case import LatticeCase, read_lattice_case
+from modeharvest.lattice.critical import find_critical, read_critical, write_critical
+from modeharvest.lattice.kinds import FileLattice
+from modeharvest.lattice.model import LatticeModel
+from modeharvest.lattice.patterns import (
     Pattern,
     find_family,
     find_modes,
@@ -39,7 +39,7 @@ from modeharvest.lattice_patterns import (
     to_be_shown,
     why_no_modes,
 )
-from modeharvest.lattice_summary import exports_in, summary_of
+from modeharvest.lattice.summary import exports_in, summary_of
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
 from modeharvest.validation.lattice_report import write_lattice_report
