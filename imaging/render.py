@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import Located, interpolate, locate
+from modeharvest.imaging.jacobian import require_positive_jacobian
 from modeharvest.imaging.speckle import Speckle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+_ROWS_AT_ONCE = 256
+_FARTHEST_CONTROL_POINT = 4.0  # beyond the nodes, in extents of the element (that of Q9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,3 +127,39 @@ def render_deformed(
     image = np.full(grid.shape, background, dtype=np.float32)
     image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
     return Rendering(image, mask, located.doubly_covered), truth
+
+
+def render_image(
+    mesh: Mesh,
+    displacement: FloatArray,
+    grid: PixelGrid,
+    speckle: Speckle,
+    background: float,
+    where: str = "deformed mesh",
+) -> Rendering:
+    """Show the deformed specimen as :func:`render_deformed` does, without the truth.
+
+    A strip of rows is shown at a time, so that little memory is needed besides the image.
+    """
+    nodes = mesh.nodes + displacement
+    require_positive_jacobian(nodes, mesh.cells, mesh.element, where)
+    image = np.full(grid.shape, background, dtype=np.float32)
+    mask = np.zeros(grid.shape, dtype=np.bool_)
+    rows = grid.to_px(nodes[:, 0], nodes[:, 1])[0][mesh.cells]
+    low, high = rows.min(axis=1), rows.max(axis=1)
+    reach = _FARTHEST_CONTROL_POINT * (high - low) + 1.0
+    twice = 0
+    for top in range(0, grid.rows, _ROWS_AT_ONCE):
+        strip = slice(top, min(top + _ROWS_AT_ONCE, grid.rows))
+        cells = mesh.cells[(high + reach >= top) & (low - reach <= strip.stop)]
+        if not len(cells):
+            continue
+        y0 = grid.y0 - top * grid.pixel_size
+        part = PixelGrid(strip.stop - top, grid.cols, grid.pixel_size, grid.x0, y0)
+        located = locate(nodes, cells, mesh.element, part, where)
+        x, y = interpolate(located, cells, mesh.element, mesh.nodes)
+        shown = located.mask
+        mask[strip] = shown
+        image[strip][shown] = speckle(*grid.to_px(x[shown], y[shown]))
+        twice += located.doubly_covered
+    return Rendering(image, mask, twice)
