@@ -25,6 +25,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.render import render_image
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 STRAIN = 0.128
@@ -82,12 +83,18 @@ def main() -> None:
         "quintic spline of the reference image": lambda: SplineImage.of(image).sample(row, col)[0],
         "cubic spline of the reference image": lambda: SplineImage.of(image, 3).sample(row, col)[0],
     }
-    found = in_turn(mapping | speckles)
+    whole: dict[str, Work] = {
+        "whole image, mapping and speckle": lambda: render_image(mesh, u, grid, speckle, 0.0),
+    }
+    found = in_turn(mapping | speckles | whole)
     some = np.random.default_rng(0).choice(row.size, POINTS, replace=False)
     truth = term_by_term(speckle, row[some], col[some])
     errors = {"inverse mapping": f"{located.max_residual_px:.1e} px", "two nodal fields": "-"}
     for name in speckles:
         errors[name] = f"{abs(found[name][0][some] - truth).max():.1e} of full scale"
+    (name,) = whole
+    shown = found[name][0].image[mask][some]
+    errors[name] = f"{abs(shown - truth).max():.1e} of full scale (float32)"
     print(f"{grid.rows} x {grid.cols} px, {row.size / 1e6:.2f} Mpx of them material, ", end="")
     print(f"{len(mesh.cells)} {mesh.element} cells at a strain of {100 * STRAIN:.1f} %")
     print(f"proved bound of the default's error: {speckle.spline.bound:.1e} of full scale\n")

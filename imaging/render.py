@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
+from modeharvest.imaging.elements import bezier_matrix, reference_element
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import Located, interpolate, locate
 from modeharvest.imaging.jacobian import require_positive_jacobian
@@ -22,7 +23,6 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _ROWS_AT_ONCE = 256
-_FARTHEST_CONTROL_POINT = 4.0  # beyond the nodes, in extents of the element (that of Q9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +145,11 @@ def render_image(
     require_positive_jacobian(nodes, mesh.cells, mesh.element, where)
     image = np.full(grid.shape, background, dtype=np.float32)
     mask = np.zeros(grid.shape, dtype=np.bool_)
-    rows = grid.to_px(nodes[:, 0], nodes[:, 1])[0][mesh.cells]
-    low, high = rows.min(axis=1), rows.max(axis=1)
-    reach = _FARTHEST_CONTROL_POINT * (high - low) + 1.0
+    low, high = _row_bounds(mesh, grid.to_px(nodes[:, 0], nodes[:, 1])[0])
     twice = 0
     for top in range(0, grid.rows, _ROWS_AT_ONCE):
         strip = slice(top, min(top + _ROWS_AT_ONCE, grid.rows))
-        cells = mesh.cells[(high + reach >= top) & (low - reach <= strip.stop)]
+        cells = mesh.cells[(high >= top) & (low < strip.stop)]
         if not len(cells):
             continue
         y0 = grid.y0 - top * grid.pixel_size
@@ -163,3 +161,17 @@ def render_image(
         image[strip][shown] = speckle(*grid.to_px(x[shown], y[shown]))
         twice += located.doubly_covered
     return Rendering(image, mask, twice)
+
+
+def _row_bounds(mesh: Mesh, row: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rows (m,) between which each element lies, from those of the nodes, with a pixel to spare.
+
+    An element lies within its Bézier control points. They are sums of the nodes with weights
+    that add up to 1, so those with weights below 0 lie outside by as many extents.
+    """
+    element = reference_element(mesh.element)
+    weights = bezier_matrix(element.triangular) @ element.coefficients
+    rows = row[mesh.cells]
+    low, high = rows.min(axis=1), rows.max(axis=1)
+    reach = 1.0 + (high - low) * float(np.maximum(-weights, 0.0).sum(axis=1).max())
+    return low - reach, high + reach
