@@ -30,6 +30,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+_BEYOND = (0.25, 0.1, 0.03)
 _MIDDLE = {True: 1.0 / 3.0, False: 0.0}
 
 
@@ -133,7 +134,7 @@ def _elements(
     hulls = np.ascontiguousarray((relative @ bezier.T).transpose(0, 2, 1))
     row_from, row_to = _row_ranges(hulls, centres, grid.rows)
     return rasterise.Elements(
-        relative, absolute, hulls, centres, _one_to_one(relative, triangular), row_from, row_to,
+        relative, absolute, hulls, centres, _reach(relative, triangular), row_from, row_to,
         bezier, sub_elements(triangular), triangular,
     )  # fmt: skip
 
@@ -176,18 +177,25 @@ def _row_ranges(hulls: FloatArray, centres: FloatArray, rows: int) -> tuple[IntA
     return first, last
 
 
-def _one_to_one(relative: FloatArray, triangular: bool) -> BoolArray:
-    """Elements whose map is provably one to one on a domain well beyond their edges.
+def _reach(relative: FloatArray, triangular: bool) -> FloatArray:
+    """(m,) how far beyond its edges, in (xi, eta), each element's map is one to one, proved.
 
-    Sufficient on a convex domain: ||A^-1 J - 1|| < 1 there, with A the Jacobian in the
-    middle; the norm is convex, so the Bernstein coefficients of J bound it. The domain is the
-    reference one enlarged so far that it reaches at least 0.25 in (xi, eta) beyond each edge.
+    Sufficient on a convex domain: ||A^-1 J - 1|| < 1 there, with A the Jacobian in the middle;
+    the norm is convex, so the Bernstein coefficients of J bound it. The domain is the reference
+    one, enlarged. Where nothing is proved it is 0.
     """
-    factor = 2.0 if triangular else 1.25
     middle = np.full(2, _MIDDLE[triangular])
-    points = middle + factor * (lattice(triangular, 2) - middle)
-    to_control = np.einsum("qp,pmi->miq", to_bernstein(triangular, 2), monomial_gradients(points))
     local = np.linalg.inv(relative @ monomial_gradients(middle)) @ relative
-    control = (local.reshape(-1, 9) @ to_control.reshape(9, -1)).reshape(len(local), 2, 2, -1)
-    deviation = control - np.eye(2)[..., None]
-    return np.asarray(np.einsum("eciq,eciq->eq", deviation, deviation).max(axis=1) < 1.0)
+    reach = np.zeros(len(relative))
+    for beyond in _BEYOND:
+        factor = 1.0 + beyond * (3.0 if triangular else 1.0)
+        points = middle + factor * (lattice(triangular, 2) - middle)
+        slopes = monomial_gradients(points)
+        to_control = np.einsum("qp,pmi->miq", to_bernstein(triangular, 2), slopes)
+        control = (local.reshape(-1, 9) @ to_control.reshape(9, -1)).reshape(len(local), 2, 2, -1)
+        deviation = control - np.eye(2)[..., None]
+        proved = np.einsum("eciq,eciq->eq", deviation, deviation).max(axis=1) < 1.0
+        reach[proved] = np.maximum(reach[proved], beyond)
+        if proved.all():
+            break
+    return reach

@@ -46,7 +46,7 @@ class Elements(NamedTuple):
     absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
     hulls : (m, p, 2) Bézier control points (row, col) relative to the centre [px].
     centres : (m, 2) whole pixels (row, col).
-    one_to_one : (m,) whether the map is so, well beyond the element's edges.
+    reach : (m,) how far beyond the element's edges its map is one to one, in (xi, eta).
     row_from, row_to : (m,) the image rows row_from ... row_to - 1 may hold pixels of it.
     bezier : (p, 9) from polynomials to control points.
     quarters : (4, 3) sub-elements.
@@ -57,7 +57,7 @@ class Elements(NamedTuple):
     absolute: FloatArray
     hulls: FloatArray
     centres: FloatArray
-    one_to_one: BoolArray
+    reach: FloatArray
     row_from: IntArray
     row_to: IntArray
     bezier: FloatArray
@@ -192,9 +192,9 @@ def _claim(
         at = where[k]
         depth = -outside(triangular, s[k], t[k])
         converged = off[k] <= ACCEPTED_PX**2
-        if not converged or (depth < -ON_EDGE and not (elements.one_to_one[e] and depth > -0.25)):
-            # On an element that is one to one well beyond its edges, a root found outside is
-            # the only one; here there may be another inside.
+        if not converged or (depth < -ON_EDGE and depth <= -elements.reach[e]):
+            # A root found outside, where the map is still one to one, is the only one; here
+            # there may be another inside.
             found, s[k], t[k] = search(
                 polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
             )
