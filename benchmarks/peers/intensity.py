@@ -15,7 +15,7 @@ from meshes import Scene, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.render import render_image
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
@@ -71,13 +71,9 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
 
 def exact(scene: Scene, speckle: Speckle) -> FloatArray:
     """Our image: the inverse mapping, and the pattern itself at the mapped points [grey levels]."""
-    mesh, grid = scene.mesh, scene.grid
-    located = locate(scene.deformed, mesh.cells, mesh.element, grid)
-    mask = located.mask
-    x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)
-    image = np.zeros(grid.shape)
-    image[mask] = GREY_LEVELS * speckle(*grid.to_px(x[mask], y[mask]))
-    return image
+    mesh = scene.mesh
+    shown = render_image(mesh, scene.deformed - mesh.nodes, scene.grid, speckle, 0.0)
+    return np.asarray(GREY_LEVELS * shown.image, dtype=np.float64)
 
 
 def sampled(speckle: Speckle, factor: int) -> FloatArray:
