@@ -15,6 +15,7 @@ from meshes import Scene, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from modeharvest.imaging.isoparametric import interpolate, locate
 from modeharvest.imaging.render import render_image
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
