@@ -17,7 +17,7 @@ from rich.table import Table
 from modeharvest import __version__
 from modeharvest.case import case_text, read_case, shipped_cases
 from modeharvest.case_file import lattice_cases
-from modeharvest.console import ProgressBars
+from modeharvest.console import ProgressBars, compilation_announced
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.lattice.terminal import print_lattice
 from modeharvest.ranks import is_first
@@ -182,7 +182,7 @@ def _of_lattice(case: str, out: Path, work: Callable[[Any], Any]) -> Any:
 @contextmanager
 def _bars() -> Iterator[ProgressBars]:
     try:
-        with ProgressBars(_errors) as bars:
+        with ProgressBars(_errors) as bars, compilation_announced(_errors):
             yield bars
     except KeyboardInterrupt as error:
         raise _InterruptedError from error

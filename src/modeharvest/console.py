@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -48,3 +51,30 @@ class ProgressBars:
                 self._bars.update(task.id, completed=task.total)
             self._tasks[what] = self._bars.add_task(what, total=total)
         self._bars.update(self._tasks[what], completed=min(done, total), total=total)
+
+
+@contextmanager
+def compilation_announced(console: Console) -> Iterator[None]:
+    """Say once, in one line, when a kernel has to be compiled because none is in the cache yet."""
+    from numba.core import event  # here: --help needn't wait for it
+
+    class Notice(event.Listener):
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.told:
+                self.told = True
+                console.print(
+                    "compiling kernels for this machine: some seconds, once; they are kept on disk"
+                )
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    compiler: Any = event  # which has no types
+    notice = Notice()
+    compiler.register("numba:compile", notice)
+    try:
+        yield
+    finally:
+        compiler.unregister("numba:compile", notice)
