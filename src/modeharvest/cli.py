@@ -127,6 +127,8 @@ def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None
     rows, cols = images.grid.shape
     print(f"{len(images.strains) + 1} images of {rows} x {cols} px in {images.folder}")
     print(f"largest residual of the inverse mapping {images.max_residual_px:.1e} px")
+    for warning in images.info.get("warnings", []):
+        _errors.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
 
 
 @app.command()
