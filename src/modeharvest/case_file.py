@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
@@ -100,7 +100,7 @@ def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) 
     try:
         return model.model_validate(dict(tables))
     except ValidationError as error:
-        raise InputError(f"{name}: {_sentence(error, model())}") from error
+        raise InputError(f"{name}: {_sentence(error, model)}") from error
 
 
 def of_kind(table: Mapping[str, Any], kinds: Mapping[str, type[Any]], where: str) -> Any:
@@ -136,30 +136,34 @@ def plain(value: Any) -> Any:
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
-def _sentence(error: ValidationError, case: CaseModel | None) -> str:
+def _sentence(error: ValidationError, model: type[CaseModel] | None) -> str:
     """The first fault, in one line: where, what came, what was expected."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     if isinstance(first.get("ctx", {}).get("error"), InputError):
         return f"[{where}] {first['ctx']['error']}" if where else str(first["ctx"]["error"])
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _known_keys(case, first["loc"][:-1])
+        known = _known_keys(model, first["loc"][:-1])
         return f"unknown key {where}{nearest(str(first['loc'][-1]), known)}"
+    if first["type"] == "missing":
+        return f"expected {where}, got none"
     return f"{where}: {first['msg']}, got {first['input']!r}"
 
 
-def _known_keys(case: CaseModel | None, table: tuple[int | str, ...]) -> list[str]:
+def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[str]:
     """The keys that the table at this place of a case may have."""
-    if case is not None and not table:
-        return list(type(case).model_fields)
-    place: Any = case
+    place = model
     for part in table:
-        inner = getattr(place, str(part), None)
-        if inner is None and isinstance(place, CaseModel):  # an optional table
-            options = get_args(type(place).model_fields[str(part)].annotation)
-            inner = next((option for option in options if is_dataclass(option)), None)
-        place = inner
-    return [f.name for f in fields(place)] if is_dataclass(place) else []
+        place = _table_type(place, str(part))
+    if place is None:
+        return []
+    return [f.name for f in fields(place)] if is_dataclass(place) else list(place.model_fields)
+
+
+def _table_type(place: type[Any] | None, name: str) -> type[Any] | None:
+    """The dataclass of a table within another; None if it has none of its own."""
+    hint = None if place is None else get_type_hints(place).get(name)
+    return next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)  # type: ignore[return-value]
 
 
 def nearest(name: str, known: list[str]) -> str:

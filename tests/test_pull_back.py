@@ -1,0 +1,41 @@
+"""Deformed images brought back to the reference's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from filling_mode import MASK, case, error_px
+from manufactured import GRID
+
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.pull_back import pulled_back
+
+
+def test_the_truth_brings_the_reference_back() -> None:
+    ansatz, truth, f, g = case()
+    result = correlate(f, g, GRID, ansatz, truth, MASK)
+    back, seen = pulled_back(g, result)
+    assert seen[MASK].all()
+    # The spline's own error on this speckle, docs/idic.md.
+    assert np.abs(back - f)[MASK].max() < 1e-4
+
+
+def test_an_image_against_the_pulled_back_one_gives_the_whole_displacement() -> None:
+    ansatz, truth, f, g = case()
+    first = correlate(f, g, GRID, ansatz, truth, MASK)
+    back, seen = pulled_back(g, first)
+    again = correlate(back, g, GRID, ansatz, ansatz.start(0.05, 1.0), MASK & seen)
+    assert error_px(again, truth) < 1e-4
+
+
+def test_pixels_off_the_image_are_told() -> None:
+    ansatz, truth, f, g = case()
+    result = correlate(f, g, GRID, ansatz, truth, MASK)
+    shifted = ansatz.start()
+    shifted[ansatz.v0_slice(0)][0] = 20.5 * GRID.pixel_size
+    shifted[ansatz.v_slice(0)] = 0.0
+    back, seen = pulled_back(g, replace(result, unknowns=shifted))
+    assert seen[:, :-21].all()
+    assert not seen[:, -20:].any()
+    assert np.isfinite(back).all()

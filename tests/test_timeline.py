@@ -1,0 +1,57 @@
+"""When a pattern appears in a sequence of images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filling_mode import MASK, case
+from manufactured import GRID
+
+from modeharvest.harvest.timeline import Moment, find_buckling, mean_strain
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import correlate
+
+CRITICAL = 0.091
+
+
+def moment(strain: float) -> Moment:
+    """A pitchfork of amplitude 100 px times the square root of the strain beyond."""
+    size = 100.0 * np.sqrt(max(0.0, strain - CRITICAL))
+    return Moment(f"at {strain}", strain, 0.3 + size, 0.5, 0.01)
+
+
+def test_the_strain_is_bracketed_and_estimated() -> None:
+    found = find_buckling([moment(e) for e in (0.05, 0.08, 0.1, 0.11, 0.12)])
+    assert (found.before, found.after) == (0.08, 0.1)
+    # The constant 0.3 px that isn't of the pitchfork moves the estimate a little.
+    assert found.estimate == pytest.approx(CRITICAL, abs=2e-3)
+    assert "between strains of 8.00 % (at 0.08) and 10.00 %" in found.sentence
+
+
+def test_an_unloading_is_not_taken_for_a_loading() -> None:
+    found = find_buckling([moment(e) for e in (0.05, 0.1, 0.12, 0.06)])
+    assert (found.before, found.after) == (0.05, 0.1)
+
+
+@pytest.mark.parametrize("strains", [(), (0.02, 0.05)])
+def test_no_pattern_is_said(strains: tuple[float, ...]) -> None:
+    found = find_buckling([moment(e) for e in strains])
+    assert np.isnan(found.after)
+    assert "No image" in found.sentence
+
+
+def test_a_pattern_from_the_beginning_is_said() -> None:
+    found = find_buckling([moment(e) for e in (0.1, 0.12)])
+    assert np.isnan(found.before)
+    assert "Every image" in found.sentence
+
+
+def test_mean_strain_is_that_of_the_slow_field() -> None:
+    ansatz, _, f, g = case()
+    a = ansatz.start(0.037, 1.0)
+    result = correlate(f, g, GRID, ansatz, a, MASK)
+    along, across = mean_strain(replace(result, unknowns=a), Box.centred(2.0, 2.4))
+    assert along == pytest.approx(0.037 * 1.0, rel=1e-12)
+    assert across == pytest.approx(0.0, abs=1e-12)
