@@ -1,0 +1,199 @@
+"""Named columns out of CSV, NPZ, HDF5 and MAT files, whatever program wrote them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+from modeharvest.errors import InputError
+
+FloatArray = NDArray[np.float64]
+Table = dict[str, FloatArray]
+
+_MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    NotImplementedError,
+    MatReadError,
+    BadZipFile,
+)
+"""What numpy, h5py and scipy raise for a file that isn't what its name says."""
+_LOGICAL = {"true": 1.0, "false": 0.0}
+
+
+def read_table(path: Path | str) -> Table:
+    """Read all the numeric variables of a file, each under its name.
+
+    Parameters
+    ----------
+    path
+        ``.csv``, ``.txt``, ``.dat`` or ``.tsv`` with columns; ``.npz``; ``.h5`` or ``.hdf5``;
+        ``.mat`` of any version. Variables in groups or structures are found by their last name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, not of its kind, or holds no numbers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"expected a displacement field in {path}, found no such file")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(
+            f"{path}: expected one of {', '.join(sorted(_READERS))}, got {path.suffix!r}; "
+            "save the field as CSV"
+        )
+    try:
+        table = reader(path)
+    except InputError:
+        raise
+    except _UNREADABLE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: can't be read as {path.suffix}: {reason}") from error
+    if not table:
+        raise InputError(f"{path}: expected numeric variables, found none")
+    return table
+
+
+def _read_text(path: Path) -> Table:
+    """Read columns under a line of names; lines before it are skipped, '#' may precede it."""
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    numbered = [(k + 1, line.strip().lstrip("#%").strip()) for k, line in enumerate(lines)]
+    numbered = [(k, line) for k, line in numbered if line]
+    first = next((i for i, (_, line) in enumerate(numbered) if _looks_numeric(line)), None)
+    if first is None:
+        raise InputError(f"{path}: expected lines of numbers, found none")
+    separator, decimal = _dialect(numbered[first][1])
+    names = _split(numbered[first - 1][1], separator) if first else []
+    while names and not names[-1]:
+        names.pop()  # of a separator at the end of the line
+    rows = [(k, _split(line, separator)) for k, line in numbered[first:]]
+    width = len(rows[0][1])
+    if len(names) != width - (not rows[0][1][-1]) and len(names) != width:
+        names = [str(k + 1) for k in range(width)]  # to be called by their number
+    for k, row in rows:
+        if len(row) - len(names) not in (0, 1) or any(row[len(names) :]):
+            raise InputError(f"{path}, line {k}: expected {len(names)} values, got {len(row)}")
+    values = np.array(
+        [[_number(v, decimal, path, k) for v in row[: len(names)]] for k, row in rows]
+    )
+    return {name: values[:, k] for k, name in enumerate(names)}
+
+
+def _looks_numeric(line: str) -> bool:
+    """Whether at least two fields are there, and all are numbers or missing."""
+    separator, decimal = _dialect(line)
+    fields = _split(line, separator)
+    numbers = sum(_is_number(f, decimal) for f in fields)
+    others = _MISSING | set(_LOGICAL)
+    return numbers >= 2 and all(_is_number(f, decimal) or f.lower() in others for f in fields)
+
+
+def _dialect(line: str) -> tuple[str | None, str]:
+    """Separator (None: blanks) and decimal sign of a line of numbers."""
+    if ";" in line:
+        return ";", "," if "," in line else "."
+    if "\t" in line:
+        return "\t", "," if "," in line and "." not in line else "."
+    return ("," if "," in line else None), "."
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    # Blanks separate, except before a unit: x [mm].
+    fields = re.split(r"\s+(?!\[)", line) if separator is None else line.split(separator)
+    return [f.strip().strip("\"'").strip() for f in fields]
+
+
+def _is_number(text: str, decimal: str) -> bool:
+    try:
+        float(text.replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _number(text: str, decimal: str, path: Path, line: int) -> float:
+    if text.lower() in _MISSING:
+        return float("nan")
+    if text.lower() in _LOGICAL:
+        return _LOGICAL[text.lower()]
+    if not _is_number(text, decimal):
+        raise InputError(f"{path}, line {line}: expected a number, got {text!r}")
+    return float(text.replace(decimal, "."))
+
+
+def _read_npz(path: Path) -> Table:
+    with np.load(path, allow_pickle=False) as file:
+        return _numeric({name: file[name] for name in file.files})
+
+
+def _read_hdf5(path: Path) -> Table:
+    found: dict[str, Any] = {}
+    with h5py.File(path, "r") as file:
+        file.visititems(
+            lambda n, o: found.update({n: o[()]}) if isinstance(o, h5py.Dataset) else None
+        )
+    return _numeric(_by_last_name(found))
+
+
+def _read_mat(path: Path) -> Table:
+    if h5py.is_hdf5(path):  # version 7.3, in which MATLAB's columns are HDF5's rows
+        return {name: array.T for name, array in _read_hdf5(path).items()}
+    content = loadmat(path, simplify_cells=True)
+    return _numeric(_by_last_name(_flattened(content)))
+
+
+def _flattened(content: dict[str, Any], above: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in content.items():
+        if name.startswith("__"):
+            continue
+        if isinstance(value, dict):
+            flat.update(_flattened(value, f"{above}{name}/"))
+        else:
+            flat[above + name] = value
+    return flat
+
+
+def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:
+    """Short names where they are unique; whole paths where they are not."""
+    last = [path.rsplit("/", 1)[-1] for path in found]
+    return {
+        name if last.count(name) == 1 else path: value
+        for (path, value), name in zip(found.items(), last, strict=True)
+    }
+
+
+def _numeric(found: dict[str, Any]) -> Table:
+    """The arrays of numbers among them, as floats."""
+    table = {}
+    for name, value in found.items():
+        array = np.asarray(value)
+        if array.dtype.kind in "fiub":
+            table[name] = array.astype(np.float64)
+    return table
+
+
+_READERS: dict[str, Callable[[Path], Table]] = {
+    ".csv": _read_text,
+    ".txt": _read_text,
+    ".dat": _read_text,
+    ".tsv": _read_text,
+    ".npz": _read_npz,
+    ".h5": _read_hdf5,
+    ".hdf5": _read_hdf5,
+    ".mat": _read_mat,
+}
