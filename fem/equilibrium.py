@@ -40,11 +40,15 @@ class Loading:
     edges
         "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
         for one node at mid-height, which keeps the specimen in place.
+    tilt
+        Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
+        strain [rad]: -e tilt y is added to its u_x.
     """
 
     half_width: float
     length: float
     edges: str = "clamped"
+    tilt: float = 0.0
 
     def __post_init__(self) -> None:
         if self.edges not in EDGES:
@@ -135,6 +139,10 @@ class Structure:
         x = self.V.tabulate_dof_coordinates()
         target = self._direction.x.array.reshape(-1, 2)
         target[dofs_x // 2, 0] = -0.5 * loading.length * np.sign(x[dofs_x // 2, 0])
+        self._stroke = self._direction.x.array.copy()
+        if loading.tilt != 0.0:
+            turning = dofs_x[x[dofs_x // 2, 0] > 0.0] // 2
+            target[turning, 0] -= loading.tilt * x[turning, 1]
         self._direction.x.scatter_forward()
         self._held = np.union1d(dofs_x, dofs_y)
         # Only the matrices use these, and there the value is of no account.
@@ -227,11 +235,11 @@ class Structure:
     def reaction(self, u: PETSc.Vec, length: float) -> float:
         """Compressive force on a loaded edge per unit thickness [N/mm].
 
-        By virtual work: d(energy)/d(strain) = force * length at equilibrium.
+        By virtual work: d(energy)/d(strain) = force * length (+ moment * tilt) at equilibrium.
         """
         forces = self._assemble(self._forms.forces, u)
         held = self._held_owned
-        work = float(forces.array[held] @ self._direction.x.array[held])
+        work = float(forces.array[held] @ self._stroke[held])
         return float(self.comm.allreduce(work)) / length
 
     def smallest_jacobian(self, u: PETSc.Vec) -> float:

@@ -15,6 +15,7 @@ from modeharvest.fem.specimen import Specimen
 
 EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")
+_LARGEST_TILT = 1.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,10 @@ class Experiment:
         path is followed.
     path
         How the path is walked.
+    tilt
+        By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
+        about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is
+        not quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
     """
 
     specimen: Specimen = field(default_factory=Specimen)
@@ -82,6 +87,7 @@ class Experiment:
     branches: tuple[str, ...] = ("buckled+",)
     imperfection: Imperfection = field(default_factory=Imperfection)
     path: PathOptions = field(default_factory=PathOptions)
+    tilt: float = 0.0
 
     def __post_init__(self) -> None:
         strains = self.strains
@@ -100,3 +106,13 @@ class Experiment:
             raise InputError(f"edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}")
         if not self.branches or not set(self.branches) <= set(BRANCHES):
             raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
+        if not abs(self.tilt) <= _LARGEST_TILT:
+            raise InputError(
+                f"tilt: expected at most {_LARGEST_TILT} rad per nominal strain (0.0137 is 0.1 "
+                f"degrees at 12.7 %), got {self.tilt}"
+            )
+
+    @property
+    def is_perfect(self) -> bool:
+        """Whether specimen and loading keep their symmetries, so that there is a bifurcation."""
+        return self.imperfection.is_none and self.tilt == 0.0

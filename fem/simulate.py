@@ -39,7 +39,7 @@ def simulate(
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
-    loading = Loading(spec.half_size[0], spec.length, experiment.edges)
+    loading = Loading(spec.half_size[0], spec.length, experiment.edges, experiment.tilt)
     structure = Structure(mesh, experiment.material, loading, comm)
     return _Run(experiment, mesh, Walker(structure, experiment.path, progress)).solution()
 
@@ -65,13 +65,13 @@ class _Run:
         """The primary path through all strains, and where it becomes unstable.
 
         Without a bifurcation there is one natural path, which bends where the pattern sets in:
-        in an imperfect specimen, and in one with an odd number of holes both ways, whose
+        in an imperfect specimen or under tilted loading, and in one with an odd number of holes both ways, whose
         pattern has the specimen's own symmetries. Long steps slip off it, so it is walked
         again from the last stable state, and no unstable one is accepted.
         """
         strains = self.experiment.strains
         path = [self.walker.start()]
-        if self.experiment.imperfection.is_none:
+        if self.experiment.is_perfect:
             self.walker.primary(path, strains, until_unstable=True)
             if path[-1].negative_pivots == 0:
                 return path, None
@@ -168,7 +168,7 @@ class _Run:
         return {
             "specimen": asdict(e.specimen),
             "material": {"kind": type(e.material).__name__, **vars(e.material)},
-            "loading": {"edges": e.edges, "length_mm": e.specimen.length},
+            "loading": {"edges": e.edges, "length_mm": e.specimen.length, "tilt_rad": e.tilt},
             "mesh_size_mm": e.mesh_size,
             "imperfection": asdict(e.imperfection),
             "critical": None if critical is None else self._critical_info(critical),

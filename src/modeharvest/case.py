@@ -61,6 +61,8 @@ class Case(CaseModel):
         """The case as plain JSON values, materials by their kind."""
         content = {name: plain(getattr(self, name)) for name in type(self).model_fields}
         content["experiment"]["material"] = kind_of(self.experiment.material, MATERIALS)
+        if self.experiment.tilt == 0.0:  # as before there was any: finished stages stay finished
+            del content["experiment"]["tilt"]
         return content
 
 

@@ -1,0 +1,105 @@
+"""Tilted loading: what it prescribes, the moment that goes with it, and where it leads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fem_bodies import plate
+
+from modeharvest.case import Case
+from modeharvest.errors import InputError
+from modeharvest.fem.continuation import Walker
+from modeharvest.fem.equilibrium import Loading, Structure
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.materials import Ogden
+from modeharvest.fem.simulate import simulate
+from modeharvest.fem.specimen import Specimen
+
+WIDTH, HEIGHT = 3.0, 2.0
+SMALL = Specimen(4, 2)
+
+
+def test_edge_turns_counter_clockwise_about_its_middle_in_proportion_to_the_strain() -> None:
+    tilt, strains = 0.05, (0.04, 0.08)
+    solution = simulate(Experiment(SMALL, strains=strains, mesh_size=0.5, tilt=tilt))
+    half_width = SMALL.half_size[0]
+    x, y = solution.mesh.nodes.T
+    for strain in strains:
+        u = solution.at(strain).displacement
+        stroke = 0.5 * strain * SMALL.length
+        for edge, expected in (
+            (x > half_width - 1e-9, -stroke - strain * tilt * y),
+            (x < 1e-9 - half_width, stroke + 0.0 * y),
+        ):
+            np.testing.assert_allclose(u[edge, 0], expected[edge], atol=1e-14)
+            np.testing.assert_array_equal(u[edge, 1], 0.0)
+    assert solution.info["loading"]["tilt_rad"] == tilt
+
+
+def test_small_tilt_of_a_plate_is_pure_bending() -> None:
+    """Sliding edges, small strain: Bernoulli's stress is exact, and T6 contains its displacement.
+
+    Stored energy beyond that of the plain compression: half the moment times the rotation, with
+    the moment E/(1 - nu^2) I theta / W of plane strain.
+    """
+    material = Ogden()
+    shear, lame = 0.5 * sum(material.moduli), material.kappa
+    modulus = 4.0 * shear * (lame + shear) / (lame + 2.0 * shear)  # E / (1 - nu^2)
+    strain, tilt = 1e-5, 2.0
+    mesh = plate(WIDTH, HEIGHT, 5, 4)
+
+    def energy_and_force(angle: float) -> tuple[float, float]:
+        structure = Structure(mesh, material, Loading(0.5 * WIDTH, WIDTH, "sliding", angle))
+        walker = Walker(structure)
+        path = [walker.start()]
+        assert walker.primary(path, [strain])
+        return structure.energy(path[-1].u), structure.reaction(path[-1].u, WIDTH)
+
+    (bent, bent_force), (plain, plain_force) = energy_and_force(tilt), energy_and_force(0.0)
+    inertia, rotation = HEIGHT**3 / 12.0, strain * tilt
+    moment = modulus * inertia * rotation / WIDTH
+    # Relative differences of the order of the strain are the material's, not the linear theory's.
+    assert bent - plain == pytest.approx(0.5 * moment * rotation, rel=1e-3)
+    assert bent_force == pytest.approx(plain_force, rel=1e-3)
+    assert plain_force == pytest.approx(modulus * strain * HEIGHT, rel=1e-3)
+
+
+def test_force_and_moment_do_the_work() -> None:
+    """d(energy)/d(strain) = force length + moment tilt; with opposite tilts the moments cancel."""
+    at, step = 0.06, 1e-4
+    moment = {}
+    for tilt in (0.3, -0.3):
+        strains = (at - step, at, at + step)
+        solution = simulate(Experiment(SMALL, strains=strains, mesh_size=0.5, tilt=tilt))
+        low, here, high = solution.snapshots
+        rate = (high.energy - low.energy) / (2.0 * step)
+        moment[tilt] = (rate - here.reaction * SMALL.length) / tilt
+    assert moment[0.3] > 0.0  # the edge resists being turned
+    # Upside down, a tilt is the opposite one: both energies and forces are the same.
+    assert moment[0.3] == pytest.approx(-moment[-0.3], rel=1e-5)
+
+
+def test_no_tilt_is_what_was_before_and_keeps_its_key() -> None:
+    plain = Structure(plate(WIDTH, HEIGHT, 3, 2), Ogden(), Loading(0.5 * WIDTH, WIDTH))
+    zero = Structure(plate(WIDTH, HEIGHT, 3, 2), Ogden(), Loading(0.5 * WIDTH, WIDTH, tilt=0.0))
+    for structure in (plain, zero):
+        assert structure._stroke.tobytes() == structure._direction.x.array.tobytes()
+    assert "tilt" not in Case().plain()["experiment"]
+    assert Case(experiment=Experiment(tilt=0.01)).plain()["experiment"]["tilt"] == 0.01
+
+
+def test_tilt_follows_the_one_natural_path() -> None:
+    """It breaks both mirror symmetries, so there is no bifurcation to find."""
+    tilted = Experiment(SMALL, strains=(0.1, 0.17), mesh_size=0.5, tilt=0.002)
+    assert not tilted.is_perfect
+    solution = simulate(tilted)
+    perfect = simulate(Experiment(SMALL, strains=(0.17,), mesh_size=0.5)).at(0.17)
+    assert solution.info["critical"] is None
+    assert not any(solution.info["path"]["primary"]["negative_pivots"])
+    assert solution.at(0.17).energy == pytest.approx(perfect.energy, rel=1e-2)
+
+
+@pytest.mark.parametrize("tilt", [2.0, -1.5, float("nan")])
+def test_absurd_tilt_is_refused(tilt: float) -> None:
+    with pytest.raises(InputError, match="tilt: expected at most"):
+        Experiment(tilt=tilt)
