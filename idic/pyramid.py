@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from modeharvest.errors import InputError
+from modeharvest.idic.blur import binned, blurred
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -111,20 +111,23 @@ def prepare(
         Give both images a local mean of 0 and a local contrast of 1, so that differences of
         brightness that vary slowly are gone; for blurred levels only.
     """
+    reference, deformed = (np.asarray(image, np.float32) for image in (reference, deformed))
     f_weight = mask if deformed_mask is not None else None
-    f = _smooth(reference, f_weight, level)
+    is_finest = level.factor == 1 and level.blur == 0
+    # The reference is never sampled between its pixels: no need to continue it into holes.
+    f = reference if is_finest else _smooth(reference, f_weight, level)
     g = _smooth(deformed, deformed_mask, level)
     if levelled and level.blur > 0:
         f, g = _levelled(f, level.blur), _levelled(g, level.blur)
     inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
-    if level.factor > 1 or level.blur > 0:
-        inside = _bin(inside, level.factor) >= 0.5
-        allowed = None
-    else:
+    if is_finest:
         inside = eroded(inside, edge_px)
         # The reference's eroded edge lands near edge_px from the edge of g, give or take the
         # local strain; one pixel less leaves those pixels in.
         allowed = None if deformed_mask is None else eroded(deformed_mask, max(0, edge_px - 1))
+    else:
+        inside = binned(reference, inside, level.factor)[1] >= 0.5
+        allowed = None
     return Pair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, allowed)
 
 
@@ -132,41 +135,39 @@ def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
     """Take away the pixels within ``distance_px`` of the mask's edge; the image border is none."""
     if distance_px < 1 or mask.all():
         return mask
-    padded = np.pad(mask, distance_px + 1, mode="edge")
-    inner = ndimage.distance_transform_cdt(padded, "chessboard") > distance_px
-    keep = distance_px + 1
-    return np.asarray(inner[keep:-keep, keep:-keep])
+    for _ in range(2):  # along the rows, then along what were the columns
+        kept = mask.copy(order="K")
+        for shift in range(1, distance_px + 1):
+            kept[shift:] &= mask[:-shift]
+            kept[:-shift] &= mask[shift:]
+        mask = kept.T
+    return np.ascontiguousarray(mask)
 
 
 def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
     """Binned and blurred; where there is no material, a smooth continuation of the material."""
-    image = np.asarray(image, dtype=np.float32)
     if weight is None or weight.all():
-        return _blur(_bin(image, level.factor), level.blur)
-    share = _bin(weight, level.factor)
-    mean = _bin(np.where(weight, image, np.float32(0.0)), level.factor)
-    if level.blur > 0:
-        return _continued(mean, share, level.blur)
-    filled = _continued(mean, share, _CONTINUED)
-    if level.factor == 1:
-        filled[weight] = image[weight]
+        return blurred(binned(image, None, level.factor)[0], level.blur)
+    mean, share = binned(image, weight, level.factor)
+    filled = _continued(mean, share, level.blur or _CONTINUED)
+    if level.factor == 1 and level.blur == 0:
+        np.copyto(filled, image, where=weight)
     return filled
 
 
 def _continued(mean: Image, share: Image, blur: float) -> Image:
-    """Blur both in place, and divide; far from any material, its mean grey level.
+    """Blur both, and divide; far from any material, its mean grey level.
 
     Parameters
     ----------
     mean, share
-        (rows, cols) grey level times share of material, and that share; their memory is reused.
+        (rows, cols) grey level times share of material, and that share.
     blur
         Standard deviation [binned px].
     """
-    for image in (mean, share):
-        ndimage.gaussian_filter(image, blur, mode="nearest", output=image)
     overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
     far = np.float32(1e-4)
+    mean, share = blurred(mean, blur), blurred(share, blur)
     mean += far * np.float32(overall)
     share += far
     mean /= share
@@ -176,21 +177,6 @@ def _continued(mean: Image, share: Image, blur: float) -> Image:
 def _levelled(image: Image, blur: float) -> Image:
     """The image less its local mean, over its local standard deviation."""
     around = _AROUND * blur
-    image = image - _blur(image, around)
-    contrast = np.sqrt(_blur(image**2, around))
+    image = image - blurred(image, around)
+    contrast = np.sqrt(blurred(image**2, around))
     return np.asarray(image / (contrast + 1e-3 * contrast.max()))
-
-
-def _bin(image: Image, factor: int) -> Image:
-    """Mean over blocks; incomplete blocks at the right and at the bottom are dropped."""
-    rows, cols = image.shape[0] // factor, image.shape[1] // factor
-    image = image[: rows * factor, : cols * factor].astype(np.float32, copy=False)
-    if factor == 1:
-        return image
-    along = np.add.reduceat(image, np.arange(0, rows * factor, factor), axis=0)
-    total = np.add.reduceat(along, np.arange(0, cols * factor, factor), axis=1)
-    return np.asarray(total / np.float32(factor * factor))
-
-
-def _blur(image: Image, sigma: float) -> Image:
-    return np.asarray(ndimage.gaussian_filter(image, sigma, mode="nearest")) if sigma else image

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from modeharvest.errors import InputError
 from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.prefilter import spline_coefficients
 
 FloatArray = NDArray[np.float64]
 
@@ -69,13 +69,12 @@ class SplineImage:
             If the image isn't two-dimensional or smaller than 2 x 2 px, or the order is
             neither 3 nor 5.
         """
-        pixels = np.asarray(image)
+        pixels = np.ascontiguousarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
             raise InputError(f"expected an image of at least 2 x 2 px, got shape {pixels.shape}")
         if order not in (3, 5):
             raise InputError(f"expected a spline of order 3 or 5, got {order}")
-        filtered = ndimage.spline_filter(pixels, order=order, output=dtype, mode="mirror")
-        return cls(np.pad(filtered, PAD, mode="reflect"), order)
+        return cls(spline_coefficients(pixels, order, PAD), order)
 
     @property
     def shape(self) -> tuple[int, int]:
