@@ -65,9 +65,9 @@ class _Run:
         """The primary path through all strains, and where it becomes unstable.
 
         Without a bifurcation there is one natural path, which bends where the pattern sets in:
-        in an imperfect specimen or under tilted loading, and in one with an odd number of holes both ways, whose
-        pattern has the specimen's own symmetries. Long steps slip off it, so it is walked
-        again from the last stable state, and no unstable one is accepted.
+        in an imperfect specimen, under tilted loading, and in a specimen with an odd number of
+        holes both ways, whose pattern has its own symmetries. Long steps slip off it, so it is
+        walked again from the last stable state, and no unstable one is accepted.
         """
         strains = self.experiment.strains
         path = [self.walker.start()]
