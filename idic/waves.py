@@ -122,6 +122,11 @@ def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[Wave]:
     return [_wave(*pair, spectrum.pitch) for pair in zip(xi, z, strict=True)]
 
 
+def explained(spectrum: Spectrum, waves: Sequence[Wave]) -> float:
+    """Share of the field's square, under the Hann taper, that these waves describe together [-]."""
+    return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
+
+
 def _wave(xi: FloatArray, z: NDArray[np.complex128], pitch: float) -> Wave:
     """Split off the common phase of both components, and note what it leaves."""
     angle = 0.5 * float(np.angle(np.sum(z**2)))
