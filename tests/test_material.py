@@ -1,0 +1,103 @@
+"""The material found in an image against the mask it was made with, on any background."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from modeharvest.errors import InputError
+from modeharvest.idic.material import MaterialOptions, find_material
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+BoolArray = NDArray[np.bool_]
+
+SHAPE, PITCH, RADIUS = (420, 460), 100.0, 38.0
+
+
+def specimen() -> BoolArray:
+    """A rectangle with 3 x 3 round holes, off the pixels' raster."""
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    mask = (abs(row - 209.3) < 185.0) & (abs(col - 230.7) < 200.0)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            mask &= np.hypot(row - 209.3 - i * PITCH, col - 230.7 - j * PITCH) > RADIUS
+    return mask
+
+
+def image(background: float, noise: float, mask: BoolArray, seed: int = 0) -> NDArray[np.float64]:
+    speckle = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0, seed=seed), SHAPE).image()
+    random = np.random.default_rng(seed + 1)
+    return np.where(mask, speckle, background) + noise * random.normal(size=SHAPE)
+
+
+def edge_distance(found: BoolArray, truth: BoolArray) -> NDArray[np.float64]:
+    """Distances of wrong pixels from the true edge [px]; 0.5 next to it."""
+    inside, outside = distance_transform_edt(truth), distance_transform_edt(~truth)
+    return np.where(truth, inside, outside)[found != truth] - 0.5
+
+
+# Share of wrong pixels: the edges are 3 900 px long, that is 2 % of the image for each px.
+@pytest.mark.parametrize(
+    ("background", "wrong", "far"),
+    [
+        (0.0, 0.002, 1.5),  # darker than every speckle: to the pixel
+        (0.2, 0.006, 8.0),  # as dark as the dark speckles: lost where one of them is at an edge
+        (0.5, 0.006, 8.0),
+        (1.0, 0.006, 8.0),
+    ],
+)
+def test_material_is_found_on_any_background(background: float, wrong: float, far: float) -> None:
+    truth = specimen()
+    found = find_material(image(background, 0.02, truth)).mask
+    assert (found != truth).mean() < wrong
+    assert edge_distance(found, truth).max(initial=0.0) < far
+
+
+@pytest.mark.parametrize("scale", [1e-3, 255.0, 65535.0])
+def test_units_of_the_grey_levels_do_not_matter(scale: float) -> None:
+    grey = image(0.3, 0.01, specimen())
+    one, other = find_material(grey).mask, find_material(scale * grey).mask
+    assert (one != other).mean() < 1e-4  # float32 rounds differently
+
+
+def test_turning_the_image_turns_the_mask() -> None:
+    grey = image(0.1, 0.01, specimen())
+    one, other = find_material(grey).mask, find_material(grey[::-1, ::-1].T).mask
+    assert (one != other.T[::-1, ::-1]).mean() < 1e-3  # an even window has no middle
+
+
+def test_uneven_lighting_does_not_matter() -> None:
+    truth = specimen()
+    light = np.linspace(0.6, 1.0, SHAPE[1]) * np.linspace(1.0, 0.8, SHAPE[0])[:, None]
+    found = find_material(light * image(0.3, 0.01, truth)).mask
+    assert (found != truth).mean() < 0.008
+
+
+def test_noise_free_images_will_do() -> None:
+    truth = specimen()
+    for background in (0.0, 0.2, 1.0):
+        assert (find_material(image(background, 0.0, truth)).mask != truth).mean() < 0.008
+
+
+def test_without_a_background_all_is_material_and_that_is_said() -> None:
+    material = find_material(image(0.0, 0.01, np.ones(SHAPE, dtype=bool)))
+    assert material.mask.all()
+    assert "whole image" in material.sentences[0]
+
+
+def test_background_like_the_speckle_is_told() -> None:
+    said = find_material(image(0.5, 0.03, specimen())).sentences
+    assert any("grey levels of the background" in sentence for sentence in said)
+
+
+def test_bad_images_are_refused() -> None:
+    with pytest.raises(InputError, match="constant grey level"):
+        find_material(np.full((100, 100), 3.0))
+    with pytest.raises(InputError, match="at least 50 px"):
+        find_material(np.zeros((30, 100)))
+    with pytest.raises(InputError, match="NaN"):
+        find_material(np.full((100, 100), np.nan))
+    with pytest.raises(InputError, match="reach"):
+        MaterialOptions(window_px=11, reach_px=10.0)
