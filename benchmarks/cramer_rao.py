@@ -1,0 +1,381 @@
+"""Whether a correlation's errors are at the Cramer-Rao bound, by Monte Carlo.
+
+The truth is inside the ansatz (77 unknowns, a pattern everywhere, 320 x 360 px), the images are
+exact. Noise is added; each realisation has a speckle of its own and comes twice, as n and as -n:
+what the mean of the two errors leaves is of second order in the noise, so a bias shows long
+before it would out of the scatter.
+
+The bound doesn't use the correlation's own matrix. With J the derivatives of f(x) - g(x + u),
+made here from the exact gradient of the pattern, it is
+
+    (J' W J)^-1,   1/W = s_f^2 + s_g^2 / det F,
+
+because where the material has shrunk fewer pixels of g look at it. Noise s_f in f, s_g in g.
+
+Run: scripts/env python benchmarks/cramer_rao.py [--pairs 100] [--standard-start] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.fourier import FourierMode, square_family
+from modeharvest.idic.pyramid import Level, eroded
+from modeharvest.idic.result import Result
+from modeharvest.idic.support import Taper
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+
+PIXEL = 0.01
+GRID = PixelGrid.centred(360, 320, PIXEL)
+BORDER_PX = 40
+STRAIN = 0.05
+ROUNDING = 1 / (255 * np.sqrt(12))
+EVERY = 8
+"""Fields are compared at every eighth pixel: they are as smooth as the ansatz."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What is wrong with the images.
+
+    Parameters
+    ----------
+    name
+        For the table.
+    in_f, in_g
+        Standard deviations [fraction of full scale].
+    rounded
+        No noise but that of rounding to 8 bits.
+    blur_px
+        Gaussian blur of both images before they are correlated [px].
+    """
+
+    name: str
+    in_f: float
+    in_g: float
+    rounded: bool = False
+    blur_px: float = 0.0
+
+    def draw(self, f: FloatArray, g: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Make a realisation for both images."""
+        if self.rounded:
+            return np.rint(255 * f) / 255 - f, np.rint(255 * g) / 255 - g
+        normal = np.random.default_rng([seed, 1]).normal(size=(2, *f.shape))
+        return self.in_f * normal[0], self.in_g * normal[1]
+
+    @property
+    def as_told(self) -> tuple[float, int]:
+        """``noise_sd`` and ``noisy_images`` of :meth:`Result.covariance`."""
+        return max(self.in_f, self.in_g), int(self.in_f > 0) + int(self.in_g > 0)
+
+    def seen(self, image: FloatArray) -> FloatArray:
+        """What is correlated of a noisy image."""
+        return ndimage.gaussian_filter(image, self.blur_px) if self.blur_px else image
+
+
+NOISES = (
+    Noise("0.2 % in both", 0.002, 0.002),
+    Noise("0.5 % in both", 0.005, 0.005),
+    Noise("1 % in both", 0.01, 0.01),
+    Noise("2 % in both", 0.02, 0.02),
+    Noise("2 % in both, blurred by 1 px", 0.02, 0.02, blur_px=1.0),
+    Noise("1 % in g only", 0.0, 0.01),
+    Noise("1 % in f only", 0.01, 0.0),
+    Noise("8-bit rounding", ROUNDING, ROUNDING, rounded=True),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A displacement that the ansatz can describe, and what the bound needs of it.
+
+    Parameters
+    ----------
+    ansatz, a
+        Kinematics and true unknowns.
+    """
+
+    ansatz: Ansatz
+    a: FloatArray
+
+    @classmethod
+    def default(cls) -> Truth:
+        """Strain, pattern and everything else disturbed; up to 11 px of displacement."""
+        everywhere = Taper(Box.centred(3.4, 3.8), 0.5)
+        mode = FourierMode.scaled(square_family("junction"), 1.0, everywhere)
+        ansatz = Ansatz(Box.centred(2.6, 3.0), (mode,))
+        rng = np.random.default_rng(0)
+        a = ansatz.start(STRAIN, 1.5)
+        for c in (0, 1):
+            a[ansatz.v0_slice(c)] += 0.003 * rng.normal(size=ansatz.v0_space.size)
+        a[ansatz.v_slice(0)][1:] += 0.05 * rng.normal(size=ansatz.v_space.size - 1)
+        a[ansatz.phi_slice(0)] += 0.02 * rng.normal(size=mode.family.size)
+        return cls(ansatz, a)
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pixels that no noise and no displacement moves off the image."""
+        mask = np.zeros(GRID.shape, dtype=np.bool_)
+        mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+        return mask
+
+    @cached_property
+    def used(self) -> tuple[NDArray[np.intp], ...]:
+        """Rows and columns of the pixels that a correlation uses."""
+        return np.nonzero(eroded(self.mask, CorrelationOptions().edge_px))
+
+    @cached_property
+    def sensitivities(self) -> FloatArray:
+        """(pixels, 2, n) of the displacement, x and y."""
+        row, col = self.used
+        points = GRID.x[col, None], GRID.y[row, None]  # two-dimensional: points, not axes
+        return self.ansatz.sensitivities(self.a, *points)[:, 0]
+
+    @cached_property
+    def deformation_gradient(self) -> FloatArray:
+        """(pixels, 2, 2) F, by central differences: h^2 of the pattern's third derivative."""
+        row, col = self.used
+        at, h = np.stack([GRID.x[col], GRID.y[row]], axis=-1), 1e-5
+        F = np.tile(np.eye(2), (len(at), 1, 1))
+        for k, step in enumerate(h * np.eye(2)):
+            ahead, behind = (self.ansatz.displacement_at(self.a, at + s) for s in (step, -step))
+            F[:, :, k] += (ahead - behind) / (2 * h)
+        return F
+
+    @cached_property
+    def came_from(self) -> FloatArray:
+        """(rows, cols, 2) X with X + u(X) = x at the pixels x, by fixed-point iteration [mm]."""
+        at = np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+        low, high = at[-1, 0], at[0, -1]
+        point = at
+        for _ in range(300):
+            # Polynomials run away outside the image; what comes from there isn't correlated.
+            moved = at - self.ansatz.displacement_at(self.a, np.clip(point, low, high))
+            change = abs(moved - point).max()
+            point = moved
+            if change < 1e-12:
+                return point
+        raise AssertionError(f"the inverse of the displacement has not converged: {change} mm")
+
+    def images(self, speckle: Speckle) -> tuple[FloatArray, FloatArray]:
+        """Exact f and g [fraction of full scale]."""
+        row, col = GRID.to_px(self.came_from[..., 0], self.came_from[..., 1])
+        return speckle.image(), speckle.exact(row, col)
+
+    def bound(self, speckle: Speckle, noise: Noise) -> FloatArray:
+        """(n, n) covariance that no unbiased estimator can undercut."""
+        d_row, d_col = speckle.gradient(*self.used)
+        slope = np.stack([d_col, -d_row], axis=-1) / PIXEL  # of f along x and y [1/mm]
+        in_g = np.linalg.solve(np.swapaxes(self.deformation_gradient, 1, 2), slope[..., None])
+        J = np.einsum("pc,pcn->pn", in_g[..., 0], self.sensitivities)
+        det = np.linalg.det(self.deformation_gradient)
+        information = J.T @ (J / (noise.in_f**2 + noise.in_g**2 / det)[:, None])
+        return np.asarray(np.linalg.inv(information))
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A part of the displacement at some pixels.
+
+    Parameters
+    ----------
+    name
+        For the table.
+    of
+        From unknowns to (points, components) [mm].
+    S
+        (points, components, n) its derivatives.
+    """
+
+    name: str
+    of: Callable[[FloatArray], FloatArray]
+    S: FloatArray
+
+    def variance(self, covariance: FloatArray) -> float:
+        """Mean over the points of the variance, all components together [mm^2]."""
+        return float(np.einsum("pcn,nm,pcm->", self.S, covariance, self.S, optimize=True)
+                     / len(self.S))  # fmt: skip
+
+
+def fields(truth: Truth) -> list[Field]:
+    """u, v0, v1 and v1 phi1."""
+    ansatz = truth.ansatz
+    row, col = (at[(truth.used[0] % EVERY == 0) & (truth.used[1] % EVERY == 0)]
+                for at in truth.used)  # fmt: skip
+    x, y = GRID.x[col, None], GRID.y[row, None]  # two-dimensional: points, not axes
+    S = ansatz.sensitivities(truth.a, x, y)[:, 0]
+    slow = np.zeros(ansatz.size, dtype=np.bool_)
+    for c in (0, 1):
+        slow[ansatz.v0_slice(c)] = True
+    v = np.zeros((len(row), 1, ansatz.size))
+    v[:, 0, ansatz.v_slice(0)] = ansatz.v_space.basis(x, y)[:, 0]
+    return [
+        Field("u", lambda a: ansatz.displacement(a, x, y)[:, 0], S),
+        Field("v0", lambda a: ansatz.v0(a, x, y)[:, 0], np.where(slow, S, 0.0)),
+        Field("v1", lambda a: ansatz.v(0, a, x, y), v),
+        Field("v1 phi1", lambda a: ansatz.fluctuation(0, a, x, y)[:, 0], np.where(slow, 0.0, S)),
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two correlations with opposite noise.
+
+    Parameters
+    ----------
+    bound
+        (n, n) covariance.
+    found
+        The two results.
+    """
+
+    bound: FloatArray
+    found: tuple[Result, Result]
+
+
+def measure(truth: Truth, noise: Noise, pairs: int, standard_start: bool) -> Iterator[Pair]:
+    """Correlate images with n and with -n, a new speckle for each pair."""
+    ansatz = truth.ansatz
+    options = CorrelationOptions() if standard_start else CorrelationOptions((Level(1, 0.0),))
+    start = ansatz.start(STRAIN, 1.0) if standard_start else truth.a
+    for seed in range(pairs):
+        speckle = Speckle(SpeckleSpec(seed=seed), GRID.shape)
+        f, g = truth.images(speckle)
+        n_f, n_g = noise.draw(f, g, seed)
+        signed = [(noise.seen(f + s * n_f), noise.seen(g + s * n_g)) for s in (1, -1)]
+        plus, minus = (
+            correlate(*images, GRID, ansatz, start, truth.mask, options=options)
+            for images in signed
+        )
+        yield Pair(truth.bound(speckle, noise), (plus, minus))
+
+
+def judge_field(field: Field, truth: Truth, pairs: list[Pair]) -> dict[str, float]:
+    """Ratio of the rms error to the bound, and bias over the bound, with standard errors."""
+    true, count = field.of(truth.a), len(pairs)
+    errors = np.array([[field.of(r.unknowns) - true for r in p.found] for p in pairs])
+    squares = (errors**2).sum(axis=-1).mean(axis=(1, 2))
+    bound = np.sqrt(np.mean([field.variance(p.bound) for p in pairs]))
+    ratio = np.sqrt(squares.mean()) / bound
+    even, odd = errors.mean(axis=1), 0.5 * (errors[:, 0] - errors[:, 1])
+
+    def mean_square_and_scatter(part: FloatArray) -> tuple[float, float]:
+        mean, variance = part.mean(axis=0), part.var(axis=0, ddof=1)
+        return (float((mean**2).sum(axis=-1).mean()),
+                float(variance.sum(axis=-1).mean()) / count)  # fmt: skip
+
+    bias, scatter = mean_square_and_scatter(even)
+    drift, drift_scatter = mean_square_and_scatter(odd)
+    return {
+        "bound_px": bound / PIXEL,
+        "ratio": ratio,
+        "ratio_se": 0.5 * ratio * squares.std(ddof=1) / squares.mean() / np.sqrt(count),
+        "bias": np.sqrt(max(0.0, bias - scatter)) / bound,
+        "bias_se": np.sqrt(scatter) / bound,
+        "odd_mean": np.sqrt(drift) / bound,
+        "odd_mean_expected": np.sqrt(drift_scatter) / bound,
+    }
+
+
+def judge_unknowns(truth: Truth, noise: Noise, pairs: list[Pair]) -> dict[str, float]:
+    """Standardised errors by the bound, and intervals by what each result says of itself."""
+    n, sd = truth.ansatz.size, noise.as_told
+    errors = np.array([[r.unknowns - truth.a for r in p.found] for p in pairs])
+    distance = np.array([
+        np.mean(np.einsum("sn,nm,sm->s", e, np.linalg.inv(p.bound), e)) / n
+        for e, p in zip(errors, pairs, strict=True)
+    ])  # fmt: skip
+    bound = np.array([np.diag(p.bound) for p in pairs])[:, None]
+    ratio = np.sqrt((errors**2 / bound).mean(axis=(0, 1)))
+    own = np.array([[np.diag(r.covariance(*sd)) for r in p.found] for p in pairs])
+    covered = (abs(errors) < 1.96 * np.sqrt(own)).mean(axis=(1, 2))
+    return {
+        "chi_square": distance.mean(),
+        "chi_square_se": distance.std(ddof=1) / np.sqrt(len(pairs)),
+        "smallest_ratio": ratio.min(),
+        "largest_ratio": ratio.max(),
+        "told_over_bound": float(np.sqrt((own / bound).mean())),
+        "coverage": covered.mean(),
+        "coverage_se": covered.std(ddof=1) / np.sqrt(len(pairs)),
+        "chi_square_of_residual": float(
+            np.mean([r.agreement(*sd).chi_square for p in pairs for r in p.found])
+            if noise.in_f > 0 else np.nan
+        ),
+        "not_converged": sum(r.outcome.value != "converged" for p in pairs for r in p.found),
+    }  # fmt: skip
+
+
+def study(pairs: int, standard_start: bool) -> dict[str, Any]:
+    """All rows."""
+    truth = Truth.default()
+    parts = fields(truth)
+    found: dict[str, Any] = {}
+    for noise in NOISES:
+        print(f"{noise.name} ...", file=sys.stderr, flush=True)
+        measured = list(measure(truth, noise, pairs, standard_start))
+        found[noise.name] = {
+            "fields": {field.name: judge_field(field, truth, measured) for field in parts},
+            "unknowns": judge_unknowns(truth, noise, measured),
+        }
+    return {
+        "pairs": pairs,
+        "pixels": len(truth.used[0]),
+        "unknowns": truth.ansatz.size,
+        "det_F": [float(v) for v in np.quantile(
+            np.linalg.det(truth.deformation_gradient), (0.0, 0.5, 1.0))],
+        "noises": found,
+    }  # fmt: skip
+
+
+def tell(found: dict[str, Any]) -> None:
+    """Print the tables."""
+    print(f"{found['pairs']} pairs of realisations, {found['pixels']} px, "
+          f"{found['unknowns']} unknowns; det F from {found['det_F'][0]:.2f} to "
+          f"{found['det_F'][2]:.2f}, median {found['det_F'][1]:.2f}\n")  # fmt: skip
+    print("| noise | field | bound, rms [px] | rms error / bound | bias / bound |")
+    print("|---|---|---|---|---|")
+    for noise, row in found["noises"].items():
+        for name, f in row["fields"].items():
+            print(f"| {noise} | {name} | {f['bound_px']:.2e} | {f['ratio']:.3f} ± "
+                  f"{f['ratio_se']:.3f} | {f['bias']:.4f} ± {f['bias_se']:.4f} |")  # fmt: skip
+    print("\n| noise | chi squared of the unknowns | each unknown's rms error / bound | told "
+          "standard error / bound | 95 % intervals cover |\n|---|---|---|---|---|")  # fmt: skip
+    for noise, row in found["noises"].items():
+        u = row["unknowns"]
+        print(f"| {noise} | {u['chi_square']:.3f} ± {u['chi_square_se']:.3f} | "
+              f"{u['smallest_ratio']:.2f} – {u['largest_ratio']:.2f} | "
+              f"{u['told_over_bound']:.3f} | {100 * u['coverage']:.1f} ± "
+              f"{100 * u['coverage_se']:.1f} % |")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--pairs", type=int, default=100, help="realisations n, each with its -n")
+    parser.add_argument("--standard-start", action="store_true", help="not from the truth: slower")
+    parser.add_argument("--json", type=Path, help="where to leave all numbers")
+    options = parser.parse_args()
+    found = study(options.pairs, options.standard_start)
+    tell(found)
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
