@@ -1,0 +1,220 @@
+"""Photographs made ready to be correlated: read, judged, freed from distortion, material found.
+
+::
+
+    prepared/reference.tif  reference_mask.tif
+    prepared/NAME.tif       NAME_mask.tif        of each deformed image
+    prepared/prepared.json                       what was done and what was skipped; written last
+
+The images are grey levels as the camera counts them, float32, on the ideal pixel grid; the masks
+are white on material.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, write_json
+from modeharvest.harvest.experiment import Experiment
+from modeharvest.harvest.noise import Noise, estimated_noise, measured_noise
+from modeharvest.idic.material import find_material
+from modeharvest.imaging.distortion import undistorted, undistorted_mask
+from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.io import read_image, read_mask, require_same_shape, write_image
+from modeharvest.imaging.photographs import Photograph
+from modeharvest.imaging.series import read_frame, read_reference
+from modeharvest.progress import Progress, silent
+
+FloatImage = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+RECORD = "prepared.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Photographs on the ideal grid, in a folder; read when asked for.
+
+    Parameters
+    ----------
+    folder
+        Where they are.
+    info
+        The content of ``prepared.json``.
+    """
+
+    folder: Path
+    info: dict[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path) -> Prepared:
+        """Open a finished folder; raises InputError if it isn't one."""
+        return cls(folder, read_json(folder / RECORD))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the deformed images that can be used, in the order of the test."""
+        return tuple(self.info["names"])
+
+    @property
+    def skipped(self) -> tuple[tuple[str, str], ...]:
+        """Name of each file that can't be used, and why."""
+        return tuple((name, reason) for name, reason in self.info["skipped"])
+
+    @property
+    def noise(self) -> Noise:
+        """The camera's."""
+        return Noise(**self.info["noise"])
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The ideal pixels; the physical origin is the middle of the image."""
+        return PixelGrid(**self.info["grid"])
+
+    def image(self, name: str = "reference") -> FloatImage:
+        """(rows, cols) grey levels."""
+        return read_image(self.folder / f"{name}.tif")
+
+    def mask(self, name: str = "reference") -> BoolArray:
+        """(rows, cols) True on material."""
+        return read_mask(self.folder / f"{name}_mask.tif")
+
+
+def prepare(
+    experiment: Experiment,
+    base: Path,
+    folder: Path,
+    distortion: Distortion | None = None,
+    progress: Progress = silent,
+) -> Prepared:
+    """Make an experiment's photographs ready; leaves them in ``folder``.
+
+    Parameters
+    ----------
+    experiment
+        Of which there are photographs.
+    base
+        Folder that its files' names are relative to.
+    folder
+        Where to leave them.
+    distortion
+        Of the optics.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If the reference can't be used, or none of the deformed images.
+    """
+    images, table = experiment.images, experiment.specimen
+    reference = read_reference(base / images.reference)
+    ready = _Maker(folder, distortion)
+    mask = ready.save("reference", reference, _given(base, table.material))
+    deformed = named_files(base, images.deformed)
+    names, skipped, notes = [], [], list(reference.notes) + ready.sentences
+    for k, path in enumerate(deformed):
+        progress(k, len(deformed), "prepare photographs")
+        given = table.deformed_material[k] if k < len(table.deformed_material) else ""
+        try:
+            frame = read_frame(path, reference)
+            ready.save(path.stem, frame, _given(base, given))
+        except InputError as error:
+            skipped.append((path.name, str(error)))
+            continue
+        names.append(path.stem)
+        notes += [note for note in frame.notes if note not in notes]
+    if not names:
+        raise InputError(
+            f"expected a deformed image that can be used, got none of {len(deformed)}: "
+            f"{skipped[0][1]}"
+        )
+    rows, cols = reference.shape
+    grid = PixelGrid.centred(rows, cols, experiment.scale.mm_per_px)
+    info = {
+        "names": names,
+        "skipped": skipped,
+        "noise": vars(_noise(experiment, base, reference, mask)),
+        "grid": vars(grid),
+        "full_scale": reference.full_scale,
+        "notes": notes,
+    }
+    write_json(folder / RECORD, info)
+    return Prepared(folder, info)
+
+
+def named_files(base: Path, names: Sequence[str]) -> tuple[Path, ...]:
+    """The files that names, or patterns with wildcards, stand for.
+
+    Raises
+    ------
+    InputError
+        If a pattern matches no file, or two files would leave results of the same name.
+    """
+    paths: list[Path] = []
+    for name in names:
+        if any(sign in name for sign in "*?["):
+            found = sorted(base.glob(name))
+            if not found:
+                raise InputError(f"expected files that match {base / name}, found none")
+            paths += found
+        else:
+            paths.append(base / name)
+    stems = [path.stem for path in paths]
+    twice = next((stem for stem in stems if stems.count(stem) > 1 or stem == "reference"), None)
+    if twice is not None and len(paths) > 1:
+        raise InputError(
+            f"expected images whose names differ, and none called 'reference', got {twice!r} "
+            "again; rename it, or narrow the pattern"
+        )
+    return tuple(paths)
+
+
+class _Maker:
+    """Frees photographs from distortion and finds their material."""
+
+    def __init__(self, folder: Path, distortion: Distortion | None) -> None:
+        self._folder, self._distortion = folder, distortion
+        self.sentences: list[str] = []
+
+    def save(self, name: str, photograph: Photograph, given: Path | None) -> BoolArray:
+        """Write image and mask under a name; returns the photograph's own mask."""
+        if given is not None:
+            mask = read_mask(given)
+            require_same_shape(photograph.image, mask, str(photograph.path), str(given))
+        else:
+            material = find_material(photograph.image)
+            mask = material.mask
+            self.sentences += [s for s in material.sentences if s not in self.sentences]
+        image, shown = photograph.image, mask
+        if self._distortion is not None:
+            image, shown = (
+                undistorted(image, self._distortion),
+                undistorted_mask(mask, self._distortion),
+            )
+        write_image(self._folder / f"{name}.tif", image)
+        write_image(self._folder / f"{name}_mask.tif", shown)
+        return mask
+
+
+def _given(base: Path, name: str) -> Path | None:
+    return base / name if name else None
+
+
+def _noise(experiment: Experiment, base: Path, reference: Photograph, mask: BoolArray) -> Noise:
+    """Given, measured or estimated, in this order; before any interpolation smooths it."""
+    if experiment.noise.sd is not None:
+        return Noise(experiment.noise.sd, "given")
+    repeats = experiment.images.repeats
+    if not repeats:
+        return estimated_noise(reference.image, mask)
+    others = [read_frame(path, reference).image for path in named_files(base, repeats)]
+    return measured_noise([reference.image, *others], mask)

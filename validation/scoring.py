@@ -1,0 +1,184 @@
+"""How good a displacement field from any DIC code is, against the truth of a benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.errors import InputError
+from modeharvest.idic.local_field import LocalField
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.regions import REGIONS
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_OTHER_UNIT = 0.05
+"""A ratio of measured to true displacement this near to the pixel size is one of units."""
+PERCENTILES = (50, 90, 95, 99)
+
+
+@dataclass(frozen=True)
+class RegionScore:
+    """The error over one region.
+
+    Parameters
+    ----------
+    points
+        Points of the field that lie there.
+    returned
+        Share of them with a displacement [-].
+    bias_px
+        (x, y) mean error [px].
+    rms_px
+        Rms error per component [px].
+    percentiles_px
+        Of the error's length, at :data:`PERCENTILES` [px].
+    max_px
+        The largest length [px].
+    """
+
+    points: int
+    returned: float
+    bias_px: tuple[float, float]
+    rms_px: float
+    percentiles_px: tuple[float, ...]
+    max_px: float
+
+    @classmethod
+    def of(cls, error_px: FloatArray, valid: BoolArray) -> RegionScore:
+        """From (n, 2) errors of n points, of which those that are not valid count as lost."""
+        found = error_px[valid]
+        nan = float("nan")
+        if not len(found):
+            share = 0.0 if len(valid) else nan
+            return cls(len(valid), share, (nan, nan), nan, (nan,) * len(PERCENTILES), nan)
+        length = np.hypot(found[:, 0], found[:, 1])
+        mean = found.mean(axis=0)
+        return cls(
+            points=len(valid),
+            returned=float(valid.mean()),
+            bias_px=(float(mean[0]), float(mean[1])),
+            rms_px=float(np.sqrt(np.mean(found**2))),
+            percentiles_px=tuple(float(p) for p in np.percentile(length, PERCENTILES)),
+            max_px=float(length.max()),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """A graded field.
+
+    Parameters
+    ----------
+    source
+        Of the field.
+    everywhere
+        Over all its points on material.
+    by_region
+        For each of :data:`modeharvest.validation.regions.REGIONS`.
+    off_material
+        Points that lie in holes or outside the specimen: not graded.
+    covered
+        Share of the material within one spacing of a valid point [-].
+    x, y, error_px
+        (m,), (m,) [mm] and (m, 2) [px] of the valid points on material.
+    """
+
+    source: str
+    everywhere: RegionScore
+    by_region: Mapping[str, RegionScore]
+    off_material: int
+    covered: float
+    x: FloatArray
+    y: FloatArray
+    error_px: FloatArray
+
+
+def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: PixelGrid) -> Score:
+    """Grade a field.
+
+    Parameters
+    ----------
+    field
+        Displacements at points of the reference [mm].
+    truth
+        (n, 2) true displacements at the field's points [mm]; NaN off the material.
+    labels
+        (rows, cols) of :func:`modeharvest.validation.regions.regions`.
+    grid
+        The reference image's pixels.
+
+    Raises
+    ------
+    InputError
+        If no point lies on the material, or the displacements are in another unit than declared.
+    """
+    here = _labels_at(field, labels, grid)
+    on_material = (here >= 0) & np.isfinite(truth).all(axis=1)
+    if not on_material.any():
+        raise InputError(
+            f"{field.source}: expected points on the specimen, got none of {field.x.size} there; "
+            "check the field's units, its origin and the direction of its y axis"
+        )
+    _require_unit(field, truth, on_material & field.good, grid)
+    error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
+    used = on_material & field.good
+    return Score(
+        source=field.source,
+        everywhere=RegionScore.of(error[on_material], field.good[on_material]),
+        by_region={
+            name: RegionScore.of(
+                error[on_material & (here == k)], field.good[on_material & (here == k)]
+            )
+            for k, name in enumerate(REGIONS)
+        },
+        off_material=int((here < 0).sum()),
+        covered=_covered(field, used, labels >= 0, grid),
+        x=field.x[used],
+        y=field.y[used],
+        error_px=error[used],
+    )
+
+
+def _labels_at(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> NDArray[np.int8]:
+    """(n,) labels of the pixels nearest to the field's points; -1 off the image."""
+    row, col = grid.to_px(field.x, field.y)
+    inside = (np.abs(row - 0.5 * (grid.rows - 1)) <= 0.5 * grid.rows - 0.5) & (
+        np.abs(col - 0.5 * (grid.cols - 1)) <= 0.5 * grid.cols - 0.5
+    )
+    found = np.full(field.x.size, -1, dtype=np.int8)
+    found[inside] = labels[np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)]
+    return found
+
+
+def _require_unit(field: LocalField, truth: FloatArray, used: BoolArray, grid: PixelGrid) -> None:
+    """Recognise pixels declared as millimetres and the reverse, by the ratio to the truth."""
+    if used.sum() < 3:
+        return
+    measured, true = field.u[used].ravel(), truth[used].ravel()
+    ratio = float(np.median(np.abs(measured)) / max(float(np.median(np.abs(true))), 1e-300))
+    for factor, words in (
+        (1.0 / grid.pixel_size, "pixels declared as mm"),
+        (grid.pixel_size, "mm declared as pixels"),
+    ):
+        if abs(ratio / factor - 1.0) < _OTHER_UNIT and abs(factor - 1.0) > 2.0 * _OTHER_UNIT:
+            raise InputError(
+                f"{field.source}: expected displacements in the declared unit, got {ratio:.4g} "
+                f"times the true ones, like {words} (a pixel is {grid.pixel_size} mm); declare "
+                "the unit that the file is in"
+            )
+
+
+def _covered(field: LocalField, used: BoolArray, mask: BoolArray, grid: PixelGrid) -> float:
+    """Share of the material's pixels within one spacing of a used point [-]."""
+    spacing_px = max(1.0, field.spacing / grid.pixel_size)
+    row, col = grid.to_px(field.x[used], field.y[used])
+    hit = np.zeros(grid.shape, dtype=np.bool_)
+    hit[np.rint(row).astype(int), np.rint(col).astype(int)] = True
+    near = ndimage.distance_transform_edt(~hit) <= spacing_px
+    return float(near[mask].mean())
