@@ -17,6 +17,9 @@ SECONDARY_PEAK = 0.25
 """A peak belongs to the pattern if it has this share of the largest one's density."""
 MOST_WAVES = 4
 """No more peaks than this are fitted as waves."""
+COPY = 0.25
+"""A wave weaker than this share of the strongest, once all are fitted, has a peak only because the
+holes repeat another wave there, and is left out."""
 SMALLEST_AMPLITUDE = 0.005
 """Mean amplitude of the strongest wave [l] below which there is no pattern."""
 SMALLEST_CONTRAST = 100.0
@@ -89,7 +92,7 @@ def read_pattern(spectrum: Spectrum) -> Pattern:
         return _no_pattern(None, "No pattern: no maximum outside the lines of the edges.")
     largest = peaks[0]
     chosen = [p for p in peaks if p.density >= SECONDARY_PEAK * largest.density]
-    waves = fit_waves(spectrum, chosen[:MOST_WAVES])
+    waves = _without_copies(spectrum, chosen[:MOST_WAVES])
     strength = max(w.strength for w in waves)
     share = explained(spectrum, waves)
     hidden = largest.contrast < SMALLEST_CONTRAST and share < LARGE_SHARE
@@ -99,11 +102,18 @@ def read_pattern(spectrum: Spectrum) -> Pattern:
             f"No pattern: the largest peak is at ξ = ({largest.xi[0]:+.2f}, {largest.xi[1]:+.2f}), "
             f"{largest.contrast:.0f} times the median density, with a mean amplitude of "
             f"{1e3 * strength:.1f} µm and {100 * share:.0f} % of the field (a pattern has "
-            f"{1e3 * SMALLEST_AMPLITUDE * spectrum.pitch:.1f} µm, and {SMALLEST_CONTRAST:.0f} times "
-            f"or {100 * LARGE_SHARE:.0f} %, at least).",
+            f"at least {1e3 * SMALLEST_AMPLITUDE * spectrum.pitch:.1f} µm, and "
+            f"{SMALLEST_CONTRAST:.0f} times or {100 * LARGE_SHARE:.0f} %).",
         )
     waves.sort(key=lambda w: np.arctan2(w.k[1], w.k[0]))
     return _described(tuple(waves), largest, spectrum.pitch)
+
+
+def _without_copies(spectrum: Spectrum, peaks: list[Peak]) -> list[Wave]:
+    waves = fit_waves(spectrum, peaks)
+    least = COPY * max(w.strength for w in waves)
+    kept = [p for p, w in zip(peaks, waves, strict=True) if w.strength >= least]
+    return waves if len(kept) == len(peaks) else fit_waves(spectrum, kept)
 
 
 def _no_pattern(largest: Peak | None, sentence: str) -> Pattern:
