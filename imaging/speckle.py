@@ -1,21 +1,13 @@
-"""A speckle pattern that is known exactly everywhere, not only at whole pixels.
+"""A speckle pattern that is known exactly everywhere: one layer, or grains of ink on it.
 
-A stationary Gaussian random field [1]_ with a radially symmetric normal spectral density is
-thresholded at its median and blurred by a Gaussian. The thresholded samples blurred by the
-*continuous* Gaussian are a trigonometric polynomial
+The one layer is a thresholded and blurred Gaussian field (:mod:`speckle_layer
+<modeharvest.imaging.speckle_layer>`). The second is ink that an air brush leaves on a powdered
+surface, as on the specimen of the paper's section "Real Experiments": the ink's own field i,
+0 ... 1, darkens what it lies on,
 
-    I(row, col) = sum_k  c_k exp(2 pi i (k_row row / rows + k_col col / cols)),
+    I = p (1 - darkness i).
 
-because the Gaussian's transfer function at the Nyquist frequency is 5e-20 for the default
-3 px. An inverse FFT gives it at whole pixels, a non-uniform FFT [2]_ at any other point, both
-to rounding. Where millions of points are wanted, a B-spline of its waves is twenty times
-faster; unlike an interpolated image it comes with a proof of how far it may be off.
-
-References
-----------
-.. [1] M. Grigoriu, Stochastic Calculus, Birkhäuser 2002, section 5.3.1.2.
-.. [2] A. H. Barnett, J. Magland, L. af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
-   doi:10.1137/18M120885X.
+Both are trigonometric polynomials, hence their product is; it is evaluated factor by factor.
 """
 
 from __future__ import annotations
@@ -23,26 +15,70 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
-import finufft
-import numba
 import numpy as np
-import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.imaging.periodic_spline import PeriodicSpline
+from modeharvest.imaging.speckle_layer import TOLERANCE, Grains, Layer
+
+__all__ = ["TOLERANCE", "Ink", "Speckle", "SpeckleSpec"]
 
 FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
-TOLERANCE = 2.0**-24
-"""Proved bound of the error between pixels [fraction of full scale]: float32's own rounding."""
-_NARROWEST_BLUR_PX = 2.0  # transfer function at Nyquist: exp(-pi^2 b^2 / 2) = 3e-9
+_NARROWEST_BLUR_PX = 0.75  # 3 x 3 samples a pixel
+_WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations away
+
+
+@dataclass(frozen=True)
+class Ink:
+    """A second layer: grains of ink, thresholded from a Gaussian field of their own and blurred.
+
+    Parameters
+    ----------
+    standard_deviation
+        Standard deviation of the Gaussian field's spectral density [cycles/px].
+    blur_px
+        Standard deviation of the Gaussian blur [px].
+    coverage
+        Share of the area under ink [-].
+    darkness
+        Share of the light that ink takes away [-].
+    seed
+        Seed of the random numbers; streams differ from those of the layer below.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range.
+    """
+
+    standard_deviation: float = 0.05
+    blur_px: float = 1.5
+    coverage: float = 0.4
+    darkness: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require_band_limited(self.standard_deviation, self.blur_px, "ink")
+        if not (0.0 < self.coverage < 1.0 and 0.0 < self.darkness <= 1.0):
+            raise InputError(
+                "ink: expected a coverage in 0 ... 1 and a darkness above 0 and at most 1, got "
+                f"coverage {self.coverage}, darkness {self.darkness}"
+            )
+        if self.seed < 0:
+            raise InputError(f"ink: expected a seed of 0 or more, got {self.seed}")
+
+    @property
+    def grains(self) -> Grains:
+        """What the layer is made of."""
+        return Grains(
+            self.standard_deviation, self.blur_px, (0.0, 1.0), self.coverage, (self.seed, 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -57,12 +93,13 @@ class SpeckleSpec:
         "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px"
         (2 pi times coarser); the paper leaves it open.
     blur_px
-        Standard deviation of the Gaussian blur [px]; at least 2, below which the pattern would
-        no longer be band-limited.
+        Standard deviation of the Gaussian blur [px], at least 0.75.
     dark, bright
         Grey levels of the two phases before the blur, as fractions of full scale [-].
     seed
         Seed of the random numbers.
+    ink
+        A second layer; none by default.
 
     Raises
     ------
@@ -76,20 +113,12 @@ class SpeckleSpec:
     dark: float = 0.2
     bright: float = 1.0
     seed: int = 0
+    ink: Ink | None = None
 
     def __post_init__(self) -> None:
         if self.unit not in _CYCLES:
             raise InputError(f"speckle: expected a unit among {list(_CYCLES)}, got {self.unit!r}")
-        if not 0.0 < self.cycles_per_px <= 0.125:
-            raise InputError(
-                "speckle: expected a spectral standard deviation above 0 and at most 0.125 "
-                f"cycles/px (4 of them below Nyquist), got {self.standard_deviation} {self.unit}"
-            )
-        if not (self.blur_px >= _NARROWEST_BLUR_PX and math.isfinite(self.blur_px)):
-            raise InputError(
-                f"speckle: expected a blur of at least {_NARROWEST_BLUR_PX:g} px (else the image "
-                f"isn't band-limited), got {self.blur_px} px"
-            )
+        _require_band_limited(self.cycles_per_px, self.blur_px, "speckle")
         if not 0.0 <= self.dark < self.bright <= 1.0:
             raise InputError(
                 "speckle: expected grey levels 0 <= dark < bright <= 1, got "
@@ -103,24 +132,23 @@ class SpeckleSpec:
         """The spectral standard deviation in cycles/px."""
         return self.standard_deviation * _CYCLES[self.unit]
 
+    @property
+    def grains(self) -> Grains:
+        """What the pattern, or the layer under the ink, is made of: half dark, half bright."""
+        return Grains(self.cycles_per_px, self.blur_px, (self.dark, self.bright), 0.5, self.seed)
 
-def gaussian_field(spec: SpeckleSpec, period: tuple[int, int]) -> FloatArray:
-    """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [px].
 
-    White noise is filtered by the square root of the spectral density. The sample's mean is
-    zero; in expectation the variance is one and the median, the threshold, zero.
-    """
-    noise = np.random.default_rng(spec.seed).standard_normal(period)
-    amplitude = np.exp(-_squared_frequency(period) / (4.0 * spec.cycles_per_px**2))
-    amplitude[0, 0] = 0.0
-    multiplicity = np.full(amplitude.shape[1], 2.0)
-    multiplicity[0] = 1.0
-    if period[1] % 2 == 0:
-        multiplicity[-1] = 1.0
-    amplitude /= math.sqrt(float((amplitude**2 @ multiplicity).sum()) / math.prod(period))
-    spectrum = scipy.fft.rfft2(noise)
-    spectrum *= amplitude
-    return np.asarray(scipy.fft.irfft2(spectrum, s=period), dtype=np.float64)
+def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> None:
+    if not (blur_px >= _NARROWEST_BLUR_PX and math.isfinite(blur_px)):
+        raise InputError(
+            f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px, got {blur_px} px"
+        )
+    widest = _WIDEST_FREQUENCY * Grains(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
+    if not 0.0 < cycles_per_px <= widest:
+        raise InputError(
+            f"{what}: expected a spectral standard deviation above 0 and at most {widest:g} "
+            f"cycles/px with a blur of {blur_px} px, got {cycles_per_px} cycles/px"
+        )
 
 
 class Speckle:
@@ -144,108 +172,66 @@ class Speckle:
             raise InputError(f"speckle: expected an image of at least 8 x 8 px, got {shape}")
         self.spec = spec
         self.shape = shape
-        self.period: tuple[int, int] = (
-            int(scipy.fft.next_fast_len(shape[0], real=True)),
-            int(scipy.fft.next_fast_len(shape[1], real=True)),
-        )
-        transfer = np.exp(-2.0 * (math.pi * spec.blur_px) ** 2 * _squared_frequency(self.period))
-        spectrum = scipy.fft.rfft2(self.binary())
-        spectrum *= transfer / math.prod(self.period)
-        self._spectrum: ComplexArray = spectrum
+        self._base = Layer(spec.grains, shape)
+        self._ink = None if spec.ink is None else Layer(spec.ink.grains, shape)
+        self._darkness = 0.0 if spec.ink is None else spec.ink.darkness
+        self.period: tuple[int, int] = self._base.period
 
     def binary(self) -> FloatArray:
-        """Return the two phases before the blur, over the period [fraction of full scale]."""
-        bright = gaussian_field(self.spec, self.period) > 0.0
-        return np.where(bright, self.spec.bright, self.spec.dark)
+        """Return the base layer's two phases before the blur, over the period's samples [-]."""
+        return self._base.binary()
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact intensities at whole pixels [fraction of full scale].
 
         ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
-        multiplied by those of its row and its column frequency (see Aperture.transfer).
+        multiplied by those of its row and its column frequency (see Aperture.transfer). Not with
+        ink, whose waves are products.
         """
-        spectrum = self._spectrum * math.prod(self.period)
+        base = self._base.image(transfer)
+        if self._ink is None:
+            return base
         if transfer is not None:
-            spectrum *= transfer(np.fft.fftfreq(self.period[0]))[:, None]
-            spectrum *= transfer(np.fft.rfftfreq(self.period[1]))
-        whole = scipy.fft.irfft2(spectrum, s=self.period)
-        return np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]])
+            raise InputError("speckle: expected one layer where pixels average, got two")
+        return base * (1.0 - self._darkness * self._ink.image())
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """Intensities at image positions (row, col) [px], of the positions' shape.
 
-        They are off by at most ``spline.bound``, at most 6e-8 of full scale, and in fact by
+        They are off by at most ``bound``, at most 6e-8 of full scale a layer, and in fact by
         less than a hundredth of that; NaN where a position is.
         """
-        return self.spline(row, col)
+        base = self._base(row, col)
+        if self._ink is not None:
+            base *= 1.0 - self._darkness * self._ink(row, col)
+        return base
 
-    @cached_property
+    @property
     def spline(self) -> PeriodicSpline:
-        """The pattern as a spline, made when first asked for."""
-        return PeriodicSpline.of(self._spectrum, self.period, TOLERANCE)
+        """The base layer as a spline, made when first asked for."""
+        return self._base.spline
+
+    @property
+    def bound(self) -> float:
+        """Proved bound of a call's error [fraction of full scale]."""
+        ink = 0.0 if self._ink is None else self._darkness * self._ink.spline.bound
+        return self.spline.bound + ink + ink * self.spline.bound
 
     def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
         """Exact intensities at image positions (row, col) [px], of the positions' shape.
 
         ``eps`` is the relative precision of the non-uniform FFT.
         """
-        return np.asarray(self._evaluate(row, col, eps, gradient=False)[0])
+        base = self._base.exact(row, col, eps)
+        if self._ink is None:
+            return base
+        return base * (1.0 - self._darkness * self._ink.exact(row, col, eps))
 
     def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
         """(2, ...) exact derivatives along (row, col) at image positions (row, col) [1/px]."""
-        return self._evaluate(row, col, eps, gradient=True)
-
-    def _evaluate(
-        self, row: ArrayLike, col: ArrayLike, eps: float, *, gradient: bool
-    ) -> FloatArray:
-        row, col = np.broadcast_arrays(
-            np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
-        )
-        scale = 2.0 * math.pi / np.asarray(self.period)
-        row_angle, col_angle = scale[0] * row.ravel(), scale[1] * col.ravel()
-        modes, k_row, k_col = self._modes(eps)
-        if gradient:
-            modes = np.stack(
-                [1j * scale[0] * k_row[:, None] * modes, 1j * scale[1] * k_col[None, :] * modes]
-            )
-        else:
-            modes = modes[None]
-        if row_angle.size == 0:
-            return np.zeros((len(modes), *row.shape))
-        values = finufft.nufft2d2(
-            row_angle, col_angle, modes, eps=eps, isign=1,
-            nthreads=numba.get_num_threads(), showwarn=0,
-        )  # fmt: skip
-        # The library's columns run from -n/2; ours from 0: a shift theorem makes up for it.
-        shift = k_col.size // 2
-        values = values.reshape(len(modes), -1) * np.exp(1j * shift * col_angle)
-        return np.ascontiguousarray(values.real).reshape(len(modes), *row.shape)
-
-    def _modes(self, eps: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Pick the non-negligible modes of a real image, wave numbers k_row centred, k_col >= 0.
-
-        What is left out sums to at most ``eps`` of the image's mean in absolute value.
-        """
-        rows = self.period[0]
-        size = np.abs(self._spectrum)
-        allowed = 0.25 * eps * size[0, 0]
-        by_row = size.sum(axis=1)
-        by_row = by_row[: rows // 2 + 1] + np.roll(by_row[::-1], 1)[: rows // 2 + 1]
-        row_cut, col_cut = _cut(by_row, allowed), _cut(size.sum(axis=0), allowed)
-        row_cut = min(row_cut, (rows - 1) // 2)
-        k_row = np.arange(-row_cut, row_cut + 1)
-        modes = self._spectrum[k_row, : col_cut + 1]
-        modes[:, 1:] *= 2.0
-        return modes, k_row.astype(np.float64), np.arange(col_cut + 1, dtype=np.float64)
-
-
-def _squared_frequency(period: tuple[int, int]) -> FloatArray:
-    """|f|^2 [cycles^2/px^2] in the layout of a real FFT."""
-    f_row, f_col = np.fft.fftfreq(period[0]), np.fft.rfftfreq(period[1])
-    return np.asarray(f_row[:, None] ** 2 + f_col[None, :] ** 2)
-
-
-def _cut(size: FloatArray, allowed: float) -> int:
-    """Find the last index to keep so that what follows sums to at most ``allowed``."""
-    tail = np.cumsum(size[::-1])[::-1]
-    return max(1, int(np.count_nonzero(tail > allowed)) - 1)
+        slope = self._base.gradient(row, col, eps)
+        if self._ink is None:
+            return slope
+        light = 1.0 - self._darkness * self._ink.exact(row, col, eps)
+        shade = self._darkness * self._ink.gradient(row, col, eps)
+        return np.asarray(light * slope - self._base.exact(row, col, eps) * shade)

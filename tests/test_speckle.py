@@ -1,6 +1,7 @@
 """Guards the pattern's statistics and that its intensity is exact at any point."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec, gaussian_field
+from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle_layer import TOLERANCE, Layer, gaussian_field
 
 FloatArray = NDArray[np.float64]
 
@@ -38,11 +40,14 @@ def directly_summed(speckle: Speckle, row: FloatArray, col: FloatArray) -> Float
 
 def blurred_in_space(speckle: Speckle, row: float, col: float) -> float:
     """Sum the binary pixels times Gaussians centred on them in space, out to 12 sd."""
-    b = speckle.spec.blur_px
+    return space_sum(speckle.binary(), speckle.spec.blur_px, row, col)
+
+
+def space_sum(samples: FloatArray, b: float, row: float, col: float) -> float:
     reach = math.ceil(12 * b)
     r = np.arange(math.floor(row) - reach, math.floor(row) + reach + 1)
     c = np.arange(math.floor(col) - reach, math.floor(col) + reach + 1)
-    binary = np.take(np.take(speckle.binary(), r, axis=0, mode="wrap"), c, axis=1, mode="wrap")
+    binary = np.take(np.take(samples, r, axis=0, mode="wrap"), c, axis=1, mode="wrap")
     weight_row = np.exp(-((r - row) ** 2) / (2 * b * b))
     weight_col = np.exp(-((c - col) ** 2) / (2 * b * b))
     return float(weight_row @ binary @ weight_col / (2 * math.pi * b * b))
@@ -88,7 +93,7 @@ def test_field_has_the_spectral_density_asked_for(unit: Any) -> None:
     spec = SpeckleSpec(unit=unit, seed=7)
     n = 600
     s = spec.standard_deviation / (1.0 if unit == "cycles/px" else 2 * math.pi)
-    field = gaussian_field(spec, (n, n))
+    field = gaussian_field(spec.cycles_per_px, spec.seed, (n, n))
     power = np.abs(np.fft.fft2(field)) ** 2
     f = np.fft.fftfreq(n)
     # A periodogram ordinate scatters by 100 %; n^2 4 pi s^2 of them matter, half independent.
@@ -105,7 +110,7 @@ def test_field_has_the_spectral_density_asked_for(unit: Any) -> None:
 
 def test_field_is_correlated_over_its_length() -> None:
     spec, n = SpeckleSpec(seed=11), 600
-    field = gaussian_field(spec, (n, n))
+    field = gaussian_field(spec.cycles_per_px, spec.seed, (n, n))
     # The inverse transform of the spectral density: exp(-2 pi^2 s^2 r^2), standard deviation
     # 1/(2 pi s) = 3.18 px; independent patches: n^2 / (pi (2 * 3.18)^2) = 2800.
     for r in (2, 4, 8):
@@ -148,11 +153,13 @@ def test_seed_decides() -> None:
         ({"unit": "1/mm"}, "unit"),
         ({"standard_deviation": 0.0}, "spectral standard deviation"),
         ({"standard_deviation": 0.2}, "spectral standard deviation"),
-        ({"blur_px": 1.0}, "blur"),
+        ({"blur_px": 0.5}, "blur"),
         ({"blur_px": float("nan")}, "blur"),
         ({"dark": 0.9, "bright": 0.5}, "grey levels"),
         ({"bright": 1.5}, "grey levels"),
         ({"seed": -1}, "seed"),
+        ({"standard_deviation": 0.2, "blur_px": 1.0, "seed": -1}, "seed"),
+        ({"standard_deviation": 0.3, "blur_px": 1.0}, "at most 0.25"),
     ],
 )
 def test_refuses_what_cannot_be_made(bad: dict[str, Any], message: str) -> None:
@@ -163,3 +170,83 @@ def test_refuses_what_cannot_be_made(bad: dict[str, Any], message: str) -> None:
 def test_refuses_an_image_too_small() -> None:
     with pytest.raises(InputError, match="8 x 8"):
         Speckle(SpeckleSpec(), (4, 100))
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"standard_deviation": 0.2}, "ink: expected a spectral"),
+        ({"blur_px": 0.1}, "ink: expected a blur"),
+        ({"coverage": 1.0}, "coverage"),
+        ({"darkness": 0.0}, "darkness"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_refuses_ink_that_cannot_be(bad: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Ink(**{"blur_px": 2.0} | bad)
+
+
+POWDER = SpeckleSpec(standard_deviation=0.16, blur_px=1.0, dark=0.35, bright=0.95, seed=2)
+PAINTED = replace(POWDER, ink=Ink(blur_px=1.5, coverage=0.35, seed=2))
+
+
+@pytest.mark.parametrize("spec", [POWDER, PAINTED], ids=["fine", "two layers"])
+def test_finer_than_pixels_and_layered_is_exact_between_them(
+    spec: SpeckleSpec, points: tuple[FloatArray, FloatArray]
+) -> None:
+    """Against a sum in space over the samples before the blur, of each layer for itself."""
+    shape = (60, 64)
+    speckle = Speckle(spec, shape)
+    expected = np.array([layers_in_space(spec, shape, r, c) for r, c in zip(*points, strict=True)])
+    # Cutting the waves off at the samples' Nyquist leaves out 3e-9 of a wave, of many waves.
+    np.testing.assert_allclose(speckle.exact(*points), expected, atol=3e-8)
+    np.testing.assert_allclose(speckle(*points), speckle.exact(*points), atol=speckle.bound)
+    assert speckle.bound < 3 * TOLERANCE
+    row, col = np.mgrid[: shape[0], : shape[1]]
+    np.testing.assert_allclose(speckle.exact(row, col), speckle.image(), atol=EXACT)
+
+
+def layers_in_space(spec: SpeckleSpec, shape: tuple[int, int], row: float, col: float) -> float:
+    base = layer_in_space(Layer(spec.grains, shape), row, col)
+    if spec.ink is None:
+        return base
+    return base * (
+        1.0 - spec.ink.darkness * layer_in_space(Layer(spec.ink.grains, shape), row, col)
+    )
+
+
+def layer_in_space(layer: Layer, row: float, col: float) -> float:
+    n = layer.grains.finer
+    return space_sum(layer.binary(), n * layer.grains.blur_px, n * row, n * col)
+
+
+def test_gradient_of_two_layers_is_the_slope(points: tuple[FloatArray, FloatArray]) -> None:
+    speckle, h = Speckle(PAINTED, (60, 64)), 1e-4
+    row, col = points
+    slope = np.array(
+        [
+            (speckle.exact(row + h, col) - speckle.exact(row - h, col)) / (2 * h),
+            (speckle.exact(row, col + h) - speckle.exact(row, col - h)) / (2 * h),
+        ]
+    )
+    # Third derivatives are below (2 pi / 3 px)^3 = 9; rounding is 1e-12 / h.
+    np.testing.assert_allclose(speckle.gradient(row, col), slope, atol=1e-7)
+
+
+def test_ink_darkens_its_share_and_knows_nothing_of_the_powder() -> None:
+    n = 600
+    bare, painted = Speckle(POWDER, (n, n)).image(), Speckle(PAINTED, (n, n)).image()
+    ink = (1.0 - painted / bare) / 0.8
+    assert -1e-6 < ink.min() < 0.01
+    assert 0.99 < ink.max() < 1.0 + 1e-6
+    # Excursions of a field of 3.2 px correlation length: n^2 / (2 pi 3.2^2) patches, binary.
+    patches = n**2 / (2 * math.pi * 3.2**2)
+    assert abs(ink.mean() - 0.35) < 4 * math.sqrt(0.35 * 0.65 / patches)
+    assert abs(np.corrcoef(ink.ravel(), bare.ravel())[0, 1]) < 4 / math.sqrt(patches)
+    assert Speckle(replace(PAINTED, ink=None), (n, n)).image().tobytes() == bare.tobytes()
+
+
+def test_refuses_to_average_two_layers() -> None:
+    with pytest.raises(InputError, match="one layer where pixels average"):
+        Speckle(PAINTED, (64, 64)).image(np.ones_like)
