@@ -1,0 +1,127 @@
+"""Campaigns: complete tables whatever dies on the way, and nothing done twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, write_json
+from modeharvest.validation.campaign import Campaign, Workers, grid
+
+BASE = {"x": 0, "wait": 0.0, "bad": -1}
+
+
+def squares(folder: Path, **axes: list[float]) -> Campaign:
+    return Campaign("campaign_cases:square", grid(BASE, **axes), folder)
+
+
+def test_a_grid_is_every_combination() -> None:
+    cases = grid(BASE, x=[1, 2], bad=[0, 5, 7])
+    assert len(cases) == 6
+    assert cases[1] == {"x": 1, "wait": 0.0, "bad": 5}
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ({"z": [1]}, "expected axes among"),
+        ({"x": []}, "expected different values of 'x'"),
+        ({"x": [1, 1]}, "expected different values of 'x'"),
+    ],
+)
+def test_bad_grids_are_one_line(axes: dict[str, list[int]], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        grid(BASE, **axes)
+
+
+def test_bad_campaigns_are_one_line(tmp_path: Path) -> None:
+    for function in ("no.such.module:f", "campaign_cases:no_such", "campaign_cases"):
+        with pytest.raises(InputError, match="expected a function"):
+            Campaign(function, (BASE,), tmp_path)
+    with pytest.raises(InputError, match="same keys"):
+        Campaign("campaign_cases:square", (BASE, {**BASE, "y": 1}), tmp_path)
+    with pytest.raises(InputError, match="at least one case"):
+        Campaign("campaign_cases:square", (), tmp_path)
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a dask scheduler at"):
+        squares(tmp_path, x=[1]).run(Workers(scheduler="no-scheme-at-all://nowhere"))
+
+
+def test_failures_are_recorded_and_only_what_is_missing_is_run_again(tmp_path: Path) -> None:
+    campaign = squares(tmp_path, x=[1, 2, 3, 4, 5], bad=[3])
+    table = campaign.run()
+    assert list(table["x"]) == [1, 2, 3, 4, 5]
+    assert list(table["square"].dropna()) == [1, 4, 16, 25]
+    assert table["error"][2] == "ValueError: 3 is bad"
+    assert "Traceback" in read_json(campaign.path(campaign.cases[2]))["error"]
+    assert len(set(table["process"].dropna())) <= 2
+    assert (tmp_path / "table.csv").read_text().count("\n") == 6
+    assert campaign.missing() == (campaign.cases[2],)
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cases").iterdir()}
+
+    # One case of them is asked for anew, by an option of its own.
+    other = squares(tmp_path, x=[1, 2, 4, 5], bad=[3])
+    other = Campaign(other.function, (*other.cases, {**BASE, "x": 6}), tmp_path)
+    assert len(other.missing()) == 1
+    assert other.run()["error"].eq("").all()
+    after = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cases").iterdir()}
+    assert all(after[name] == stamp for name, stamp in before.items())
+
+
+def test_results_of_another_version_are_named_and_not_mixed(tmp_path: Path) -> None:
+    campaign = squares(tmp_path, x=[1])
+    write_json(tmp_path / "cases" / "old.json", {"version": "0.0.0", "error": "", "result": {}})
+    assert campaign.of_other_versions() == {"0.0.0": 1}
+    assert campaign.table()["error"][0] == "not run"
+
+
+def test_half_a_result_is_none(tmp_path: Path) -> None:
+    campaign = squares(tmp_path, x=[1])
+    path = campaign.path(campaign.cases[0])
+    path.parent.mkdir()
+    path.write_text('{"error": ""')
+    assert campaign.missing() == campaign.cases
+
+
+def test_a_worker_killed_costs_nothing(tmp_path: Path) -> None:
+    base = {"x": 0, "folder": str(tmp_path)}
+    campaign = Campaign("campaign_cases:dies_once", grid(base, x=list(range(6))), tmp_path / "out")
+    table = campaign.run()
+    assert (tmp_path / "died").exists()
+    assert list(table["x_again"]) == list(range(6))
+    assert table["error"].eq("").all()
+
+
+def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+    program = textwrap.dedent(f"""
+        import sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from pathlib import Path
+        from test_campaign import squares
+        if __name__ == "__main__":
+            squares(Path({str(tmp_path)!r}), x=list(range(8)), wait=[0.5]).run()
+    """)
+    script = tmp_path / "run.py"
+    script.write_text(program)
+    run = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
+    campaign = squares(tmp_path, x=list(range(8)), wait=[0.5])
+    while len(campaign.missing()) > 5:
+        assert run.poll() is None
+        time.sleep(0.05)
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    finished = {path: path.read_bytes() for path in (tmp_path / "cases").glob("*.json")}
+    left = len(campaign.missing())
+    assert 0 < left <= 5
+    assert campaign.run()["error"].eq("").all()
+    assert all(path.read_bytes() == content for path, content in finished.items())
