@@ -161,7 +161,7 @@ class Campaign:
             client.submit(_work, self.function, case, str(self.path(case)), pure=False): case
             for case in missing
         }
-        for future in as_completed(futures):
+        for future in as_completed(futures):  # type: ignore[no-untyped-call]
             if future.status == "error":
                 failure = f"{type(future.exception()).__name__}: {future.exception()}"
                 _store(self.path(futures[future]), futures[future], None, failure, 0.0)
