@@ -1,0 +1,90 @@
+"""The cellular part from a lattice, a polygon or a mask image: one specimen, one set of boxes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.hole_lattice import find_hole_lattice
+from modeharvest.idic.region import junction, region_of_lattice, region_of_mask, region_of_polygon
+from modeharvest.imaging.grid import PixelGrid
+
+SPECIMEN = Specimen(holes_x=4, holes_y=3)
+GRID = PixelGrid.centred(251, 401, 0.04)  # [mm/px]; room for the bulk all around
+
+
+def specimen_mask(grid: PixelGrid = GRID) -> NDArray[np.bool_]:
+    x, y = grid.x[None, :], grid.y[:, None]
+    width, height = SPECIMEN.half_size
+    mask = (abs(x) <= width) & (abs(y) <= height)
+    for cx, cy in SPECIMEN.hole_centres:
+        mask = mask & (np.hypot(x - cx, y - cy) > 0.5 * SPECIMEN.diameter)
+    return np.asarray(mask)
+
+
+def test_boxes_of_the_specimen_are_found() -> None:
+    mask = specimen_mask()
+    region = region_of_lattice(find_hole_lattice(mask), mask, GRID)
+    (a, b), (width, height) = SPECIMEN.cellular_half_size, SPECIMEN.half_size
+    px = GRID.pixel_size
+    np.testing.assert_allclose(astuple(region.cellular), (-a, a, -b, b), atol=0.1 * px)
+    np.testing.assert_allclose(astuple(region.domain), (-width, width, -height, height), atol=px)
+    expected = (SPECIMEN.bulk_x,) * 2 + (SPECIMEN.bulk_y,) * 2
+    np.testing.assert_allclose(region.margins, expected, atol=px)
+
+
+def test_all_three_ways_agree() -> None:
+    mask = specimen_mask()
+    by_lattice = region_of_lattice(find_hole_lattice(mask), mask, GRID)
+    by_polygon = region_of_polygon(by_lattice.polygon, mask, GRID)
+    by_mask = region_of_mask(by_lattice.inside(GRID), mask, GRID)
+    for other in (by_polygon, by_mask):
+        np.testing.assert_allclose(
+            astuple(other.cellular), astuple(by_lattice.cellular), atol=1.01 * GRID.pixel_size
+        )
+        assert other.domain == by_lattice.domain
+    a, b = SPECIMEN.cellular_half_size
+    share = by_lattice.inside(GRID).mean() * GRID.rows * GRID.cols * GRID.pixel_size**2
+    assert share == pytest.approx(4 * a * b, rel=0.01)
+
+
+def test_junction_lies_between_holes() -> None:
+    mask = specimen_mask()
+    x, y = junction(find_hole_lattice(mask), GRID)
+    nearest = np.linalg.norm(SPECIMEN.hole_centres - (x, y), axis=1).min()
+    assert nearest == pytest.approx(SPECIMEN.pitch / np.sqrt(2.0), rel=1e-3)
+
+
+def test_unseen_edges_have_no_margin() -> None:
+    grid = PixelGrid.centred(251, 201, 0.04)  # cuts both loaded edges off
+    mask = specimen_mask(grid)
+    corners = [(60, 30), (60, 170), (190, 170), (190, 30)]
+    region = region_of_polygon(corners, mask, grid)
+    np.testing.assert_array_equal(np.isnan(region.margins), [True, True, False, False])
+    assert "leaves the image at the left, right" in region.sentences[-1]
+
+
+def test_a_region_that_is_no_rectangle_is_told() -> None:
+    triangle = [(60.0, 60.0), (60.0, 340.0), (190.0, 60.0)]
+    region = region_of_polygon(triangle, specimen_mask(), GRID)
+    assert re.search(r"fills 5[01] % of its bounding box", region.sentences[1])  # rounding of px
+
+
+def test_bad_regions_are_refused() -> None:
+    mask = specimen_mask()
+    with pytest.raises(InputError, match="at least three corners"):
+        region_of_polygon([(0, 0), (1, 1)], mask, GRID)
+    with pytest.raises(InputError, match="inside the image of 251 x 401"):
+        region_of_polygon([(0, 0), (0, 500), (100, 0)], mask, GRID)
+    with pytest.raises(InputError, match=r"got 0\.0 % of it"):
+        region_of_polygon([(0, 0), (0, 10), (10, 0)], mask, GRID)
+    with pytest.raises(InputError, match="shape"):
+        region_of_mask(mask[:-1], mask, GRID)
+    with pytest.raises(InputError, match=r"got 0\.0 % of it"):
+        region_of_mask(np.zeros(GRID.shape), mask, GRID)
