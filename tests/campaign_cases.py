@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 
-def square(case: Mapping[str, Any]) -> dict[str, float]:
+def square(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     """Wait, tell on what process, fail where told to."""
     time.sleep(case["wait"])
     if case["x"] == case["bad"]:
@@ -18,9 +18,9 @@ def square(case: Mapping[str, Any]) -> dict[str, float]:
     return {"square": case["x"] ** 2, "process": os.getpid()}
 
 
-def dies_once(case: Mapping[str, Any]) -> dict[str, int]:
+def dies_once(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
     """Kill its own worker, -9, the first time that x is 2."""
-    mark = Path(case["folder"]) / "died"
+    mark = folder / "died"
     if case["x"] == 2 and not mark.exists():
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)

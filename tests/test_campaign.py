@@ -94,8 +94,8 @@ def test_half_a_result_is_none(tmp_path: Path) -> None:
 
 
 def test_a_worker_killed_costs_nothing(tmp_path: Path) -> None:
-    base = {"x": 0, "folder": str(tmp_path)}
-    campaign = Campaign("campaign_cases:dies_once", grid(base, x=list(range(6))), tmp_path / "out")
+    cases = grid({"x": 0}, x=list(range(6)))
+    campaign = Campaign("campaign_cases:dies_once", cases, tmp_path)
     table = campaign.run()
     assert (tmp_path / "died").exists()
     assert list(table["x_again"]) == list(range(6))

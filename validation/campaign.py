@@ -31,6 +31,7 @@ from modeharvest.progress import Progress, silent
 from modeharvest.stages import digest
 
 Case = Mapping[str, Any]
+CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
 
 _PATIENCE_S = 10.0
 """How long to wait for a scheduler that does not answer."""
@@ -69,10 +70,11 @@ class Campaign:
     Parameters
     ----------
     function
-        "package.module:name" of a function that takes a case and returns a mapping of plain
-        values, the row of the table.
+        "package.module:name" of a function that takes a case and the campaign's folder and
+        returns a mapping of plain values, the row of the table.
     cases
-        What to run it with; all have the same keys.
+        What to run it with; all have the same keys. What the function reads from the folder
+        belongs in them by a digest, so that a result is known to be of other inputs.
     folder
         Where the results go.
     """
@@ -158,7 +160,7 @@ class Campaign:
         from distributed import as_completed
 
         futures = {
-            client.submit(_work, self.function, case, str(self.path(case)), pure=False): case
+            client.submit(_work, self.function, case, str(self.folder), pure=False): case
             for case in missing
         }
         for future in as_completed(futures):  # type: ignore[no-untyped-call]
@@ -193,25 +195,26 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)
 
 
-def named(function: str) -> Callable[[Case], Mapping[str, Any]]:
+def named(function: str) -> CaseFunction:
     """The function that "package.module:name" stands for; InputError if there is none."""
     module, _, name = function.partition(":")
     try:
-        found: Callable[[Case], Mapping[str, Any]] = getattr(importlib.import_module(module), name)
+        found: CaseFunction = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(f"expected a function 'package.module:name', got {function!r}") from error
     return found
 
 
-def _work(function: str, case: Case, path: str) -> None:
+def _work(function: str, case: Case, folder: str) -> None:
     """Run one case in a worker and store what becomes of it."""
     begin = time.perf_counter()
     result, error = None, ""
     try:
-        result = dict(named(function)(case))
+        result = dict(named(function)(case, Path(folder)))
     except Exception:  # a case may fail in any way: that is its result
         error = traceback.format_exc()
-    _store(Path(path), case, result, error, time.perf_counter() - begin)
+    path = Campaign(function, (case,), Path(folder)).path(case)
+    _store(path, case, result, error, time.perf_counter() - begin)
 
 
 def _store(
