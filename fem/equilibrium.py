@@ -43,12 +43,15 @@ class Loading:
     tilt
         Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
         strain [rad]: -e tilt y is added to its u_x.
+    pins
+        Points (x, y) whose u_y is held [mm]; nodes have to be there.
     """
 
     half_width: float
     length: float
     edges: str = "clamped"
     tilt: float = 0.0
+    pins: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.edges not in EDGES:
@@ -129,7 +132,12 @@ class Structure:
                 (np.abs(x[0] + loading.half_width) < tolerance) & (np.abs(x[1]) < tolerance)
             )
 
-        held_y = on_edge if loading.edges == "clamped" else anchor
+        def held_y(x: FloatArray) -> NDArray[np.bool_]:
+            held = on_edge(x) if loading.edges == "clamped" else anchor(x)
+            for pin in loading.pins:
+                held |= np.hypot(x[0] - pin[0], x[1] - pin[1]) < tolerance
+            return held
+
         dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, held_y)
         if self.comm.allreduce(len(dofs_x)) == 0 or self.comm.allreduce(len(dofs_y)) == 0:
             raise InputError(

@@ -77,6 +77,9 @@ class Experiment:
         By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
         about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is
         not quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
+    guided
+        Hold u_y at the solid junctions on the line of mid-height, as pins in a straight rail
+        would; ``holes_y`` has to be even. Keeps a long specimen from bowing sideways.
     """
 
     specimen: Specimen = field(default_factory=Specimen)
@@ -88,6 +91,7 @@ class Experiment:
     imperfection: Imperfection = field(default_factory=Imperfection)
     path: PathOptions = field(default_factory=PathOptions)
     tilt: float = 0.0
+    guided: bool = False
 
     def __post_init__(self) -> None:
         strains = self.strains
@@ -110,6 +114,11 @@ class Experiment:
             raise InputError(
                 f"tilt: expected at most {_LARGEST_TILT} rad per nominal strain (0.0137 is 0.1 "
                 f"degrees at 12.7 %), got {self.tilt}"
+            )
+        if self.guided and self.specimen.holes_y % 2:
+            raise InputError(
+                "guided: expected an even holes_y, so that there are solid junctions at "
+                f"mid-height, got {self.specimen.holes_y}"
             )
 
     @property

@@ -39,7 +39,8 @@ def simulate(
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
-    loading = Loading(spec.half_size[0], spec.length, experiment.edges, experiment.tilt)
+    pins = spec.mid_junctions if experiment.guided else ()
+    loading = Loading(spec.half_size[0], spec.length, experiment.edges, experiment.tilt, pins)
     structure = Structure(mesh, experiment.material, loading, comm)
     return _Run(experiment, mesh, Walker(structure, experiment.path, progress)).solution()
 
@@ -168,7 +169,12 @@ class _Run:
         return {
             "specimen": asdict(e.specimen),
             "material": {"kind": type(e.material).__name__, **vars(e.material)},
-            "loading": {"edges": e.edges, "length_mm": e.specimen.length, "tilt_rad": e.tilt},
+            "loading": {
+                "edges": e.edges,
+                "length_mm": e.specimen.length,
+                "tilt_rad": e.tilt,
+                "guided": e.guided,
+            },
             "mesh_size_mm": e.mesh_size,
             "imperfection": asdict(e.imperfection),
             "critical": None if critical is None else self._critical_info(critical),

@@ -96,6 +96,12 @@ class Specimen:
         """(holes_x * holes_y,) diameters of the holes [mm], in the order of ``hole_centres``."""
         return self.diameter + self.hole_centres @ [self.grading_x, self.grading_y]
 
+    @property
+    def mid_junctions(self) -> tuple[tuple[float, float], ...]:
+        """Corners (x, 0) of the unit cells between the holes [mm], on the line of mid-height."""
+        x = (np.arange(1, self.holes_x) - 0.5 * self.holes_x) * self.pitch
+        return tuple((float(at), 0.0) for at in x)
+
     def pattern(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The square lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
 

@@ -103,3 +103,33 @@ def test_tilt_follows_the_one_natural_path() -> None:
 def test_absurd_tilt_is_refused(tilt: float) -> None:
     with pytest.raises(InputError, match="tilt: expected at most"):
         Experiment(tilt=tilt)
+
+
+def test_guide_holds_the_junctions_at_mid_height_and_nothing_else() -> None:
+    guided = simulate(Experiment(SMALL, strains=(0.1,), mesh_size=0.5, tilt=0.2, guided=True))
+    free = simulate(Experiment(SMALL, strains=(0.1,), mesh_size=0.5, tilt=0.2))
+    x, y = guided.mesh.nodes.T
+    u, without = guided.at(0.1).displacement, free.at(0.1).displacement
+    held = np.zeros(x.size, dtype=np.bool_)
+    for junction in (-SMALL.pitch, 0.0, SMALL.pitch):
+        held |= np.hypot(x - junction, y) < 1e-9
+    assert held.sum() == 3
+    np.testing.assert_array_equal(u[held, 1], 0.0)
+    assert np.abs(without[held, 1]).min() > 1e-4
+    assert np.ptp(u[held, 0]) > 0.1  # free to move along the rail
+    assert guided.at(0.1).energy > free.at(0.1).energy
+
+
+def test_guide_leaves_a_symmetric_path_as_it_is() -> None:
+    """Before buckling u_y vanishes at mid-height by itself."""
+    guided, free = (
+        simulate(Experiment(SMALL, strains=(0.08,), mesh_size=0.5, guided=g)).at(0.08)
+        for g in (True, False)
+    )
+    np.testing.assert_allclose(guided.displacement, free.displacement, atol=1e-9)
+    assert guided.reaction == pytest.approx(free.reaction, rel=1e-9)
+
+
+def test_guide_needs_junctions_at_mid_height() -> None:
+    with pytest.raises(InputError, match="guided: expected an even holes_y"):
+        Experiment(Specimen(4, 3), guided=True)

@@ -61,8 +61,9 @@ class Case(CaseModel):
         """The case as plain JSON values, materials by their kind."""
         content = {name: plain(getattr(self, name)) for name in type(self).model_fields}
         content["experiment"]["material"] = kind_of(self.experiment.material, MATERIALS)
-        if self.experiment.tilt == 0.0:  # as before there was any: finished stages stay finished
-            del content["experiment"]["tilt"]
+        for name in ("tilt", "guided"):  # as before there were any: what is finished stays so
+            if not content["experiment"][name]:
+                del content["experiment"][name]
         return content
 
 
