@@ -112,8 +112,9 @@ def shape_gradients(name: str, xi: ArrayLike) -> FloatArray:
 
 def polynomials(name: str, cells: IntArray, nodal: FloatArray) -> FloatArray:
     """(m, c, 9) coefficients, over each cell (m, k), of a nodal field (n, c)."""
-    per_cell = nodal[cells].transpose(0, 2, 1)
-    return np.ascontiguousarray(per_cell @ reference_element(name).coefficients.T)
+    per_cell = np.ascontiguousarray(nodal[cells].transpose(0, 2, 1), dtype=np.float64)
+    flat = per_cell.reshape(-1, cells.shape[1]) @ reference_element(name).coefficients.T
+    return flat.reshape(len(cells), nodal.shape[1], 9)
 
 
 def lattice(triangular: bool, degree: int) -> FloatArray:

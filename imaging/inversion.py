@@ -1,10 +1,9 @@
 """Compiled kernels: the inverse of one element's map, (row, col) to (xi, eta).
 
 Two ways. A batch of pixels runs through Newton's method in step, a loop without branches that
-the compiler turns into vector instructions; it starts from a series of second order, and what
-it gives is checked pixel by pixel. Where that fails, an exhaustive search takes over: the
-element is halved until the Bézier control points' box of a part can't hold the pixel or
-Newton's method finds it.
+the compiler turns into vector instructions; what it gives is checked pixel by pixel. Where that
+fails, an exhaustive search takes over: the element is halved until the Bézier control points'
+box of a part can't hold the pixel or Newton's method finds it.
 
 Coordinates are (row, col) in px relative to a whole pixel near the element's centre.
 """
@@ -77,40 +76,14 @@ def invert(
     t: FloatArray,
     count: int,
 ) -> None:
-    """Solve position(s, t) = (row, col) for the first ``count`` pixels; s, t may be wrong."""
+    """Solve position(s, t) = (row, col) for the first ``count`` pixels from the start in s, t.
+
+    What it gives may be wrong.
+    """
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
-    _series(a, b, 1.0 / 3.0 if triangular else 0.0, row, col, s, t, count)
     for _ in range(_BATCH_STEPS):
         if _step(a, b, not triangular, row, col, s, t, count) <= _NEARLY_PX**2:
             break
-
-
-@compiled(relaxed=True)
-def _series(
-    a: Coefficients,
-    b: Coefficients,
-    middle: float,
-    row: FloatArray,
-    col: FloatArray,
-    s: FloatArray,
-    t: FloatArray,
-    count: int,
-) -> None:
-    """Start from the inverse's series of second order about the middle.
-
-    The terms of higher degree don't count there: a triangle has none, a square's middle is 0.
-    """
-    p, p_s, p_t = value_and_slopes(a, False, middle, middle)
-    q, q_s, q_t = value_and_slopes(b, False, middle, middle)
-    inverse = 1.0 / (p_s * q_t - p_t * q_s)
-    p_s, p_t, q_s, q_t = p_s * inverse, p_t * inverse, q_s * inverse, q_t * inverse
-    for k in range(count):
-        dp, dq = row[k] - p, col[k] - q
-        ds, dt = q_t * dp - p_t * dq, p_s * dq - q_s * dp
-        dp = ds * (ds * a[3] + dt * a[4]) + dt * dt * a[5]
-        dq = ds * (ds * b[3] + dt * b[4]) + dt * dt * b[5]
-        s[k] = middle + ds - (q_t * dp - p_t * dq)
-        t[k] = middle + dt - (p_s * dq - q_s * dp)
 
 
 @compiled(relaxed=True)

@@ -8,14 +8,15 @@ shows a violation or every part is proved. Only then is the element's map one to
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.elements import (
     bernstein,
     lattice,
     monomial_gradients,
-    polynomials,
     reference_element,
     to_bernstein,
 )
@@ -48,19 +49,25 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     triangular = reference_element(element).triangular
     degree = 2 if triangular else 3
     points = lattice(triangular, degree)
-    slopes = monomial_gradients(points).transpose(1, 2, 0).reshape(9, -1)
-    jacobians = polynomials(element, cells, positions).reshape(-1, 9) @ slopes
-    (x_s, x_t), (y_s, y_t) = jacobians.reshape(len(cells), 2, 2, -1).transpose(1, 2, 0, 3)
+    slopes = np.ascontiguousarray(monomial_gradients(points).transpose(2, 0, 1))
     convert = to_bernstein(triangular, degree)
-    coefficients = (x_s * y_t - x_t * y_s) @ convert.T
+    shape_slopes = slopes @ reference_element(element).coefficients
+    positions = np.ascontiguousarray(positions, dtype=np.float64)
+    all_coefficients = np.empty((len(cells), len(points)))
+    proved = np.empty(len(cells), dtype=np.bool_)
+    _prove(positions, np.ascontiguousarray(cells), shape_slopes, convert, all_coefficients, proved)
+    if proved.all():
+        return np.empty(0, dtype=np.int64)
+    unproved = np.flatnonzero(~proved)
+    coefficients = all_coefficients[unproved]
     corners = _corners(triangular, degree)
     split = np.stack(
         [convert @ bernstein(triangular, degree, s[:2] + s[2] * points)
          for s in sub_elements(triangular)]
     )  # fmt: skip
-    owner = np.arange(len(cells))
+    owner = np.arange(len(unproved))
     threshold = _ROUNDING * np.abs(coefficients).max(axis=1)
-    bad = np.zeros(len(cells), dtype=np.bool_)
+    bad = np.zeros(len(unproved), dtype=np.bool_)
     for _ in range(_DEEPEST):
         positive = coefficients > threshold[owner, None]  # False for NaN
         bad[owner[~positive[:, corners].all(axis=1)]] = True
@@ -72,7 +79,48 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
         owner = np.repeat(owner[open_], 4)
     else:
         bad[owner] = True  # zero to within what can be told
-    return np.flatnonzero(bad)
+    return unproved[bad]
+
+
+@compiled(parallel=True)
+def _prove(
+    positions: FloatArray,
+    cells: IntArray,
+    slopes: FloatArray,
+    convert: FloatArray,
+    coefficients: FloatArray,
+    proved: BoolArray,
+) -> None:
+    """Bernstein coefficients of every determinant, and whether all are positive.
+
+    ``slopes`` (2, q, k): derivatives of the shape functions at the lattice's points.
+    """
+    for e in prange(len(cells)):
+        proved[e] = _prove_one(positions, cells[e], slopes, convert, coefficients[e])
+
+
+@compiled(relaxed=True)
+def _prove_one(
+    positions: FloatArray,
+    cell: IntArray,
+    slopes: FloatArray,
+    convert: FloatArray,
+    coefficients: FloatArray,
+) -> bool:
+    coefficients[:] = 0.0
+    for q in range(slopes.shape[1]):
+        x_s, x_t, y_s, y_t = 0.0, 0.0, 0.0, 0.0
+        for a in range(cell.size):
+            x, y = positions[cell[a], 0], positions[cell[a], 1]
+            x_s += slopes[0, q, a] * x
+            x_t += slopes[1, q, a] * x
+            y_s += slopes[0, q, a] * y
+            y_t += slopes[1, q, a] * y
+        determinant = x_s * y_t - x_t * y_s
+        for p in range(coefficients.size):
+            coefficients[p] += convert[p, q] * determinant
+    size = np.abs(coefficients).max()
+    return bool(np.all(coefficients > _ROUNDING * size))  # False for NaN
 
 
 def require_positive_jacobian(

@@ -1,13 +1,12 @@
-"""Compiled kernels: which element covers a pixel, and a field at located pixels.
+"""Compiled kernels: which element covers a pixel, and fields there.
 
 The image is cut into bands of rows. A band visits, in ascending order, the elements that reach
 into it, and writes its own pixels only: no races, and the same result for any number of
-threads. Within an element, a row's pixels are limited to the convex hull of the Bézier control
-points, which holds the whole element however curved it is. They are collected over the rows and
-inverted together.
+threads. Within an element, a row's pixels are limited to those between its two ends on the
+element's sides, however curved. They are collected over the rows and inverted together.
 
-Coordinates are (row, col) in px relative to the element's ``centre``, a whole number of pixels,
-so rounding is that of the element's size and not of the image's.
+Coordinates are (row, col) in px relative to the element's centre, a whole number of pixels, so
+rounding is that of the element's size and not of the image's.
 """
 
 from __future__ import annotations
@@ -28,6 +27,8 @@ from modeharvest.imaging.inversion import (
     search,
     value,
 )
+from modeharvest.imaging.layout import Elements, proved_reach
+from modeharvest.imaging.scanline import ends, start_affine, start_cubic
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,229 +37,251 @@ BoolArray = NDArray[np.bool_]
 BAND = 32  # rows
 _BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache
 _CLEAR_OF_EDGES = 1e-6  # in xi, eta; pixels on an edge come out within some 1e-9
-_NOT_WANTED = 2**31 - 1
+_MARGIN_PX = 1e-3  # beyond a row's ends; these are found much more closely
 
-
-class Elements(NamedTuple):
-    """A mesh as the kernels see it: m elements.
-
-    polynomials : (m, 2, 9) (row, col) relative to the centre [px].
-    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
-    hulls : (m, p, 2) Bézier control points (row, col) relative to the centre [px].
-    centres : (m, 2) whole pixels (row, col).
-    reach : (m,) how far beyond the element's edges its map is one to one, in (xi, eta).
-    row_from, row_to : (m,) the image rows row_from ... row_to - 1 may hold pixels of it.
-    bezier : (p, 9) from polynomials to control points.
-    quarters : (4, 3) sub-elements.
-    triangular : triangles or quadrilaterals.
-    """
-
-    polynomials: FloatArray
-    absolute: FloatArray
-    hulls: FloatArray
-    centres: FloatArray
-    reach: FloatArray
-    row_from: IntArray
-    row_to: IntArray
-    bezier: FloatArray
-    quarters: FloatArray
-    triangular: bool
+_NOBODYS, _ON_EDGE, _INSIDE, _TWICE, _NOT_WANTED = 0, 1, 2, 3, 4
 
 
 class Pixels(NamedTuple):
-    """What is found, over the pixels in the order of memory.
+    """What is found, over some rows of an image, pixels in the order of memory.
 
-    element : (rows * cols,) int32 element, -1 where none is.
-    xi : (rows * cols, 2) local coordinates, NaN where no element is.
-    residual : (rows * cols,) float32 [px], NaN where no element is.
-    cols : how many a row.
-    x0, y0, pixel_size : of the grid [mm].
+    element : (n,) int32 element, -1 where none is.
+    values : (c, n) fields at the pixels, NaN where no element is.
+    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted.
+    first_row : of these pixels in the image.
+    cols : pixels a row.
+    x0, y0, pixel_size : of the image's grid [mm].
     """
 
     element: NDArray[np.int32]
-    xi: FloatArray
+    values: FloatArray
     residual: NDArray[np.float32]
+    first_row: int
     cols: int
     x0: float
     y0: float
     pixel_size: float
 
 
+class Batch(NamedTuple):
+    """Pixels of one element on their way through the kernels: arrays of equal length.
+
+    row, col : relative to the element's centre [px].
+    s, t : local coordinates.
+    off : squared residual in the kernels' own coordinates [px^2].
+    residual : distance in the physical plane, by the nodes' own coordinates [px].
+    where : place among the pixels.
+    """
+
+    row: FloatArray
+    col: FloatArray
+    s: FloatArray
+    t: FloatArray
+    off: FloatArray
+    residual: FloatArray
+    where: IntArray
+
+
 @compiled(parallel=True)
 def rasterise(
     elements: Elements,
+    fields: FloatArray,
     pixels: Pixels,
     wanted: BoolArray,
-    visit_start: IntArray,
+    start: IntArray,
     visits: IntArray,
     order: IntArray,
 ) -> int:
-    """Fill ``pixels``, and count those that lie inside more than one element.
+    """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
 
-    ``wanted`` (rows * cols,) tells where to look, everywhere if it is empty.
-    ``visits[visit_start[b]:visit_start[b + 1]]`` are the elements of band b, ascending;
-    ``order`` is that of the bands.
+    ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
+    the local coordinates. ``wanted`` (n,) tells where to look, everywhere if it is empty. The
+    elements of band b are ``visits[start[b]:start[b + 1]]``; ``order`` is that of the bands.
     """
+    rows = pixels.element.size // pixels.cols
     twice = 0
     for i in prange(order.size):
-        band = order[i]
-        twice += _fill_band(
-            elements, pixels, wanted, visits[visit_start[band] : visit_start[band + 1]], band
-        )
+        top = order[i] * BAND
+        visited = visits[start[order[i]] : start[order[i] + 1]]
+        twice += fill(elements, fields, pixels, wanted, visited, top, min(top + BAND, rows))
     return twice
 
 
 @compiled()
-def _fill_band(
-    elements: Elements, pixels: Pixels, wanted: BoolArray, visits: IntArray, band: int
+def fill(
+    elements: Elements,
+    fields: FloatArray,
+    pixels: Pixels,
+    wanted: BoolArray,
+    visited: IntArray,
+    top: int,
+    bottom: int,
 ) -> int:
-    cols = pixels.cols
-    rows = pixels.element.size // cols
-    top, bottom = band * BAND, min((band + 1) * BAND, rows)
-    for at in range(top * cols, bottom * cols):
-        pixels.element[at] = -1 if wanted.size == 0 or wanted[at] else _NOT_WANTED
-    again = np.zeros((bottom - top) * cols, dtype=np.bool_)
-    work, where = np.empty((6, _BATCH)), np.empty(_BATCH, dtype=np.int64)
-    for e in visits:
+    """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many are covered twice."""
+    begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
+    state = np.zeros(end - begin, dtype=np.uint8)
+    if wanted.size:
+        for k in range(end - begin):
+            if not wanted[top * pixels.cols + k]:
+                state[k] = _NOT_WANTED
+    real = np.empty((6, _BATCH))
+    batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
+                  np.empty(_BATCH, dtype=np.int64))  # fmt: skip
+    for e in visited:
         first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
-        _fill_element(elements, pixels, e, first, last, again, top * cols, work, where)
-    for at in range(top * cols, bottom * cols):
-        if pixels.element[at] == _NOT_WANTED:
-            pixels.element[at] = -1
-        if pixels.element[at] < 0:
-            pixels.xi[at, 0] = pixels.xi[at, 1] = np.nan
-            pixels.residual[at] = np.nan
-    return np.count_nonzero(again)
+        _fill_element(
+            elements, fields, pixels, e, first, last, wanted.size > 0, state, begin, batch
+        )
+    twice = 0
+    for k in range(end - begin):
+        if state[k] == _NOBODYS or state[k] == _NOT_WANTED:
+            pixels.element[begin + k] = -1
+            for field in range(pixels.values.shape[0]):
+                pixels.values[field, begin + k] = np.nan
+            if pixels.residual.size:
+                pixels.residual[begin + k] = np.nan
+        elif state[k] == _TWICE:
+            twice += 1
+    return twice
 
 
 @compiled()
 def _fill_element(
     elements: Elements,
+    fields: FloatArray,
     pixels: Pixels,
     e: int,
     first: int,
     last: int,
-    again: BoolArray,
-    band_start: int,
-    work: FloatArray,
-    where: IntArray,
+    picky: bool,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
 ) -> None:
     """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
-    cols = pixels.cols
-    hull = elements.hulls[e]
-    centre_row, centre_col = elements.centres[e]
-    row, col = work[0], work[1]
+    centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     count = 0
     for image_row in range(first, last):
-        low, high = _row_range(hull, image_row - centre_row)
-        if low > high:
+        low, high = ends(elements.sides[e], elements.corners, float(image_row - centre_row))
+        if not low[0] <= high[0]:
             continue
-        from_col = max(0, int(np.ceil(low - 1e-9 + centre_col)))
-        to_col = min(cols - 1, int(np.floor(high + 1e-9 + centre_col)))
-        for image_col in range(from_col, to_col + 1):
-            at = image_row * cols + image_col
-            if pixels.element[at] == _NOT_WANTED:
-                continue
+        col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
+        past = min(pixels.cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
+        row_begin = (image_row - pixels.first_row) * pixels.cols
+        while col < past:
             if count == _BATCH:
-                _claim(elements, pixels, e, again, band_start, work, where, count)
+                _claim(elements, fields, pixels, e, state, begin, batch, count)
                 count = 0
-            row[count], col[count] = image_row - centre_row, image_col - centre_col
-            where[count] = at
-            count += 1
-    _claim(elements, pixels, e, again, band_start, work, where, count)
+            stop = min(past, col + _BATCH - count)
+            if picky:
+                while col < stop and state[row_begin + col - begin] == _NOT_WANTED:
+                    col += 1
+                until = col
+                while until < stop and state[row_begin + until - begin] != _NOT_WANTED:
+                    until += 1
+                stop = until
+            n = stop - col
+            row, col_from = float(image_row - centre_row), float(col - centre_col)
+            s, t = batch.s[count : count + n], batch.t[count : count + n]
+            if elements.affine[e]:
+                start_affine(elements.polynomials[e], row, col_from, s, t)
+            else:
+                start_cubic(
+                    elements.polynomials[e], not elements.triangular, low, high, col_from, s, t
+                )
+            for k in range(n):
+                batch.row[count + k] = row
+                batch.col[count + k] = col_from + k
+                batch.where[count + k] = row_begin + col + k
+            count += n
+            col = stop
+    _claim(elements, fields, pixels, e, state, begin, batch, count)
 
 
 @compiled()
 def _claim(
     elements: Elements,
+    fields: FloatArray,
     pixels: Pixels,
     e: int,
-    again: BoolArray,
-    band_start: int,
-    work: FloatArray,
-    where: IntArray,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
     count: int,
 ) -> None:
     """Invert a batch; claim those of its pixels that are inside and nobody's yet."""
-    triangular = elements.triangular
-    row, col, s, t, off, residual = work[0], work[1], work[2], work[3], work[4], work[5]
-    polynomial, absolute = elements.polynomials[e], elements.absolute[e]
-    invert(polynomial, triangular, row, col, s, t, count)
-    centre_row, centre_col = elements.centres[e]
-    h = pixels.pixel_size
-    start = (pixels.y0 - h * centre_row, pixels.x0 + h * centre_col, h)
-    _check(polynomial, absolute, not triangular, row, col, s, t, start, off, residual, count)
+    if not elements.affine[e]:
+        invert(elements.polynomials[e], elements.triangular, batch.row, batch.col, batch.s, batch.t,
+               count)  # fmt: skip
+    _check(elements, pixels, e, batch, 0, count)
+    reach = np.inf if elements.affine[e] else np.nan  # it is proved when first needed
+    claimed = 0
     for k in range(count):
-        at = where[k]
-        depth = -outside(triangular, s[k], t[k])
-        converged = off[k] <= ACCEPTED_PX**2
-        if not converged or (depth < -ON_EDGE and depth <= -elements.reach[e]):
+        depth = -outside(elements.triangular, batch.s[k], batch.t[k])
+        if depth < -ON_EDGE and np.isnan(reach):
+            reach = proved_reach(elements.polynomials[e], elements.slopes, elements.middle)
+        if batch.off[k] > ACCEPTED_PX**2 or (depth < -ON_EDGE and depth <= -reach):
             # A root found outside, where the map is still one to one, is the only one; here
             # there may be another inside.
-            found, s[k], t[k] = search(
-                polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
-            )
+            found, batch.s[k], batch.t[k] = search(
+                elements.polynomials[e], elements.bezier, elements.quarters, elements.triangular,
+                batch.row[k], batch.col[k],
+            )  # fmt: skip
             if not found:
                 continue
-            depth = -outside(triangular, s[k], t[k])
-            _check(polynomial, absolute, not triangular, row[k:], col[k:], s[k:], t[k:], start,
-                   off[k:], residual[k:], 1)  # fmt: skip
+            depth = -outside(elements.triangular, batch.s[k], batch.t[k])
+            _check(elements, pixels, e, batch, k, k + 1)
         if depth < -ON_EDGE:
             continue
-        if pixels.element[at] < 0:
+        at = batch.where[k]
+        if state[at - begin] == _NOBODYS:
+            state[at - begin] = _INSIDE if depth > _CLEAR_OF_EDGES else _ON_EDGE
             pixels.element[at] = e
-            pixels.xi[at, 0] = s[k]
-            pixels.xi[at, 1] = t[k]
-            pixels.residual[at] = residual[k]
-        elif depth > _CLEAR_OF_EDGES:
-            owner_depth = -outside(triangular, pixels.xi[at, 0], pixels.xi[at, 1])
-            again[at - band_start] |= owner_depth > _CLEAR_OF_EDGES
+            if pixels.residual.size:
+                pixels.residual[at] = batch.residual[k]
+            batch.where[claimed], batch.s[claimed], batch.t[claimed] = at, batch.s[k], batch.t[k]
+            claimed += 1
+        elif depth > _CLEAR_OF_EDGES and state[at - begin] == _INSIDE:
+            state[at - begin] = _TWICE
+    _write(elements, fields, pixels, e, batch, claimed)
 
 
 @compiled(relaxed=True)
-def _check(
-    polynomial: FloatArray,
-    absolute: FloatArray,
-    curved: bool,
-    row: FloatArray,
-    col: FloatArray,
-    s: FloatArray,
-    t: FloatArray,
-    start: tuple[float, float, float],
-    off: FloatArray,
-    residual: FloatArray,
-    count: int,
+def _check(elements: Elements, pixels: Pixels, e: int, batch: Batch, first: int, last: int) -> None:
+    """Compute the residuals of the pixels ``first`` ... ``last`` - 1 of a batch, two ways."""
+    curved = not elements.triangular
+    a = coefficients(elements.polynomials[e, 0])
+    b = coefficients(elements.polynomials[e, 1])
+    for k in range(first, last):
+        p = value(a, curved, batch.s[k], batch.t[k]) - batch.row[k]
+        q = value(b, curved, batch.s[k], batch.t[k]) - batch.col[k]
+        batch.off[k] = p * p + q * q
+    if not pixels.residual.size:
+        return
+    x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
+    h = pixels.pixel_size
+    y0, x0 = pixels.y0 - h * elements.centres[e, 0], pixels.x0 + h * elements.centres[e, 1]
+    for k in range(first, last):
+        down = y0 - h * batch.row[k] - value(y, curved, batch.s[k], batch.t[k])
+        right = x0 + h * batch.col[k] - value(x, curved, batch.s[k], batch.t[k])
+        batch.residual[k] = np.sqrt(down * down + right * right) / h
+
+
+@compiled(relaxed=True)
+def _write(
+    elements: Elements, fields: FloatArray, pixels: Pixels, e: int, batch: Batch, count: int
 ) -> None:
-    """Compute the residuals of the first ``count`` pixels, two ways.
-
-    ``off`` is squared, by the kernel's own coordinates [px^2]; ``residual`` is the distance in
-    the physical plane, by the nodes' own [px].
-    """
-    a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
-    x, y = coefficients(absolute[0]), coefficients(absolute[1])
-    y0, x0, h = start
-    for k in range(count):
-        p = value(a, curved, s[k], t[k]) - row[k]
-        q = value(b, curved, s[k], t[k]) - col[k]
-        off[k] = p * p + q * q
-        down = y0 - h * row[k] - value(y, curved, s[k], t[k])
-        right = x0 + h * col[k] - value(x, curved, s[k], t[k])
-        residual[k] = np.sqrt(down * down + right * right) / h
-
-
-@compiled()
-def _row_range(hull: FloatArray, row: float) -> tuple[float, float]:
-    """Find the least and greatest column of the control points' hull on an image row."""
-    low, high = np.inf, -np.inf
-    for i in range(hull.shape[0]):
-        if abs(hull[i, 0] - row) < 1e-9:
-            low, high = min(low, hull[i, 1]), max(high, hull[i, 1])
-        for j in range(i):
-            if (hull[i, 0] - row) * (hull[j, 0] - row) < 0.0:
-                part = (row - hull[i, 0]) / (hull[j, 0] - hull[i, 0])
-                col = hull[i, 1] + part * (hull[j, 1] - hull[i, 1])
-                low, high = min(low, col), max(high, col)
-    return low, high
+    """Write the fields, or the local coordinates, at the first ``count`` pixels of a batch."""
+    if fields.shape[1] == 0:
+        for k in range(count):
+            pixels.values[0, batch.where[k]] = batch.s[k]
+            pixels.values[1, batch.where[k]] = batch.t[k]
+        return
+    curved = not elements.triangular
+    for field in range(fields.shape[1]):
+        a = coefficients(fields[e, field])
+        for k in range(count):
+            pixels.values[field, batch.where[k]] = value(a, curved, batch.s[k], batch.t[k])
 
 
 @compiled(parallel=True, relaxed=True)
@@ -269,7 +292,10 @@ def evaluate(
     xi: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols)."""
+    """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols).
+
+    ``xi`` (rows, cols, 2) may lie in memory in any order.
+    """
     cols = element.shape[1]
     for row in prange(element.shape[0]):
         begin = 0
@@ -286,24 +312,3 @@ def evaluate(
                     for col in range(begin, end):
                         out[k, row, col] = value(a, curved, xi[row, col, 0], xi[row, col, 1])
             begin = end
-
-
-@compiled()
-def bands(row_from: IntArray, row_to: IntArray, rows: int) -> tuple[IntArray, IntArray]:
-    """(visit_start, visits): for each band of rows the elements that reach into it."""
-    count = (rows + BAND - 1) // BAND
-    start = np.zeros(count + 1, dtype=np.int64)
-    for e in range(row_from.size):
-        if row_to[e] > row_from[e]:
-            for b in range(row_from[e] // BAND, (row_to[e] - 1) // BAND + 1):
-                start[b + 1] += 1
-    for b in range(count):
-        start[b + 1] += start[b]
-    visits = np.empty(start[-1], dtype=np.int64)
-    cursor = start[:-1].copy()
-    for e in range(row_from.size):
-        if row_to[e] > row_from[e]:
-            for b in range(row_from[e] // BAND, (row_to[e] - 1) // BAND + 1):
-                visits[cursor[b]] = e
-                cursor[b] += 1
-    return start, visits

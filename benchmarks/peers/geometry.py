@@ -12,7 +12,7 @@ import riley_side
 from laps import in_turn, use_threads
 from meshes import ELEMENTS, Scene, aligned, bulged, specimen
 
-from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.isoparametric import locate, map_back
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:
@@ -40,20 +40,19 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
     nodes, mesh = scene.mesh.nodes, scene.mesh
     three = np.column_stack([nodes, np.ones(len(nodes))])
 
-    def map_back() -> Any:
-        located = locate(scene.deformed, mesh.cells, mesh.element, scene.grid)
-        return located, interpolate(located, mesh.cells, mesh.element, nodes)
-
     laps = in_turn(
         {
             "locate": lambda: locate(scene.deformed, mesh.cells, mesh.element, scene.grid),
-            "locate and interpolate": map_back,
+            "map back": lambda: map_back(
+                scene.deformed, mesh.cells, mesh.element, scene.grid, nodes
+            ),
             "riley, three fields": riley_side.nodal(scene, three, options["threads"]),
             "riley, one field": riley_side.nodal(scene, nodes[:, :1], options["threads"]),
         },
         options["laps"],
     )
-    (located, point), theirs = laps["locate and interpolate"].result, laps["riley, three fields"]
+    located, ours = laps["locate"].result, laps["map back"].result
+    theirs = laps["riley, three fields"].result
     return {
         "mesh": scene.name,
         "element": mesh.element,
@@ -62,7 +61,7 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
         "threads": options["threads"],
         "seconds": {name: lap.median_s for name, lap in laps.items()},
         "first_s": {name: lap.first_s for name, lap in laps.items()},
-        **compare(scene, located.mask, point, theirs.result),
+        **compare(scene, located.mask, ours.values, theirs),
         "residual_px": located.max_residual_px,
     }
 
@@ -98,7 +97,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
     ]
     for row in found.values():
         speed = {name: row["material_px"] / s / 1e6 for name, s in row["seconds"].items()}
-        both, three = speed["locate and interpolate"], speed["riley, three fields"]
+        both, three = speed["map back"], speed["riley, three fields"]
         lines.append(
             f"| {row['element']}, {row['mesh']}, {row['cells']} cells "
             f"| {row['shape'][0]} × {row['shape'][1]}, {row['material_px'] / 1e6:.2f} Mpx "
