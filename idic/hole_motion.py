@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RBFInterpolator
 
 from modeharvest.errors import InputError
 from modeharvest.idic.hole_lattice import HoleLattice
@@ -56,6 +57,16 @@ class HoleMotion:
         x, y = grid.to_mm(self.before[:, 0], self.before[:, 1])
         x2, y2 = grid.to_mm(self.after[:, 0], self.after[:, 1])
         return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+
+    def at(self, points: ArrayLike) -> FloatArray:
+        """Where positions (n, 2) (row, col) of the reference have moved to, from the holes around.
+
+        Between the holes the displacement is interpolated by linear radial functions and a plane
+        [px].
+        """
+        where = np.asarray(points, dtype=np.float64)
+        between = RBFInterpolator(self.before, self.after - self.before, kernel="linear", degree=1)
+        return np.asarray(where + between(where))
 
     def affine(self) -> tuple[FloatArray, FloatArray]:
         """Fit (offset, matrix): after = offset + before @ matrix, in (row, col) [px]."""

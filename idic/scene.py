@@ -1,0 +1,182 @@
+"""Whether two images show the same surface, from small blocks searched for in the other image.
+
+Blocks of the reference are looked for where they should have moved to, and as a comparison
+where they surely are not. If they correlate no better in the first place, the reference is not
+the reference, or the motion is larger than expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_cdt
+from skimage.feature import match_template
+
+from modeharvest.errors import InputError
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Expected = Callable[[FloatArray], FloatArray]
+"""From (n, 2) (row, col) in the reference to (n, 2) (row, col) in the deformed image [px]."""
+
+BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
+"""About so many blocks of such an edge, smaller where ligaments are too narrow for it."""
+REACH_PX = 24
+"""A block may be so far from where it is expected, along rows and along columns."""
+_SAME = 0.5
+"""Share of blocks that must be found."""
+_CLEAR = 0.1
+"""By how much a correlation must exceed what chance gives."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMatch:
+    """Blocks of the reference, found in the deformed image or not.
+
+    Parameters
+    ----------
+    before, after
+        (n, 2) block centres in the reference and where they correlate best, (row, col) whole
+        pixels.
+    correlation
+        (n,) normalised cross-correlation there [-].
+    chance
+        Correlation that 95 % of the blocks stay below where they can't be [-].
+    block_px
+        Edge of a block [px].
+    """
+
+    before: FloatArray
+    after: FloatArray
+    correlation: FloatArray
+    chance: float
+    block_px: int
+
+    @property
+    def found(self) -> BoolArray:
+        """(n,) whether a block correlates clearly better than by chance."""
+        return np.asarray(self.correlation > self.chance + _CLEAR * (1.0 - self.chance))
+
+    @property
+    def share(self) -> float:
+        """Share of blocks that were found [-]."""
+        return float(self.found.mean())
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the images show the same surface."""
+        return self.share >= _SAME
+
+    @property
+    def sentence(self) -> str:
+        """What was found."""
+        return (
+            f"{int(self.found.sum())} of {len(self.found)} blocks of {self.block_px} px of the "
+            f"reference were found in the deformed image (median correlation "
+            f"{np.median(self.correlation):.2f}, by chance up to {self.chance:.2f})."
+        )
+
+
+def compare_scenes(
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    mask: ArrayLike | None = None,
+    expected: Expected | None = None,
+    reach_px: int = REACH_PX,
+) -> SceneMatch:
+    """Look for blocks of the reference in the deformed image.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
+    expected
+        Where positions should have moved to, as ``HoleMotion.at`` says it; nowhere by default.
+    reach_px
+        How far from there a block is searched for, along rows and columns [px].
+
+    Raises
+    ------
+    InputError
+        If the images' sizes differ or there is no room for blocks.
+    """
+    f, g = np.asarray(reference, dtype=np.float32), np.asarray(deformed, dtype=np.float32)
+    if f.ndim != 2 or f.shape != g.shape:
+        raise InputError(f"expected two images of one size, got {f.shape} and {g.shape}")
+    material = np.ones(f.shape, dtype=np.bool_) if mask is None else np.asarray(mask, np.bool_)
+    centres, half = _blocks(material)
+    aims = centres if expected is None else np.rint(expected(centres.astype(np.float64)))
+    inside = ((aims >= half) & (aims < np.array(f.shape) - half)).all(axis=1)
+    centres, aims = centres[inside], aims[inside].astype(np.int64)
+    if len(centres) < 4:
+        raise InputError(
+            f"expected blocks of the reference to lie in the deformed image, got {len(centres)} "
+            "that do; the motion is too large, or the mask is of another image"
+        )
+    elsewhere = np.roll(aims, len(aims) // 2, axis=0)
+    there = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, aims, strict=True)]
+    decoys = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, elsewhere, strict=True)]
+    return SceneMatch(
+        before=centres.astype(np.float64),
+        after=np.array([place for place, _ in there], dtype=np.float64),
+        correlation=np.array([value for _, value in there]),
+        chance=float(np.quantile([value for _, value in decoys], 0.95)),
+        block_px=2 * half + 1,
+    )
+
+
+def require_same_scene(match: SceneMatch, reference: str, deformed: str) -> None:
+    """Raise InputError unless two images, named for the message, show the same surface."""
+    if not match.is_same:
+        raise InputError(
+            f"expected two images of one surface, got {reference} and {deformed}, of which only "
+            f"{int(match.found.sum())} of {len(match.found)} blocks agree; the reference is not "
+            "the reference, or the motion is too large: give frames in between"
+        )
+
+
+def _blocks(material: BoolArray) -> tuple[NDArray[np.int64], int]:
+    """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
+    padded = np.pad(material, 1)  # the image's border counts as an edge
+    room = np.asarray(distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1]
+    cell = max(8, int(np.sqrt(material.size / BLOCKS)))
+    rows, cols = (n // cell for n in material.shape)
+    tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)
+    flat = tiles.reshape(rows, cols, -1)
+    widest, where = flat.max(axis=-1), flat.argmax(axis=-1)
+    half = min(BLOCK_PX // 2, int(np.quantile(widest[widest > 0], 0.5)) - 1 if widest.any() else 0)
+    if half < SMALLEST_PX // 2:
+        raise InputError(
+            f"expected room for blocks of {SMALLEST_PX} px on the material, got ligaments "
+            f"narrower than that or an image of {material.shape} px; check the mask"
+        )
+    i, j = np.nonzero(widest > half)
+    inner_row, inner_col = np.divmod(where[i, j], cell)
+    return np.column_stack([i * cell + inner_row, j * cell + inner_col]).astype(np.int64), half
+
+
+def _search(
+    f: NDArray[Any],
+    g: NDArray[Any],
+    centre: NDArray[np.int64],
+    aim: NDArray[np.int64],
+    half: int,
+    reach: int,
+) -> tuple[NDArray[np.int64], float]:
+    """Where around ``aim`` the block around ``centre`` fits best, and how well."""
+    row, col = centre
+    block = f[row - half : row + half + 1, col - half : col + half + 1]
+    low = np.maximum(aim - half - reach, 0)
+    high = np.minimum(aim + half + reach + 1, g.shape)
+    window = g[low[0] : high[0], low[1] : high[1]]
+    if np.ptp(block) == 0.0 or np.ptp(window) == 0.0:
+        return aim, 0.0
+    score = np.asarray(match_template(window, block))  # type: ignore[no-untyped-call]
+    best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
+    return low + best + half, float(score[best[0], best[1]])

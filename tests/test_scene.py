@@ -1,0 +1,84 @@
+"""Blocks of one image in another: found where the surface moved to, and not on another surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.hole_motion import HoleMotion
+from modeharvest.idic.scene import compare_scenes, require_same_scene
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+SHAPE = (300, 340)
+SPECKLE = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0), SHAPE)
+
+
+def moved(
+    shift: tuple[float, float], stretch: float = 1.0, noise: float = 0.03
+) -> NDArray[np.float64]:
+    """The pattern after x -> stretch x + shift; exact, because the pattern is known anywhere."""
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    image = SPECKLE((row - shift[0]) / stretch, (col - shift[1]) / stretch)
+    return image + noise * np.random.default_rng(0).normal(size=SHAPE)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (7, -3), (-20, 15)])
+def test_a_shifted_surface_is_found_to_the_pixel(shift: tuple[int, int]) -> None:
+    match = compare_scenes(SPECKLE.image(), moved(shift))
+    assert match.is_same
+    off = (match.after - match.before)[match.found]
+    # Some blocks have left the image, and 5 % of those are found elsewhere, by chance.
+    assert (off == np.array(shift)).all(axis=1).mean() > 0.95
+
+
+def test_another_surface_is_not_the_same() -> None:
+    other = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0, seed=7), SHAPE).image()
+    match = compare_scenes(SPECKLE.image(), other)
+    assert match.share < 0.3  # 5 % by the definition of chance, of some 60 blocks
+    assert not match.is_same
+    with pytest.raises(InputError, match=r"r\.tif and d\.tif, of which only"):
+        require_same_scene(match, "r.tif", "d.tif")
+
+
+def test_large_motion_is_found_where_it_is_expected() -> None:
+    image = moved((60.0, -10.0), stretch=0.95)
+    f = SPECKLE.image()
+    lost = compare_scenes(f, image)
+    found = compare_scenes(f, image, expected=lambda p: 0.95 * p + (58.0, -7.0))
+    assert not lost.is_same
+    assert found.is_same
+    aims = 0.95 * found.before + (60.0, -10.0)
+    # Whole pixels, and where in the block the contrast is: 5 % of half a block is 1 px.
+    assert np.median(np.abs(found.after - aims)[found.found], axis=0).max() < 1.5
+    assert found.found.mean() > 0.9
+
+
+def test_blocks_lie_on_material() -> None:
+    mask = np.zeros(SHAPE, dtype=bool)
+    mask[40:260, 100:180] = True
+    match = compare_scenes(SPECKLE.image(), moved((0.0, 0.0)), mask)
+    half = match.block_px // 2
+    for row, col in match.before.astype(int):
+        assert mask[row - half : row + half + 1, col - half : col + half + 1].all()
+
+
+def test_motion_between_holes_reproduces_affine_maps() -> None:
+    random = np.random.default_rng(0)
+    before = random.uniform(0, 300, size=(20, 2))
+    matrix, shift = np.array([[0.9, 0.05], [-0.02, 1.03]]), (12.0, -30.0)
+    motion = HoleMotion(np.zeros((20, 2), int), before, before @ matrix + shift, 0, ())
+    np.testing.assert_allclose(motion.at(before), motion.after, atol=1e-9)
+    points = random.uniform(-100, 400, size=(5, 2))
+    np.testing.assert_allclose(motion.at(points), points @ matrix + shift, atol=1e-8)
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    f = SPECKLE.image()
+    with pytest.raises(InputError, match="one size"):
+        compare_scenes(f, f[:-1])
+    with pytest.raises(InputError, match="room for blocks"):
+        compare_scenes(f, f, np.zeros(SHAPE))
+    with pytest.raises(InputError, match="motion is too large"):
+        compare_scenes(f, f, expected=lambda p: p + 1e4)
