@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.agreement import Agreement
+from modeharvest.idic.calibration_result import Calibration
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.error_bars import FieldErrors
+from modeharvest.idic.hole_lattice import HoleLattice
 from modeharvest.idic.identifiability import Identifiability
 from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.pattern import Pattern
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectrum import Spectrum
+from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
@@ -192,7 +195,7 @@ class HarvestTruth:
     """
 
     frames: Mapping[str, FrameTruth]
-    distortion: Any = None
+    distortion: Distortion | None = None
     rows: tuple[TruthRow, ...] = ()
 
 
@@ -249,12 +252,12 @@ class Harvest:
     frames: tuple[HarvestedFrame, ...]
     noise_sd: float
     noise_source: str
-    lattice: Any = None
+    lattice: HoleLattice | None = None
     skipped: tuple[tuple[str, str], ...] = ()
     timeline: Sequence[TimePoint] = ()
     buckling: BucklingPoint | None = None
-    calibration: Any = None
-    distortion: Any = None
+    calibration: Calibration | None = None
+    distortion: Distortion | None = None
     full_scale: float | None = None
     sentences: tuple[str, ...] = ()
     truth: HarvestTruth | None = None
@@ -290,3 +293,10 @@ class Harvest:
     def order(self) -> int:
         """Of the spline that interpolates the images."""
         return int(self.experiment.get("correlation", {}).get("order", 5))
+
+    @property
+    def lens(self) -> Distortion | None:
+        """The optics' distortion, given or calibrated."""
+        if self.distortion is None and self.calibration is not None:
+            return self.calibration.distortion
+        return self.distortion

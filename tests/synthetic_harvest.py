@@ -1,0 +1,193 @@
+"""A harvest made up in memory, from small photographs with holes: for its report's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from manufactured import image_pair, reference_points, speckle
+from numpy.typing import NDArray
+
+from modeharvest.harvest.timeline import Moment, find_buckling
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.calibration_result import Calibration, DegreeTrial
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.error_bars import field_errors
+from modeharvest.idic.fourier import FourierMode
+from modeharvest.idic.gauss_newton import Iteration, Outcome
+from modeharvest.idic.hole_lattice import find_hole_lattice
+from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.local_field import sampled_field
+from modeharvest.idic.pattern import read_pattern
+from modeharvest.idic.result import Result
+from modeharvest.idic.spectrum import spectral_density
+from modeharvest.imaging.distortion import PolynomialDistortion
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.harvest_run import (
+    FrameTruth,
+    Harvest,
+    HarvestedFrame,
+    HarvestTruth,
+    TruthRow,
+)
+
+FloatArray = NDArray[np.float64]
+
+PITCH, HOLES, DIAMETER = 0.5, (5, 6), 0.38
+GRID = PixelGrid.centred(290, 250, 0.0125)
+CELLULAR = Box.centred(PITCH * HOLES[0], PITCH * HOLES[1])
+DOMAIN = Box.centred(2.8, 3.3)
+LEVELS = 4095.0
+NOISE = 25.0
+
+
+def material(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    """A rectangle with round holes in its cells' middles, at positions [mm]."""
+    in_cell = [np.mod(t + 0.5 * n * PITCH, PITCH) - 0.5 * PITCH
+               for t, n in ((x, HOLES[0]), (y, HOLES[1]))]  # fmt: skip
+    cellular = (abs(x) < CELLULAR.x_max) & (abs(y) < CELLULAR.y_max)
+    inside = (abs(x) < DOMAIN.x_max) & (abs(y) < DOMAIN.y_max)
+    return np.asarray(inside & ~(cellular & (np.hypot(*in_cell) < 0.5 * DIAMETER)))
+
+
+MASK = material(*np.meshgrid(GRID.x, GRID.y))
+
+
+def ansatz(held: bool = False) -> Ansatz:
+    """The paper's, its mode held or free."""
+    made = Ansatz.square(DOMAIN, CELLULAR, PITCH)
+    mode = made.modes[0]
+    family = mode.family.held() if held else mode.family
+    return replace(made, modes=(FourierMode(family, mode.half_wavelength, mode.scale, mode.taper),))
+
+
+def photographs(a: Ansatz, unknowns: FloatArray) -> tuple[Any, Any, NDArray[np.bool_]]:
+    """Reference, deformed image and its mask: bright speckle on material, dark elsewhere."""
+    f, g = image_pair(speckle(3, GRID), a, unknowns, GRID)
+    at = reference_points(a, unknowns, GRID)
+    seen = material(at[..., 0], at[..., 1])
+    rng = np.random.default_rng(0)
+    levels = [np.where(m, 700 + 2600 * image, 250.0) for m, image in ((MASK, f), (seen, g))]
+    reference, deformed = (np.asarray(i + NOISE * rng.normal(size=i.shape), np.float32)
+                           for i in levels)  # fmt: skip
+    return reference, deformed, seen
+
+
+def frame(name: str, strain: float, amplitude: float, held: bool = False) -> HarvestedFrame:
+    """A photograph whose pattern has that amplitude [mm, times max phi = 0.04]."""
+    kinematics = ansatz(held)
+    a = kinematics.start(strain, amplitude)
+    _, deformed, seen = photographs(kinematics, a)
+    steps = ((8, 1, 3.0), (8, 2, 0.1), (1, 1, 0.2), (1, 2, 1e-4))
+    result = Result(
+        kinematics, GRID, a, 1e-9 * np.eye(kinematics.size), 60.0, int(MASK.sum()), 0,
+        Outcome.CONVERGED, 1e3, tuple(Iteration(f, n, 60.0, s, 0.0, 100) for f, n, s in steps),
+        residual_correlation=0.1,
+    )  # fmt: skip
+    x, y = GRID.x[::8], GRID.y[::8]
+    leftover = 1e-6 * np.eye(kinematics.size)
+    u = result.displacement() + wave()
+    spectrum = spectral_density(u, GRID, MASK, PITCH)
+    rng = np.random.default_rng(1)
+    local = sampled_field(u, GRID, MASK, 6, "a local DIC")
+    noisy = local.u + 1e-4 * rng.normal(size=local.u.shape)
+    return HarvestedFrame(
+        name=name,
+        strain_x=strain,
+        strain_y=-0.2 * strain,
+        image=deformed,
+        mask=seen,
+        result=result,
+        identifiability=identifiability(result, MASK),
+        agreement=result.agreement(NOISE),
+        error_x=x,
+        error_y=y,
+        by_noise=field_errors(result, x, y, result.covariance(NOISE)),
+        by_leftover=field_errors(result, x, y, leftover),
+        leftover_covariance=leftover,
+        spectrum=spectrum,
+        pattern=read_pattern(spectrum),
+        local=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)),
+        start_sentences=("v0 starts from the local DIC.",),
+    )
+
+
+def wave() -> FloatArray:
+    """What the ansatz can't describe: (rows, cols, 2), 4 um [mm]."""
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    k = 2.0 * np.pi / PITCH
+    return 0.004 * np.stack([np.sin(k * x) * np.cos(2 * k * y), np.cos(k * x)], axis=-1)
+
+
+def lens(size: float = 1.0) -> PolynomialDistortion:
+    """A distortion of a few pixels."""
+    c = np.zeros((2, 10))
+    c[0, 3:], c[1, 3:] = [0.8, -0.2, 1.5, 0.1, 0.6, 0.0, 0.9], [1.2, 0.3, 0.5, 0.9, 0.0, 0.7, 0.1]
+    return PolynomialDistortion(GRID.shape, size * c)
+
+
+def calibration() -> Calibration:
+    """That distortion, as if found."""
+    trials = tuple(
+        DegreeTrial(d, 2 * n, r, b, c, 0.002)
+        for d, n, r, b, c in (
+            (2, 3, 90.0, 5e4, 1.1),
+            (3, 7, 40.0, 0.0, 0.6),
+            (4, 12, 40.0, 70, 3e-3),
+        )
+    )
+    shifts = np.array([[0.0, 0.0], [0.1, 60.0], [-55.0, 0.3]])
+    return Calibration(
+        lens(), shifts, np.full((3, 2), 0.004), np.zeros(3), np.full(3, 1e-6), trials, 24.0,
+        np.array([0.99, 0.98, 0.99]), 1e-6 * np.eye(14), 3, ("S is a polynomial of degree 3.",),
+    )  # fmt: skip
+
+
+def harvest(
+    states: Sequence[tuple[str, float, float]] = (("IMG_1", 0.04, 0.02), ("IMG_2", 0.07, 0.9)),
+) -> Harvest:
+    """Photographs (name, strain, amplitude), everything known; the first one's mode is held."""
+    frames = tuple(frame(*state, held=k == 0) for k, state in enumerate(states))
+    reference, _, _ = photographs(ansatz(), ansatz().start(0.0, 0.0))
+    timeline = [moment(one) for one in frames]
+    truth = {
+        one.name: FrameTruth(
+            np.where(MASK[..., None], one.result.displacement() + wave(), np.nan),
+            replace(one.result, unknowns=one.result.unknowns + 1e-4),
+        )
+        for one in frames
+    }
+    rows = (
+        TruthRow("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
+        TruthRow("distortion, affine part aside", 0.07, 0.05, False, "px"),
+    )
+    return Harvest(
+        title="Made up <for tests>",
+        experiment={"specimen": {"cell_size": PITCH}, "correlation": {"order": 5}},
+        grid=GRID,
+        reference=reference,
+        mask=MASK,
+        lattice=find_hole_lattice(MASK),
+        cellular=CELLULAR,
+        domain=DOMAIN,
+        frames=frames,
+        skipped=(("IMG_3.tif", "expected an image <of 290 x 250 px>, got a damaged file"),),
+        timeline=timeline,
+        buckling=find_buckling(timeline),
+        calibration=calibration(),
+        noise_sd=NOISE,
+        noise_source="measured from 3 exposures",
+        full_scale=LEVELS,
+        sentences=("The material was found by its speckle.",),
+        truth=HarvestTruth(truth, lens(1.01), rows),
+        timings={"prepare": 1.0, "correlate": 12.3},
+        versions={"modeharvest": "0"},
+    )
+
+
+def moment(one: HarvestedFrame) -> Moment:
+    """Its place in the time line."""
+    seen = one.identifiability
+    return Moment(one.name, one.strain_x, seen.amplitude_px[0], seen.leftover_px, 0.01)

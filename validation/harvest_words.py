@@ -1,0 +1,249 @@
+"""What the report of a harvest says in words and tables, taken from its summary alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from modeharvest.validation.page import short
+
+Summary = Mapping[str, Any]
+Frame = Mapping[str, Any]
+
+NBSP = "\N{NO-BREAK SPACE}"
+
+
+def percent(value: float | None, digits: int = 3) -> str:
+    """A strain in percent, with its sign."""
+    if value is None:
+        return "–"
+    return f"{100 * value:.{digits}g}{NBSP}%".replace("-", "−")
+
+
+def state(frame: Frame) -> str:
+    """Whether a photograph shows the pattern."""
+    has = frame["has_pattern"]
+    return "Deformed" if has is None else "After buckling" if has else "Before buckling"
+
+
+def label(frame: Frame, named: bool) -> str:
+    """How a photograph is called above its pictures; with its file's name where there are many."""
+    said = f"{state(frame)} · {percent(frame['strain'])}"
+    return f"{said} · {frame['name']}" if named else said
+
+
+def key_numbers(summary: Summary) -> list[dict[str, str]]:
+    """The few numbers at the top: what they are called, the number, its unit, a remark."""
+    last = summary["frames"][-1]
+    keys = [_photographs(summary), _buckling(summary)]
+    if last["modes"]:
+        keys += _mode_keys(last)
+    keys.append(_left(last))
+    if summary["truth"]:
+        rows = summary["truth"]
+        met = sum(row["ok"] for row in rows)
+        keys[0] = _key("as near to the truth as asked", f"{met} of {len(rows)}", "", "table below")
+    return keys
+
+
+def _photographs(summary: Summary) -> dict[str, str]:
+    used, left = len(summary["frames"]), len(summary["skipped"])
+    remark = f"{left} of them left out, see below" if left else "all of them"
+    return _key("photographs used", f"{used} of {used + left}", "", remark)
+
+
+def _buckling(summary: Summary) -> dict[str, str]:
+    found = summary["buckling"]
+    if found is None or found["after"] is None:
+        return _key("buckling", "–", "", "no pattern that stands out")
+    if found["before"] is None:
+        return _key("buckling", f"< {100 * found['after']:.3g}", "%", "all show the pattern")
+    span = f"{100 * found['before']:.3g} … {100 * found['after']:.3g}"
+    remark = "the pattern appears between these strains"
+    if found["estimate"] is not None:
+        remark = f"its growth points back to {percent(found['estimate'])}"
+    return _key("buckling", span, "%", remark)
+
+
+def _mode_keys(frame: Frame) -> list[dict[str, str]]:
+    mode, at = frame["modes"][0], f"at {percent(frame['strain'])}"
+    wave = mode["waves"][0]
+    xi = ", ".join(f"{value:.4f}".replace("-", "−") for value in wave["xi"])
+    errors = [f"± {_micro(mode['v_max_sd_noise_mm'])} µm by noise"]
+    if mode["v_max_sd_leftover_mm"] is not None:
+        errors.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
+    count = len(mode["waves"])
+    sd = "held fixed" if mode["held"] else f"± {max(_numbers(wave)):.1g}"
+    return [
+        _key("pattern", f"{mode['largest_px']:.3g}", "px", f"largest v₁φ₁ {at}"),
+        _key("largest v₁", _micro(mode["v_max_mm"]), "µm", ", ".join(errors)),
+        _key("wave vector ξ", f"({xi})", "1/l", f"{sd}; the first of {count}"),
+    ]
+
+
+def _numbers(wave: Mapping[str, Any]) -> list[float]:
+    known = [*(wave["sd_noise"] or []), *(wave["sd_leftover"] or [])]
+    return [value for value in known if value is not None] or [float("nan")]
+
+
+def _left(frame: Frame) -> dict[str, str]:
+    local = frame["local"]
+    if local is not None and local["w_beyond_noise_px"] is not None:
+        remark = f"rms of local DIC − IDIC beyond the local DIC’s {local['sd_px']:.2g} px"
+        return _key("left over, w", f"{local['w_beyond_noise_px']:.2g}", "px", remark)
+    remark = "rms, estimated from the residual"
+    return _key("left over, w", f"{frame['leftover_px']:.2g}", "px", remark)
+
+
+def fact(key: str, frame: Frame) -> str:
+    """One line of numbers under a picture; empty if there is nothing to add."""
+    local, left = frame["local"], frame["errors_px"]["leftover"]
+    if key == "image":
+        return f"{frame['name']}; compression {percent(frame['strain_x'])} along x, " + (
+            f"{percent(frame['strain_y'])} along y"
+        )
+    if key == "residual":
+        return _residual(frame)
+    if key == "w" and local is not None:
+        said = f"rms {local['w_rms_px']:.3g} px per component at {local['points']} points"
+        if local["sd_px"] is not None:
+            said += f", of which the local DIC’s own error {local['sd_px']:.2g} px"
+        return said + (f"; {local['lost']} points lost" if local["lost"] else "")
+    if key.startswith("v") and key[1:].isdigit() and key != "v0":
+        return _amplitude(frame["modes"][int(key[1:]) - 1], key[1:])
+    field, _, cause = key.partition("-")
+    errors = frame["errors_px"]["noise"] if cause == "noise" else left if cause else None
+    if errors is None or field not in ("v0", "fluc1") or len(frame["modes"]) > 1:
+        return ""
+    name = {"v0": "v0", "fluc1": "fluctuation"}[field]
+    return "" if errors[name] is None else f"rms {errors[name]:.2g} px per component"
+
+
+def _residual(frame: Frame) -> str:
+    share, chi = frame["residual_of_full_scale"], frame["chi_square"]
+    said = f"rms {short(frame['residual_rms'])} grey levels"
+    if share is not None:
+        said += f", {100 * share:.2g}{NBSP}% of full scale"
+    return said + ("" if chi is None else f"; χ² {chi:.3g}")
+
+
+def _amplitude(mode: Mapping[str, Any], n: str) -> str:
+    sd = [f"{_micro(mode['v_max_sd_noise_mm'])} by noise"]
+    if mode["v_max_sd_leftover_mm"] is not None:
+        sd.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
+    said = f"largest among the holes {_micro(mode['v_max_mm'])} ± {' '.join(sd)} µm"
+    return said if mode["observable"] else f"{said}; too weak for φ{n} to mean anything"
+
+
+FRAME_COLUMNS = (
+    ("photograph", ""), ("strain x", "%"), ("strain y", "%"), ("pattern, rms", "px"),
+    ("largest", "px"), ("sd of it: noise", "px"), ("… leftover", "px"),
+    ("w, estimated", "px"), ("w, local DIC", "px"), ("residual", "levels"),
+    ("χ²", "–"), ("iterations", ""), ("outcome", ""),
+)  # fmt: skip
+"""Heads of the table of all photographs, and their units."""
+
+
+def frame_rows(summary: Summary) -> list[dict[str, Any]]:
+    """A row of that table for each photograph: its name, its cells, and how it ended."""
+    rows = []
+    for frame in summary["frames"]:
+        modes, errors, local = frame["modes"], frame["errors_px"], frame["local"]
+        rows.append({
+            "name": frame["name"],
+            "cells": [
+                _digits(100 * frame["strain_x"], 3), _digits(100 * frame["strain_y"], 3),
+                _digits(max((m["amplitude_px"] for m in modes), default=None), 3),
+                _digits(max((m["largest_px"] for m in modes), default=None), 3),
+                *(_digits((errors[cause] or {}).get("fluctuation"), 2)
+                  for cause in ("noise", "leftover")),
+                _digits(frame["leftover_px"], 2),
+                _digits(None if local is None else local["w_rms_px"], 2),
+                _digits(frame["residual_rms"], 3), _digits(frame["chi_square"], 3),
+                f"{frame['iterations']} of {frame['iterations_all_levels']}",
+            ],
+            "outcome": frame["outcome"],
+        })  # fmt: skip
+    return rows
+
+
+def mode_tables(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """For each mode its parameters in each of these frames, with both standard errors."""
+    tables = []
+    for i in range(max((len(frame["modes"]) for frame in frames), default=0)):
+        of = [frame for frame in frames if i < len(frame["modes"])]
+        names = [(p["name"], p["unit"]) for p in max(
+            (frame["modes"][i]["parameters"] for frame in of), key=len)]  # fmt: skip
+        rows = []
+        for name, unit in names:
+            cells = [
+                next((p for p in frame["modes"][i]["parameters"] if p["name"] == name), None)
+                for frame in of
+            ]
+            rows.append({"name": name, "unit": unit, "cells": cells})
+        families = list(dict.fromkeys(frame["modes"][i]["family"] for frame in of))
+        tables.append({"number": i + 1, "frames": of, "rows": rows, "families": families})
+    return tables
+
+
+def wave_rows(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """Wave vectors of all modes in these frames, with both standard errors."""
+    rows = []
+    for frame in frames:
+        for i, mode in enumerate(frame["modes"], start=1):
+            for w, wave in enumerate(mode["waves"], start=1):
+                noise, left = wave["sd_noise"] or [None] * 2, wave["sd_leftover"] or [None] * 2
+                rows.append({
+                    "frame": frame, "mode": i, "wave": w, "held": mode["held"],
+                    "observable": mode["observable"],
+                    "cells": list(zip(wave["xi"], noise, left, strict=True)),
+                })  # fmt: skip
+    return rows
+
+
+def error_text(noise: float | None, leftover: float | None) -> str:
+    """Both standard errors behind a value: "± 0.0002 ± 0.003"."""
+    return " ".join(f"± {value:.1g}" for value in (noise, leftover) if value is not None) or "–"
+
+
+def notes(summary: Summary) -> list[str]:
+    """What a reader should know before trusting the numbers."""
+    said = []
+    for frame in summary["frames"]:
+        at = f"{frame['name']}, {percent(frame['strain'])}:"
+        if frame["outcome"] != "converged":
+            ended = f"the correlation ended as “{frame['outcome']}”: {frame['outcome_why']}"
+            said.append(f"{at} {ended}")
+        said += [f"{at} {_sentence(warning)}" for warning in frame["warnings"]]
+        said.append(f"{at} {frame['agreement']}")
+    noise = summary["noise"]
+    share = "" if noise["of_full_scale"] is None else (
+        f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip
+    said += [
+        f"Camera noise: {noise['sd']:.3g} grey levels{share}, {noise['source']}.",
+        "Two standard errors are given apart. The first is what the photographs’ noise does, the "
+        "Cramér–Rao bound. The second is what the part of the displacement that the ansatz can’t "
+        "describe does to the unknowns, estimated from the residual with one block for each cell; "
+        "it includes the noise, and takes cells for independent.",
+        "Neither of them is the difference between the measured field and the true displacement: "
+        "that is w, shown as what is left over.",
+        "rms is per component: the root of the mean square over both components.",
+    ]
+    return said
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith(".") else f"{text}."
+
+
+def _micro(millimetres: float | None) -> str:
+    """Micrometres to three digits."""
+    return "∞" if millimetres is None else short(float(f"{1e3 * millimetres:.3g}"))
+
+
+def _digits(value: float | None, digits: int) -> str:
+    return "–" if value is None else short(float(f"{value:.{digits}g}"))
+
+
+def _key(name: str, value: str, unit: str, remark: str) -> dict[str, str]:
+    return {"name": name, "value": value, "unit": unit, "remark": remark}
