@@ -102,6 +102,26 @@ def modes(case: CaseName, out: OutFolder) -> None:
 
 
 @app.command()
+def harvest(
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT.toml", help="What there are photographs of.")
+    ],
+    out: OutFolder,
+) -> None:
+    """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
+
+    The TOML file names the reference and the deformed images, the pixel size and the cell size;
+    all else is found or has a default. Leaves results/, report.html and summary.json in DIR. Run
+    the same command again after an interruption: finished photographs are not measured again.
+    """
+    from modeharvest.harvest import pipeline, terminal
+
+    with _bars() as bars:
+        summary = pipeline.harvest(experiment, out, bars)
+    terminal.print_harvest(summary, out)
+
+
+@app.command()
 def fem(case: CaseName, out: OutFolder) -> None:
     """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
 

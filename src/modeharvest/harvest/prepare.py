@@ -151,8 +151,10 @@ def prepare(
     return Prepared(folder, info)
 
 
-def named_files(base: Path, names: Sequence[str]) -> tuple[Path, ...]:
+def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
     """The files that names, or patterns with wildcards, stand for.
+
+    ``unique``: no two may have the same stem, because results are named by it.
 
     Raises
     ------
@@ -170,7 +172,7 @@ def named_files(base: Path, names: Sequence[str]) -> tuple[Path, ...]:
             paths.append(base / name)
     stems = [path.stem for path in paths]
     twice = next((stem for stem in stems if stems.count(stem) > 1 or stem == "reference"), None)
-    if twice is not None and len(paths) > 1:
+    if unique and twice is not None and len(paths) > 1:
         raise InputError(
             f"expected images whose names differ, and none called 'reference', got {twice!r} "
             "again; rename it, or narrow the pattern"

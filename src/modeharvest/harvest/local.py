@@ -1,0 +1,83 @@
+"""The local DIC of a harvest: another code's files, or pyvale's subsets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from modeharvest.errors import InputError
+from modeharvest.harvest.experiment import Experiment
+from modeharvest.harvest.prepare import Prepared
+from modeharvest.idic.field_files import read_field
+from modeharvest.idic.local_field import LocalField
+from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.imaging.grid import PixelGrid
+
+
+def local_field(
+    experiment: Experiment,
+    base: Path,
+    prepared: Prepared,
+    number: int,
+    distortion: Distortion | None,
+) -> LocalField | None:
+    """The displacement field of one deformed photograph by a local DIC; None if there is none.
+
+    Files are of the photographs as they are; what the lens did to them is taken out here.
+
+    Parameters
+    ----------
+    experiment, base
+        What there is, and the folder its names are relative to.
+    prepared
+        The photographs, made ready.
+    number
+        Of the deformed photograph, from 0.
+    distortion
+        Of the lens.
+
+    Raises
+    ------
+    InputError
+        If there are files, but none for this photograph.
+    """
+    table, grid = experiment.local, prepared.grid
+    if table.code == "none":
+        return None
+    if table.code == "pyvale":
+        from modeharvest.idic.subsets import subset_field
+
+        name = prepared.names[number]
+        return subset_field(
+            prepared.image(), prepared.image(name), grid, prepared.mask(),
+            subset_px=table.subset, step_px=table.step,
+        )  # fmt: skip
+    if number >= len(table.files):
+        raise InputError(
+            f"local: expected a field for each of {len(prepared.names)} deformed images, got "
+            f"{len(table.files)} files"
+        )
+    field = read_field(base / table.files[number], grid, units=table.unit, y_axis=table.y_axis)
+    return field if distortion is None else without_distortion(field, grid, distortion)
+
+
+def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:
+    """The field that an ideal lens would have shown: both ends of every displacement put right.
+
+    Parameters
+    ----------
+    field
+        Measured on photographs as they are.
+    grid
+        Their pixels.
+    distortion
+        Of the lens.
+    """
+    u = np.where(field.good[:, None], field.u, 0.0)
+    row, col = distortion.ideal(*grid.to_px(field.x, field.y))
+    row2, col2 = distortion.ideal(*grid.to_px(field.x + u[:, 0], field.y + u[:, 1]))
+    x, y = grid.to_mm(row, col)
+    x2, y2 = grid.to_mm(row2, col2)
+    return replace(field, x=x, y=y, u=np.column_stack([x2 - x, y2 - y]))

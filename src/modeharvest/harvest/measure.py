@@ -1,0 +1,186 @@
+"""One deformed photograph against the reference: where to start, and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.harvest.experiment import Measurement
+from modeharvest.harvest.geometry import Geometry
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.automatic_start import Start, StartOptions, automatic_start
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.fourier import FourierMode, square_family
+from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.region import junction
+from modeharvest.idic.result import Result
+from modeharvest.idic.support import Taper
+from modeharvest.progress import Progress, silent
+
+FloatArray = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What is correlated.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) f and g.
+    mask, deformed_mask
+        (rows, cols) True on material.
+    """
+
+    reference: FloatImage
+    deformed: FloatImage
+    mask: BoolArray
+    deformed_mask: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What came out of one photograph.
+
+    Parameters
+    ----------
+    result
+        Of the correlation.
+    local
+        The displacement field that the start was read from, a local DIC's if there is one.
+    held
+        Whether the mode was held.
+    sentences
+        Where the correlation started from, in words.
+    """
+
+    result: Result
+    local: LocalField
+    held: bool
+    sentences: tuple[str, ...]
+
+
+def measure(
+    pair: Pair,
+    geometry: Geometry,
+    cell_size: float,
+    how: Measurement,
+    local: LocalField | None = None,
+    before: Measured | None = None,
+    progress: Progress = silent,
+) -> Measured:
+    """Find start and ansatz, and correlate.
+
+    Parameters
+    ----------
+    pair
+        Of images.
+    geometry
+        Of the specimen.
+    cell_size
+        l [mm].
+    how
+        The ansatz and how to correlate.
+    local
+        A local DIC's field.
+    before
+        What came out of the photograph before. If it had a pattern, its ansatz is kept and its
+        unknowns are the start; the start is found anew if that leads nowhere.
+    progress
+        Listener.
+    """
+    holes, said = geometry.holes_in(pair.deformed_mask)
+    if holes is None and before is not None:
+        holes = _moved_cells(before.result, geometry)
+        said += " v0 starts from the photograph before."
+    options = StartOptions(how.v0_degree, how.v_degree, how.brightness())
+    start = automatic_start(
+        pair.reference, pair.deformed, geometry.grid, cell_size, geometry.region.cellular,
+        pair.mask, pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
+        domain=geometry.region.domain, options=options,
+    )  # fmt: skip
+    ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
+    sentences = (said, *start.sentences)
+    if before is not None and _goes_on(before, held):
+        there = before.result
+        found = _correlated(pair, geometry, there.ansatz, there.unknowns, how, progress)
+        if found.outcome is Outcome.CONVERGED:
+            words = "The correlation started from the result of the photograph before."
+            return Measured(found, start.local, before.held, (*sentences, words))
+    found = _correlated(pair, geometry, ansatz, unknowns, how, progress)
+    return Measured(found, start.local, held, sentences)
+
+
+def chosen_modes(
+    start: Start, geometry: Geometry, cell_size: float, how: Measurement
+) -> tuple[Ansatz, FloatArray, bool]:
+    """The start's ansatz and unknowns with the family and the holding that were asked for."""
+    ansatz, unknowns, held = start.ansatz, start.unknowns, start.held
+    wants_square = how.family == "square" and geometry.lattice is not None
+    if (wants_square and "square" not in start.family) or (held and how.hold_mode is False):
+        ansatz, unknowns = _with_square_mode(ansatz, unknowns, geometry, cell_size)
+        held = False
+    if how.hold_mode is True and not held:
+        ansatz, unknowns = with_held_modes(ansatz, unknowns)
+        held = True
+    return ansatz, unknowns, held
+
+
+def with_held_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, FloatArray]:
+    """The same ansatz with its modes held where the unknowns have them, and fewer unknowns."""
+    modes = []
+    for i, mode in enumerate(ansatz.modes):
+        here = replace(mode.family, start=unknowns[ansatz.phi_slice(i)])
+        modes.append(replace(mode, family=here.held()))
+    first, last = ansatz.phi_offset(0), ansatz.phi_offset(len(ansatz.modes))
+    return replace(ansatz, modes=tuple(modes)), np.concatenate([unknowns[:first], unknowns[last:]])
+
+
+def _with_square_mode(
+    ansatz: Ansatz, unknowns: FloatArray, geometry: Geometry, cell_size: float
+) -> tuple[Ansatz, FloatArray]:
+    """The paper's Eq. (mode) with its origin on a junction, started as in the paper."""
+    assert geometry.lattice is not None
+    family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
+    taper = Taper(geometry.region.cellular, 0.5 * cell_size)
+    mode = FourierMode.scaled(family, cell_size, taper)
+    made = replace(ansatz, modes=(mode,))
+    a = made.start()
+    slow = 2 * ansatz.v0_space.size
+    a[:slow] = unknowns[:slow]
+    return made, a
+
+
+def _goes_on(before: Measured, held: bool) -> bool:
+    """Whether the photograph before is a start: it was measured, and the pattern is still there."""
+    return before.result.outcome is Outcome.CONVERGED and before.held == held
+
+
+def _moved_cells(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Positions over the cellular part and v0 there, as if holes had been followed [mm]."""
+    box = geometry.region.cellular
+    x, y = (np.linspace(a, b, 8) for a, b in ((box.x_min, box.x_max), (box.y_min, box.y_max)))
+    positions = np.stack(np.meshgrid(x, y), axis=-1)
+    moved = result.ansatz.v0(result.unknowns, x, y)
+    return positions.reshape(-1, 2), moved.reshape(-1, 2)
+
+
+def _correlated(
+    pair: Pair,
+    geometry: Geometry,
+    ansatz: Ansatz,
+    unknowns: FloatArray,
+    how: Measurement,
+    progress: Progress,
+) -> Result:
+    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
+    return correlate(
+        *images, geometry.grid, ansatz, unknowns, pair.mask, pair.deformed_mask, how.options(),
+        progress,
+    )  # fmt: skip

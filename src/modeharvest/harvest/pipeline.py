@@ -1,0 +1,224 @@
+"""A harvest in one folder, in stages that can be interrupted and go on where they were.
+
+::
+
+    distortion.json                     optics      S, if it is calibrated
+    prepared/                           prepare     photographs without distortion, masks
+    results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
+    results/NAME_start.json                         where it started from, in words
+    report.html  summary.json           report      everything that was found
+    stages.json                                     which stages are finished, and what they took
+"""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from modeharvest import __version__
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, require_writable, write_json
+from modeharvest.harvest.experiment import Experiment, read_experiment
+from modeharvest.harvest.geometry import Geometry, find_geometry
+from modeharvest.harvest.local import local_field
+from modeharvest.harvest.measure import Measured, Pair, measure
+from modeharvest.harvest.optics import Optics, find_optics
+from modeharvest.harvest.prepare import RECORD, Prepared, named_files, prepare
+from modeharvest.harvest.told import harvest_of
+from modeharvest.idic.field_files import read_field, write_field
+from modeharvest.idic.pull_back import pulled_back
+from modeharvest.idic.result import Result
+from modeharvest.progress import Progress, silent
+from modeharvest.stages import Stages, digest, file_digest
+from modeharvest.validation.harvest_report import write_harvest_report
+from modeharvest.validation.harvest_run import Harvest, HarvestTruth
+from modeharvest.validation.harvest_summary import harvest_summary
+
+
+@dataclass(frozen=True)
+class Harvesting:
+    """An experiment, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    experiment
+        Of which there are photographs.
+    base
+        Folder that its files' names are relative to.
+    folder
+        Where to leave what is found.
+    progress
+        Listener.
+    source
+        The experiment's file, for the report.
+    """
+
+    experiment: Experiment
+    base: Path
+    folder: Path
+    progress: Progress = silent
+    source: str = "EXPERIMENT.toml"
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    @cached_property
+    def optics(self) -> Optics:
+        """The lens's distortion, calibrated if need be; leaves ``distortion.json``."""
+        return find_optics(
+            self.experiment, self.base, self.folder / "distortion.json", self.progress
+        )
+
+    def prepared(self) -> Prepared:
+        """Make the photographs ready; leaves ``prepared/``."""
+        folder = self.folder / "prepared"
+
+        def work() -> None:
+            distortion = self.optics.distortion
+            prepare(self.experiment, self.base, folder, distortion, self.progress)
+
+        self.stages.do("prepare", self._prepared_key(), work, folder / RECORD)
+        return Prepared.read(folder)
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """Holes, lattice and cellular part, from the reference."""
+        return find_geometry(self.prepared(), self.experiment.specimen, self.base)
+
+    def results(self) -> dict[str, Measured]:
+        """Correlate every photograph, each after the one before; leaves ``results/``."""
+        prepared, found = self.prepared(), {}
+        before: Measured | None = None
+        key = digest([self._prepared_key(), self._how()])
+        for number, name in enumerate(prepared.names):
+            key = digest([key, name, self._local_digest(number)])
+            self._measure_one(prepared, number, before, key)
+            before = found[name] = self._read(name)
+        return found
+
+    def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
+        """All that is known of the test, for the report."""
+        names = ("optics", "prepare", *(f"correlate {name}" for name in self.prepared().names))
+        seconds = {name: float(self.stages.finished(name).get("seconds", 0.0)) for name in names}
+        return harvest_of(
+            self.experiment, self.prepared(), self.geometry, self.optics, self.results(),
+            truth=truth, source=self.source, folder=self.folder, timings=seconds,
+            versions=versions(), progress=self.progress,
+        )  # fmt: skip
+
+    def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
+        """Do everything that is not finished; returns the content of ``summary.json``."""
+        require_writable(self.folder)
+        self.results()
+        harvest = self.harvest(truth)
+        summary = harvest_summary(harvest)
+        write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
+        write_json(self.folder / "summary.json", summary)
+        return summary
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _measure_one(
+        self, prepared: Prepared, number: int, before: Measured | None, key: str
+    ) -> None:
+        name = prepared.names[number]
+        result, field, start = self._paths(name)
+
+        def work() -> None:
+            found = measure(
+                self._pair(prepared, number, before),
+                self.geometry,
+                self.experiment.specimen.cell_size,
+                self.experiment.correlation,
+                local_field(self.experiment, self.base, prepared, number, self.optics.distortion),
+                before,
+                self.progress,
+            )
+            write_field(field, found.local)
+            told = {"held": found.held, "source": found.local.source, "said": found.sentences}
+            write_json(start, told)
+            found.result.write(result)
+
+        self.stages.do(f"correlate {name}", key, work, result, field, start)
+
+    def _pair(self, prepared: Prepared, number: int, before: Measured | None) -> Pair:
+        """The photograph and what it is correlated with."""
+        name = prepared.names[number]
+        reference, mask = prepared.image(), prepared.mask()
+        if self.experiment.correlation.formulation == "updated" and before is not None:
+            earlier = prepared.image(prepared.names[number - 1])
+            order = self.experiment.correlation.order
+            reference, seen = pulled_back(earlier, before.result, order)
+            mask = mask & seen
+        return Pair(reference, prepared.image(name), mask, prepared.mask(name))
+
+    def _read(self, name: str) -> Measured:
+        result, field, start = self._paths(name)
+        told = read_json(start)
+        return Measured(
+            Result.read(result), read_field(field), bool(told["held"]), tuple(told["said"])
+        )
+
+    def _paths(self, name: str) -> tuple[Path, Path, Path]:
+        folder = self.folder / "results"
+        return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
+
+    def _prepared_key(self) -> str:
+        tables = self.experiment.plain()
+        images = self.experiment.images
+        names = [images.reference, *images.deformed, *images.repeats]
+        table = self.experiment.specimen
+        masks = [table.material, table.cells, *table.deformed_material]
+        lens = [self.experiment.distortion.file, *self.experiment.distortion.calibration]
+        files = named_files(self.base, [name for name in names if name], unique=False)
+        files += named_files(self.base, [n for n in (*masks, *lens) if n], unique=False)
+        wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
+        return digest([wanted, [[path.name, file_digest(path)] for path in files], __version__])
+
+    def _how(self) -> list[Any]:
+        tables = self.experiment.plain()
+        return [tables["correlation"], tables["local"]]
+
+    def _local_digest(self, number: int) -> str:
+        files = self.experiment.local.files
+        return file_digest(self.base / files[number]) if number < len(files) else ""
+
+
+def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
+    """Harvest an experiment's photographs; what ``modeharvest harvest`` does.
+
+    Parameters
+    ----------
+    path
+        Its TOML file.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    path = Path(path)
+    experiment = read_experiment(path)
+    if not (path.parent / experiment.images.reference).is_file():
+        raise InputError(
+            f"{path}: expected the reference image at {path.parent / experiment.images.reference}, "
+            "found no such file"
+        )
+    return Harvesting(experiment, path.parent, Path(folder), progress, str(path)).all()
+
+
+def versions() -> dict[str, str]:
+    """Of this software and what its numbers depend on."""
+    libraries = ("numpy", "scipy", "numba", "scikit-image")
+    own = {"modeharvest": __version__, "python": platform.python_version()}
+    return own | {name: version(name) for name in libraries}
