@@ -21,7 +21,9 @@ from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.fourier import PER_WAVE
-from modeharvest.idic.moments import IMAGES, Runs, Tables, Target, accumulate
+from modeharvest.idic.moments import accumulate
+from modeharvest.idic.pixel_blocks import Target
+from modeharvest.idic.tables import Runs, runs_of, tables_of
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -96,13 +98,9 @@ class Assembly:
             )
 
     @cached_property
-    def _runs(self) -> Runs:
-        edges = np.zeros((self.mask.shape[0], self.mask.shape[1] + 1), dtype=np.bool_)
-        edges[:, 1:-1] = self.mask[:, 1:] != self.mask[:, :-1]
-        edges[:, 0], edges[:, -1] = self.mask[:, 0], self.mask[:, -1]
-        columns = np.nonzero(edges)[1].astype(np.int32)  # where runs begin and end, in turns
-        per_row = edges.sum(axis=1, dtype=np.int64) // 2
-        return Runs(columns[::2], columns[1::2], np.concatenate([[0], np.cumsum(per_row)]))
+    def runs(self) -> Runs:
+        """Where the pixels that count are."""
+        return runs_of(self.mask)
 
     @cached_property
     def _degrees(self) -> list[int]:
@@ -172,11 +170,7 @@ class Assembly:
         with_matrix
             Without the matrix the pass costs about half as much.
         """
-        nothing = np.zeros((0, 0))
-        spline = deformed.coefficients, deformed.order
-        target = Target(
-            IMAGES, np.ascontiguousarray(reference), *spline, nothing, self.grid.pixel_size
-        )
+        target = Target.images(reference, deformed, self.grid)
         return self._assemble(a, target, with_matrix)
 
     def displacement(
@@ -205,11 +199,11 @@ class Assembly:
         return along(0) + along(1)
 
     def _assemble(self, a: FloatArray, target: Target, with_matrix: bool) -> NormalEquations:
-        pairs, degrees, runs = self._pairs(with_matrix), self._degrees, self._runs
+        pairs, degrees, runs = self._pairs(with_matrix), self._degrees, self.runs
         top = max(int(pairs[:, 2].max()), *degrees) + 1
         moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
-        tables = _tables(self.ansatz, self.grid, self.ansatz.checked(a))
+        tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
         kernel: Callable[..., None] = accumulate
         kernel(target, runs, tables, pairs, len(degrees), moments, left)
         off, pixels = int(left.sum()), int((runs.stop - runs.first).sum())
@@ -235,37 +229,3 @@ def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
     k, m = np.array(orders(other)).T[:, None, :]
     a, b, c, d = i + k, abs(i - k), j + m, abs(j - m)
     return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
-
-
-def _tables(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:
-    """Make the one-dimensional tables that the kernel combines."""
-    v0 = np.stack([ansatz.v0_space.square(a[ansatz.v0_slice(c)]) for c in (0, 1)])
-    n, d = len(ansatz.modes), ansatz.v_degree + 1
-    v, waves, mode_of_wave = np.zeros((n, d, d)), np.zeros((0, 6)), []
-    taper_x, taper_y = np.zeros((n, grid.cols)), np.zeros((n, grid.rows))
-    for i, mode in enumerate(ansatz.modes):
-        v[i] = ansatz.v_space.square(a[ansatz.v_slice(i)])
-        own = mode.family.waves(a[ansatz.phi_slice(i)])
-        per_mm = np.full((len(own), 1), np.pi / mode.half_wavelength)
-        waves = np.vstack([waves, np.hstack([own, per_mm])])
-        mode_of_wave += [i] * len(own)
-        taper_x[i] = mode.scale * mode.taper.along_x(grid.x)
-        taper_y[i] = mode.taper.along_y(grid.y)
-    tx = waves[:, 5:] * waves[:, 2:3] * grid.x
-    ty = waves[:, 5:] * (waves[:, 3:4] * grid.y + waves[:, 4:5])
-    xi, eta = ansatz.domain.normalised(grid.x, grid.y)
-    trig_x = np.stack([np.sin(tx), np.cos(tx)], axis=1).reshape(-1, grid.cols)
-    first = 2 + n + 3 * len(waves)
-    return Tables(
-        eta,
-        np.vstack([xi, trig_x, taper_x]),
-        v0,
-        v,
-        ansatz.brightness.squares(a[ansatz.phi_offset(n) :]),
-        *ansatz.brightness.fields(first),
-        waves,
-        np.array(mode_of_wave, dtype=np.int64),
-        np.sin(ty),
-        np.cos(ty),
-        taper_y,
-    )
