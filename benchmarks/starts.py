@@ -196,7 +196,7 @@ def span(counts: list[int]) -> str:
 
 def draw(ends: list[End], path: Path) -> None:
     """Draw the shares over the radius."""
-    made = figure(5.0, 3.2)
+    made = figure(5.0, 3.6)
     axes = made.add_subplot()
     percent = [100 * r for r in RADII]
 
@@ -214,8 +214,8 @@ def draw(ends: list[End], path: Path) -> None:
     axes.set(xlabel="all seven mode parameters off by up to [%]", ylabel="starts [%]",
              ylim=(-3, 103), xlim=(0, None))  # fmt: skip
     axes.grid(alpha=0.25)
-    axes.legend(frameon=False, loc="lower left")
-    made.tight_layout()
+    made.legend(*axes.get_legend_handles_labels(), frameon=False, loc="upper left", fontsize=8)
+    made.tight_layout(rect=(0, 0, 1, 0.82))
     made.patch.set_facecolor("white")
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary:
