@@ -2,7 +2,8 @@
 
 The speckle itself tells: within some pixels the material's grey level varies, the background's
 hardly does, whether it is black, grey or white. That finds the background roughly; its own grey
-level, learnt there, then says pixel by pixel how far it goes.
+level, learnt there, then says pixel by pixel how far it goes. What is left at the edges but out of
+focus is the wall of a hole, seen through it.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, label, uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 from skimage.filters import threshold_otsu
 
 from modeharvest.errors import InputError
+from modeharvest.idic.morphology import connected_to, grown, opened, shrunk, without_small
 
 BoolArray = NDArray[np.bool_]
 FloatImage = NDArray[np.float32]
@@ -30,6 +32,9 @@ _FAINTEST = 0.002
 """A difference of grey levels that counts as none, as a share of their range."""
 _SPECK_PX2 = 6
 """Area of what can be a few pixels' noise in the background."""
+_WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
+"""Out of focus is what has, in a window of this share of the speckle's, less than this share of
+the material's fine contrast."""
 _SLIGHTEST = 0.02
 """Share of material with grey levels of the background from which on that is said."""
 
@@ -122,7 +127,8 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
             "expected a speckled material in the image, got a mask with nothing in it: the "
             "background's grey levels are everywhere; give the mask as an image"
         )
-    return Material(material, ratio, alike, _sentences(material, ratio, alike))
+    material, walls = _without_walls(grey, material, options)
+    return Material(material, ratio, alike, _sentences(material, ratio, alike, walls))
 
 
 def _checked(image: ArrayLike, options: MaterialOptions) -> FloatImage:
@@ -154,7 +160,7 @@ def _surely_background(contrast: FloatImage, options: MaterialOptions) -> tuple[
     if ratio < _APART:
         return np.zeros(contrast.shape, dtype=np.bool_), np.inf
     # Flat patches of a few joined speckles are dull, too, but not wide.
-    return _opened(dull, 0.25 * options.window_px), ratio
+    return opened(dull, 0.25 * options.window_px), ratio
 
 
 def _refined(
@@ -163,7 +169,7 @@ def _refined(
     """(material, share of it that looks like background), from the background's own level."""
     level, spread = _background_level(grey, sure, 4 * options.window_px)
     away = np.abs(grey - level)
-    inside = ~_grown(sure, options.window_px)
+    inside = ~grown(sure, options.window_px)
     inside = inside if inside.any() else ~sure
     # Half-way to the material's nearest levels where they leave a gap, else as near as the
     # noise allows.
@@ -171,44 +177,38 @@ def _refined(
     least = max(0.5 * nearest, _FAINTEST * float(np.ptp(grey)))
     alike = away < np.maximum(_SIGMAS * spread, least)
     share = float(alike[inside].mean())
-    alike = ~_without_small(~alike, _SPECK_PX2)  # single pixels of noise
-    wide = _opened(alike, options.reach_px)
-    parts, count = label(wide)
-    known = np.zeros(count + 1, dtype=np.bool_)
-    known[np.unique(parts[sure])] = True
-    known[0] = False
-    material = _without_small(~known[parts], options.window_px**2)
-    return material, share
+    alike = ~without_small(~alike, _SPECK_PX2)  # single pixels of noise
+    background = connected_to(sure, opened(alike, options.reach_px))
+    return without_small(~background, options.window_px**2), share
 
 
-def _opened(mask: BoolArray, radius: float) -> BoolArray:
-    """What of a mask a disk of this radius [px] can cover without leaving it."""
-    return _grown(_shrunk(mask, radius), radius)
+def _without_walls(
+    grey: FloatImage, material: BoolArray, options: MaterialOptions
+) -> tuple[BoolArray, float]:
+    """The material without what lies deeper, out of focus: (material, share taken away).
 
-
-def _shrunk(mask: BoolArray, px: float) -> BoolArray:
-    return ~_grown(~mask, px)
-
-
-def _grown(mask: BoolArray, px: float) -> BoolArray:
-    if not mask.any():  # has no distance
-        return mask
-    return np.asarray(distance_transform_edt(~mask) <= px)
-
-
-def _without_small(mask: BoolArray, px: int) -> BoolArray:
-    """The mask without connected parts of up to ``px`` pixels."""
-    parts, _ = label(mask)
-    keep = np.bincount(parts.ravel()) > px
-    keep[0] = False
-    return np.asarray(keep[parts])
+    Through a hole in a thick specimen the camera sees the hole's wall, bright but blurred.
+    """
+    window = max(5, int(_WALL_WINDOW * options.window_px))
+    fine = gaussian_filter(grey, 0.7) - gaussian_filter(grey, 2.7)
+    power = uniform_filter(fine.astype(np.float64) ** 2, window)
+    sharpness = np.sqrt(np.maximum(power, 0.0))
+    core = shrunk(material, window)
+    if not core.any():
+        return material, 0.0
+    dull = material & (sharpness < _WALL_SHARPNESS * float(np.median(sharpness[core])))
+    background = ~material
+    wall = opened(dull, 0.25 * window) & connected_to(background, dull | background)
+    # Near the edge the window holds some sharp material: a wall ends a little further on.
+    left = without_small(material & ~grown(wall, 0.45 * window), options.window_px**2)
+    return left, float((material & ~left).sum() / material.sum())
 
 
 def _background_level(
     grey: FloatImage, sure: BoolArray, reach: int
 ) -> tuple[FloatImage, FloatImage]:
     """(level, standard deviation) of the background nearby, carried on into the material."""
-    core = _shrunk(sure, 2.0)
+    core = shrunk(sure, 2.0)
     core = core if core.any() else sure
     mean = float(grey[core].mean())
     off = np.where(core, grey - mean, np.float32(0.0))  # small numbers, for running sums
@@ -225,7 +225,7 @@ def _around(image: NDArray[Any], reach: int) -> NDArray[Any]:
     return np.asarray(uniform_filter(uniform_filter(image, reach), reach))
 
 
-def _sentences(material: BoolArray, ratio: float, alike: float) -> tuple[str, ...]:
+def _sentences(material: BoolArray, ratio: float, alike: float, walls: float) -> tuple[str, ...]:
     said = [
         f"Material was found by its speckle, {100 * material.mean():.0f} % of the image, with "
         f"{ratio:.0f} times the contrast of the background."
@@ -234,5 +234,9 @@ def _sentences(material: BoolArray, ratio: float, alike: float) -> tuple[str, ..
         said.append(
             f"{100 * alike:.0f} % of the material has grey levels of the background; there its "
             "edge is known to some pixels only."
+        )
+    if walls > 0.0:
+        said.append(
+            f"At its edges, {100 * walls:.1f} % of it was out of focus and counts as background."
         )
     return tuple(said)

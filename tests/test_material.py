@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from modeharvest.errors import InputError
 from modeharvest.idic.material import MaterialOptions, find_material
@@ -79,6 +79,21 @@ def test_noise_free_images_will_do() -> None:
     truth = specimen()
     for background in (0.0, 0.2, 1.0):
         assert (find_material(image(background, 0.0, truth)).mask != truth).mean() < 0.008
+
+
+def test_walls_of_holes_out_of_focus_are_background() -> None:
+    truth = specimen()
+    grey = image(0.0, 0.01, truth)
+    inward = distance_transform_edt(~truth)
+    seen = ~truth & (inward < 24.0)  # at one side only, as of a hole in a thick specimen
+    seen[:, 230:] = False
+    blurred = gaussian_filter(Speckle(SpeckleSpec(seed=5), SHAPE).image(), 8.0)
+    grey += np.where(seen, 0.6 * blurred * (1.0 - inward / 24.0), 0.0)
+    material = find_material(grey)
+    assert "out of focus" in material.sentences[-1]
+    assert (seen & material.mask).sum() < 0.25 * seen.sum()
+    # Paid for by some px at the edges there, which hide in the same window.
+    assert (truth & ~material.mask).mean() < 0.01
 
 
 def test_without_a_background_all_is_material_and_that_is_said() -> None:
