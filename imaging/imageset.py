@@ -18,10 +18,15 @@ what makes the set anew:
 ``saturated_px``, ``doubly_covered_px``
     In each image's entry: material pixels at the highest level, and pixels inside more than one
     element, where the specimen overlaps.
+``light``
+    In each image's entry, if the light flickers: the factor on its irradiance.
 ``quadrature``
     In each image's entry, if the sensor averages: points a pixel and their error's bound.
 ``warnings``
     Sentences about what makes the images other than what a camera would show.
+
+With a distortion of the lens, images and masks are as the lens shows them, and the truth is on the
+ideal grid: what a measurement finds in images that were undistorted.
 
 For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
 """
@@ -44,6 +49,9 @@ import modeharvest
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
+from modeharvest.imaging.distorted import Positions, render_seen, seen_points
+from modeharvest.imaging.distortion import CameraDistortion
+from modeharvest.imaging.distortion_files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.integrate import Scene, integrate
 from modeharvest.imaging.io import read_image, read_mask, write_image
@@ -51,7 +59,7 @@ from modeharvest.imaging.isoparametric import Located, locate
 from modeharvest.imaging.render import Rendering, Truth, render_deformed, render_reference
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
 from modeharvest.imaging.truth import read_truth, write_truth
 from modeharvest.progress import Progress, silent
 
@@ -105,8 +113,11 @@ class ImageSet:
     def spec(self) -> ImagingSpec:
         """How the set was imaged."""
         values = dict(self.info["spec"])
-        values["speckle"] = SpeckleSpec(**values["speckle"])
+        speckle, lens = dict(values["speckle"]), values.get("distortion")
+        speckle["ink"] = Ink(**speckle["ink"]) if speckle.get("ink") else None
+        values["speckle"] = SpeckleSpec(**speckle)
         values["sensor"] = Sensor(**values.get("sensor", {}))
+        values["distortion"] = CameraDistortion(**lens) if isinstance(lens, dict) else lens
         return ImagingSpec(**values)
 
     @property
@@ -172,6 +183,9 @@ def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -
     wanted = {"format": FORMAT, "pixels": PIXELS, "spec": asdict(spec),
               "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
     digest.update(json.dumps(wanted, sort_keys=True).encode())
+    if isinstance(spec.distortion, str):
+        read_distortion(spec.distortion)  # says what is wrong with it
+        digest.update(_sha256(Path(spec.distortion)).encode())
     for array in (solution.mesh.nodes, solution.mesh.cells):
         digest.update(array.tobytes())
     for strain in strains:
@@ -260,14 +274,17 @@ def _write_set(
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
     scene = Scene(mesh, None, grid, speckle, spec.background, "undeformed mesh")
-    seen = render_reference(located, speckle, spec.background)
-    reference = _write_rendering(folder, "reference", "mask.tif", seen, scene, spec)
+    lens = spec.lens(grid.shape)
+    points = None if lens is None else seen_points(lens, grid.shape)
+    ideal = render_reference(located, speckle, spec.background)
+    shown = _through_lens(ideal, scene, points)
+    reference = _write_rendering(folder, "reference", "mask.tif", shown, scene, spec)
     snapshots = []
     for k, (strain, label) in enumerate(wanted):
         progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         where = f"snapshot at strain {strain:.4f}"
         moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
-        entry = _write_snapshot(moved, strain, label, located, spec, folder)
+        entry = _write_snapshot(moved, strain, label, located, points, spec, folder)
         snapshots.append({"branch": solution.at(strain).branch, **entry})
     residuals = [s["inverse_map_max_residual_px"] for s in snapshots]
     constant, slope = spec.sensor.noise_model(spec.bits)
@@ -290,17 +307,19 @@ def _write_snapshot(
     strain: float,
     label: str,
     located_reference: Located,
+    points: Positions | None,
     spec: ImagingSpec,
     folder: Path,
 ) -> dict[str, Any]:
     """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
     assert scene.displacement is not None
-    seen, truth = render_deformed(
+    ideal, truth = render_deformed(
         scene.mesh, scene.displacement, located_reference, scene.grid, scene.speckle,
         scene.background, scene.where,
     )  # fmt: skip
     name, truth_name = f"deformed_{label}", f"truth_{label}.h5"
-    images = _write_rendering(folder, name, f"{name}_mask.tif", seen, scene, spec)
+    shown = _through_lens(ideal, scene, points)
+    images = _write_rendering(folder, name, f"{name}_mask.tif", shown, scene, spec)
     write_truth(folder / truth_name, truth, strain, scene.grid)
     return {
         "nominal_strain": float(strain),
@@ -308,6 +327,17 @@ def _write_snapshot(
         "truth": truth_name,
         "inverse_map_max_residual_px": float(np.nanmax(truth.residual_px)),
     }
+
+
+def _through_lens(ideal: Rendering, scene: Scene, points: Positions | None) -> Rendering:
+    """What a lens shows that sees ``points`` at its pixels; None is a perfect lens."""
+    if points is None:
+        return ideal
+    shown = render_seen(
+        scene.mesh, scene.displacement, scene.grid, points, scene.speckle, scene.background,
+        scene.where,
+    )  # fmt: skip
+    return replace(shown, doubly_covered=ideal.doubly_covered)
 
 
 def _write_rendering(
@@ -320,6 +350,9 @@ def _write_rendering(
         averaged, quadrature = integrate(scene, sensor.aperture, mask)
         irradiance = averaged.astype(np.float32)
         entry["quadrature"] = asdict(quadrature)
+    if sensor.flicker > 0.0:
+        irradiance = np.float32(sensor.light(name)) * irradiance
+        entry["light"] = sensor.light(name)
     mean, levels = sensor.mean(irradiance), sensor.expose(irradiance, spec.bits, name)
     camera_name = f"{name}_{spec.bits}bit.tif"
     write_image(folder / f"{name}.tif", mean)

@@ -54,8 +54,10 @@ class Sensor:
         Standard deviation of the read noise [fraction of full scale].
     saturation
         Grey level that is never exceeded [fraction of full scale].
-    shot_seed, read_seed
-        Seeds of the two noises; every image of a set has streams of its own.
+    flicker
+        Relative standard deviation of the light from image to image [-], even over an image.
+    shot_seed, read_seed, flicker_seed
+        Seeds of the noises; every image of a set has streams of its own.
 
     Raises
     ------
@@ -72,6 +74,8 @@ class Sensor:
     saturation: float = 1.0
     shot_seed: int = 0
     read_seed: int = 0
+    flicker: float = 0.0
+    flicker_seed: int = 0
 
     def __post_init__(self) -> None:
         _ = self.aperture  # checks fill factor and point spread
@@ -93,7 +97,11 @@ class Sensor:
             raise InputError(
                 f"sensor: expected saturation above 0 and at most 1 (white), got {self.saturation}"
             )
-        for seed in (self.shot_seed, self.read_seed):
+        if not 0.0 <= self.flicker <= 0.2:
+            raise InputError(
+                f"sensor: expected a flicker of 0 to 0.2 (20 %) of the light, got {self.flicker}"
+            )
+        for seed in (self.shot_seed, self.read_seed, self.flicker_seed):
             if seed < 0:
                 raise InputError(f"sensor: expected seeds of 0 or more, got {seed}")
 
@@ -101,6 +109,13 @@ class Sensor:
     def aperture(self) -> Aperture:
         """What a pixel averages."""
         return Aperture(self.fill_factor, self.psf_px)
+
+    def light(self, name: str) -> float:
+        """Factor on an image's irradiance, 1 on average, by its name in its set."""
+        if self.flicker == 0.0:
+            return 1.0
+        draw = _stream(self.flicker_seed, "flicker", name).standard_normal()
+        return float(np.exp(self.flicker * draw))
 
     def mean(self, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
         """Grey levels without noise, cut-off and rounding [fraction of full scale]."""

@@ -10,6 +10,9 @@ import numpy as np
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
+from modeharvest.imaging.distorted import without_affine
+from modeharvest.imaging.distortion import CameraDistortion
+from modeharvest.imaging.distortion_files import AnyDistortion, read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
@@ -35,6 +38,15 @@ class ImagingSpec:
         The pattern.
     sensor
         What a pixel averages, and its noise; the default shows points without noise.
+    distortion
+        Of the lens: a camera's, or a file that :func:`read_distortion
+        <modeharvest.imaging.distortion_files.read_distortion>` reads; None is a perfect lens.
+        Where there is one, pixels show points, in the images and in their masks as the lens
+        distorts them; the truth stays on the ideal grid, that of the images once undistorted.
+    affine_distortion
+        False takes the distortion's affine part away (see :func:`without_affine
+        <modeharvest.imaging.distorted.without_affine>`): it is no more than another pixel size,
+        and can't be told from the images of a target whose shifts are unknown.
 
     Raises
     ------
@@ -49,6 +61,8 @@ class ImagingSpec:
     bits: int = 8
     speckle: SpeckleSpec = field(default_factory=SpeckleSpec)
     sensor: Sensor = field(default_factory=Sensor)
+    distortion: CameraDistortion | str | None = None
+    affine_distortion: bool = True
 
     def __post_init__(self) -> None:
         if not (self.pixel_size > 0.0 and math.isfinite(self.pixel_size)):
@@ -59,8 +73,29 @@ class ImagingSpec:
             raise InputError(f"imaging: expected a background in 0 ... 1, got {self.background}")
         if not 1 <= self.bits <= 16:
             raise InputError(f"imaging: expected 1 to 16 bits, got {self.bits}")
+        two_layers, distorted = self.speckle.ink is not None, self.distortion is not None
+        if (two_layers or distorted) and not self.sensor.aperture.is_point:
+            raise InputError(
+                "imaging: expected pixels that show points (fill_factor = 0, psf_px = 0) with a "
+                "distortion or a second layer of speckle, got pixels that average"
+            )
         if self.shape is not None:
             object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+
+    def lens(self, shape: tuple[int, int]) -> AnyDistortion | None:
+        """The distortion of images of that size, (rows, cols) [px]; None for a perfect lens.
+
+        Raises
+        ------
+        InputError
+            If it is in a file that can't be read.
+        """
+        lens: AnyDistortion | str | None = self.distortion
+        if isinstance(lens, str):
+            lens = read_distortion(lens)
+        if lens is None or self.affine_distortion:
+            return lens
+        return without_affine(lens, shape)
 
 
 def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> PixelGrid:

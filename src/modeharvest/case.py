@@ -12,11 +12,15 @@ Python objects use the same names and units::
     [imaging.speckle]         # imaging.speckle.SpeckleSpec
     [correlation]             # idic.setup.Identification
 
+A table ``[calibration]`` (imaging.calibration_target.CalibrationTarget) makes it the twin of a
+real experiment: photographs through a lens that has to be calibrated first, to be harvested.
+
 Infinite lattices have cases of their own: :mod:`modeharvest.lattice.case`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +42,10 @@ from modeharvest.case_file import (
 from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.idic.setup import Identification
+from modeharvest.imaging.calibration_target import CalibrationTarget
 from modeharvest.imaging.spec import ImagingSpec
 
-__all__ = ["Case", "case_text", "read_case", "shipped_cases", "shipped_solution"]
+__all__ = ["Case", "TwinCase", "case_text", "read_case", "shipped_cases", "shipped_solution"]
 
 
 class Case(CaseModel):
@@ -67,8 +72,21 @@ class Case(CaseModel):
         return content
 
 
+class TwinCase(Case):
+    """The twin of a real experiment: its specimen, its photographs, those of the calibration."""
+
+    calibration: CalibrationTarget = CalibrationTarget()
+
+
+def is_twin(tables: Mapping[str, Any]) -> bool:
+    """Whether tables describe the twin of a real experiment."""
+    return "calibration" in tables
+
+
 def read_case(name: str | Path) -> Case:
     """Read a case by the name of a shipped one or by the path of a TOML file.
+
+    The twin of a real experiment is a :class:`TwinCase`.
 
     Raises
     ------
@@ -82,4 +100,4 @@ def read_case(name: str | Path) -> Case:
             f"{name}: expected a virtual experiment, got an infinite lattice; run 'modeharvest "
             f"modes {name} --out DIR', or 'modeharvest bloch {name} --out DIR' for its stability"
         )
-    return checked(Case, tables, name)
+    return checked(TwinCase if is_twin(tables) else Case, tables, name)
