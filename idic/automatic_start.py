@@ -5,18 +5,17 @@ Modes": a displacement field, its spectral densities, the waves that they show, 
 these belong to. The field is a local DIC's where there is one, and otherwise a rough one that the
 images give by themselves (:mod:`modeharvest.idic.coarse_field`).
 
-1. v0: through the local field; else through the motion of hole centres; else of the outlines.
-2. A field, rough or measured, and its spectrum over the cellular part.
+1. v0: through the motion of hole centres, or of outlines; not needed with a local DIC's field.
+2. A field, rough or measured, and its spectrum over each region.
 3. Modes: the square family with seven parameters, or free waves, or the pattern that the lattice of
    holes allows, held, where the images show none.
-4. v0 and every v_i once more, together, by robust least squares through the field.
+4. v0 and every v_i, together, by robust least squares through the field.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,29 +23,29 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.coarse_field import Slow, coarse_field
+from modeharvest.idic.coarse_field import coarse_field
 from modeharvest.idic.fourier import FourierMode
 from modeharvest.idic.inputs import checked_mask
 from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.measured_spectrum import measured_spectrum
 from modeharvest.idic.pattern import Pattern, read_pattern
 from modeharvest.idic.spectrum import Spectrum
-from modeharvest.idic.start_fits import RobustFit, degree_for, fit_unknowns, outline_motion
+from modeharvest.idic.start_fits import RobustFit, fit_unknowns
 from modeharvest.idic.start_modes import (
+    Cells,
     StartMode,
     held_square,
-    is_square,
-    lattice_vectors,
     modes_of,
     require_cell_size,
 )
+from modeharvest.idic.start_motion import SLOW_DEGREE, first_motion
 from modeharvest.idic.support import Taper
 from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
+_Placed = tuple[StartMode, Box]
+"""A mode and its region."""
 
-SLOW_DEGREE = 3
-"""Total degree of v0 at the start, at most: what bends and barrels, but doesn't follow cells."""
 AMPLITUDE_DEGREE = 2
 """Total degree of every v_i at the start: strongest in the middle, weaker at clamped edges."""
 HELD_AMPLITUDE = 1.0
@@ -71,6 +70,28 @@ class StartOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class Region:
+    """A part of the specimen with a pattern of its own.
+
+    Parameters
+    ----------
+    box
+        Where [mm].
+    spectrum
+        Of the field there.
+    pattern
+        What the spectrum shows.
+    modes
+        Indices of the ansatz's modes that belong to it.
+    """
+
+    box: Box
+    spectrum: Spectrum
+    pattern: Pattern
+    modes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Start:
     """Where a correlation begins, and why there.
 
@@ -80,14 +101,10 @@ class Start:
         With the modes found.
     unknowns
         (size,) for :func:`modeharvest.idic.correlate.correlate`.
-    family
-        Names of the modes' families.
-    pattern
-        What the spectrum shows.
-    spectrum
-        Of the field that the start was read from.
+    regions
+        One or more, with their spectra.
     local
-        That field.
+        The field that the start was read from.
     held
         Whether the modes are held because no pattern is seen.
     sentences
@@ -96,12 +113,25 @@ class Start:
 
     ansatz: Ansatz
     unknowns: FloatArray
-    family: str
-    pattern: Pattern
-    spectrum: Spectrum
+    regions: tuple[Region, ...]
     local: LocalField
     held: bool
     sentences: tuple[str, ...]
+
+    @property
+    def family(self) -> str:
+        """Names of the modes' families."""
+        return " and ".join(mode.family.name for mode in self.ansatz.modes) or "none"
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """Of the first region."""
+        return self.regions[0].spectrum
+
+    @property
+    def pattern(self) -> Pattern:
+        """Of the first region."""
+        return self.regions[0].pattern
 
 
 def automatic_start(
@@ -109,7 +139,7 @@ def automatic_start(
     deformed: ArrayLike,
     grid: PixelGrid,
     cell_size: float,
-    cellular: Box,
+    cellular: Box | Sequence[Box],
     mask: ArrayLike | None = None,
     deformed_mask: ArrayLike | None = None,
     *,
@@ -128,13 +158,13 @@ def automatic_start(
     grid
         Their pixels.
     cell_size
-        l [mm].
+        l, the distance of neighbouring holes [mm].
     cellular
-        The part with holes, or the region with a pattern of its own [mm].
+        The part with holes [mm]; or several parts, each with modes of its own.
     mask, deformed_mask
         (rows, cols) True on material.
     local
-        A displacement field of a local DIC.
+        A displacement field of a local DIC; the images are not looked at then.
     holes
         (n, 2) hole centres in the reference and (n, 2) their displacements [mm].
     lattice
@@ -147,42 +177,102 @@ def automatic_start(
     Raises
     ------
     InputError
-        If the lattice or the spectrum contradict the cell size, or the images are no pair.
+        If the holes or the spectrum contradict the cell size, or the images are no pair.
     """
     options = options or StartOptions()
-    vectors = lattice_vectors(cell_size, lattice)
-    inside, landing = (
-        checked_mask(mask, "mask", grid),
-        checked_mask(deformed_mask, "deformed mask", grid),
-    )
+    inside = checked_mask(mask, "mask", grid)
+    landing = checked_mask(deformed_mask, "deformed mask", grid)
+    boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)
     domain = domain or _bounding_box(inside, grid)
-    slow = Ansatz(domain, (), min(SLOW_DEGREE, options.v0_degree), 0)
+    cells = Cells.found(cell_size, lattice, inside, grid, boxes, holes)
     said: list[str] = []
     if local is None:
-        known = _slow_motion(slow, inside, landing, grid, holes, said)
+        known, sentence = first_motion(domain, grid, inside, landing, holes)
         local = coarse_field(reference, deformed, grid, cell_size, known, inside, landing)
-        said.append(f"No local DIC is given: {local.x.size} points of the {local.source} stand in.")
+        said += [sentence, f"Without a local DIC: {local.x.size} points of {local.source}."]
     else:
-        said.append(
-            f"Local field {local.source}: {local.x.size} points, {100 * local.valid_share:.1f} % "
-            "of them valid."
-        )
-    spectrum = measured_spectrum(local, cell_size, cellular)
+        share = 100 * local.valid_share
+        said.append(f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid.")
+    regions: list[Region] = []
+    modes: list[_Placed] = []
+    for box in boxes:
+        region, found = _read_region(local, box, cells, len(modes), said)
+        regions.append(region)
+        modes += found
+    held = not modes
+    if held:
+        modes = _held_mode(boxes[0], cells, said)
+    ansatz, a = _assembled(modes, cell_size, domain, options)
+    fit = _fitted(ansatz, a, local, held)
+    said.append(_fit_words(ansatz, fit, held))
+    return Start(ansatz, fit.coefficients, tuple(regions), local, held, tuple(said))
+
+
+def _read_region(
+    local: LocalField, box: Box, cells: Cells, first: int, said: list[str]
+) -> tuple[Region, list[_Placed]]:
+    """Read the spectrum of one region, and make its modes."""
+    spectrum = measured_spectrum(local, cells.cell_size, box)
     pattern = read_pattern(spectrum)
     said += pattern.sentences
-    if lattice is None:
-        require_cell_size(pattern, cell_size)
-    held = not pattern.waves
-    modes = (
-        _held_mode(vectors, cell_size, cellular, holes, said)
-        if held
-        else modes_of(pattern, vectors, cell_size)
+    if not cells.given:
+        require_cell_size(pattern, cells.cell_size)
+    modes = modes_of(pattern, cells) if pattern.waves else []
+    if len(modes) > 1:
+        said.append(
+            f"The waves share no vector of the reciprocal lattice: {len(modes)} modes, each with "
+            "an amplitude of its own."
+        )
+    numbers = tuple(range(first, first + len(modes)))
+    return Region(box, spectrum, pattern, numbers), [(mode, box) for mode in modes]
+
+
+def _held_mode(box: Box, cells: Cells, said: list[str]) -> list[_Placed]:
+    """The pattern that a square lattice allows; none on others, of which we don't know it."""
+    if not cells.square:
+        said.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
+        return []
+    said.append(
+        "The mode is held at the square pattern that the lattice of holes allows: without a "
+        "pattern, its parameters can't be seen."
     )
-    ansatz, a = _assembled(modes, cell_size, cellular, domain, options)
-    fit = _fitted(ansatz, a, local, held)
-    said.append(_fit_words(ansatz, fit.sd, fit.outliers, held))
-    family = " and ".join(m.family.name for m in modes)
-    return Start(ansatz, fit.coefficients, family, pattern, spectrum, local, held, tuple(said))
+    return [(StartMode(held_square(cells), 0.0), box)]
+
+
+def _assembled(
+    modes: Sequence[_Placed], cell_size: float, domain: Box, options: StartOptions
+) -> tuple[Ansatz, FloatArray]:
+    """The ansatz, and unknowns in which every v_i is a constant."""
+    fourier = tuple(
+        FourierMode.scaled(mode.family, cell_size, Taper(box, 0.5 * cell_size))
+        for mode, box in modes
+    )
+    ansatz = Ansatz(domain, fourier, options.v0_degree, options.v_degree, options.brightness)
+    a = ansatz.start()
+    for i, (mode, _) in enumerate(modes):
+        a[ansatz.v_slice(i)][0] = mode.amplitude / fourier[i].scale or HELD_AMPLITUDE
+    return ansatz, a
+
+
+def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, held: bool) -> RobustFit:
+    """v0 and every v_i through the field; a mode that can't be seen isn't fitted."""
+    x, y, u = local.valid_points()
+    points = np.column_stack([x, y])
+    slow = min(SLOW_DEGREE, ansatz.v0_degree)
+    if not held:
+        return fit_unknowns(ansatz, a, points, u, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
+    alone = replace(ansatz, modes=(), brightness=Brightness())
+    fit = fit_unknowns(alone, np.zeros(alone.size), points, u, slow, -1)
+    return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
+
+
+def _fit_words(ansatz: Ansatz, fit: RobustFit, held: bool) -> str:
+    modes = () if held else ansatz.modes
+    what = " and ".join(["v0", *(f"v{i + 1}" for i in range(len(modes)))])
+    return (
+        f"{what} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
+        "aside."
+    )
 
 
 def _bounding_box(mask: NDArray[np.bool_] | None, grid: PixelGrid) -> Box:
@@ -193,97 +283,3 @@ def _bounding_box(mask: NDArray[np.bool_] | None, grid: PixelGrid) -> Box:
     x, y = grid.to_mm(rows, cols)
     h = 0.5 * grid.pixel_size
     return Box(float(x[0]) - h, float(x[1]) + h, float(y[1]) - h, float(y[0]) + h)
-
-
-def _slow_motion(
-    slow: Ansatz,
-    mask: NDArray[np.bool_] | None,
-    deformed_mask: NDArray[np.bool_] | None,
-    grid: PixelGrid,
-    holes: tuple[ArrayLike, ArrayLike] | None,
-    said: list[str],
-) -> Slow:
-    """The slow field by what is given: hole centres, else outlines, else none."""
-    if holes is not None:
-        centres, moved = (np.asarray(h, dtype=np.float64) for h in holes)
-        good = np.isfinite(np.hstack([centres, moved])).all(axis=1)
-        degree = degree_for(int(good.sum()), slow.v0_degree)
-        if degree:
-            zero = np.zeros(slow.size)
-            fit = fit_unknowns(slow, zero, centres[good], moved[good], degree, -1)
-            said.append(
-                f"v0 through the motion of {good.sum()} hole centres: degree {degree}, leaves "
-                f"{1e3 * fit.sd:.0f} µm, {fit.outliers} of {2 * good.sum()} components set aside."
-            )
-            return partial(slow.displacement_at, fit.coefficients)
-    affine = None
-    if mask is not None and deformed_mask is not None:
-        affine = outline_motion(mask, deformed_mask, grid)
-    if affine is None:
-        said.append("v0 starts from no motion: neither hole centres nor whole outlines are seen.")
-        return np.zeros_like
-    said.append(
-        f"v0 through the outlines: {100 * affine[0, 1]:+.1f} % along x and "
-        f"{100 * affine[1, 2]:+.1f} % along y."
-    )
-    plane = affine
-    return lambda points: plane[:, 0] + points @ plane[:, 1:].T
-
-
-def _held_mode(
-    vectors: FloatArray,
-    cell_size: float,
-    cellular: Box,
-    holes: tuple[ArrayLike, ArrayLike] | None,
-    said: list[str],
-) -> list[StartMode]:
-    """The pattern that a square lattice allows; none on others, of which we don't know it."""
-    if not is_square(vectors):
-        said.append("No pattern is seen and the lattice isn't square: v0 alone.")
-        return []
-    if holes is None:
-        hole = np.array([cellular.x_min, cellular.y_min]) + 0.5 * vectors.sum(axis=0)
-    else:
-        hole = np.asarray(holes[0], dtype=np.float64)[0]
-    said.append(
-        "The mode is held at the square pattern that the lattice of holes allows: without a "
-        "pattern, its parameters can't be seen."
-    )
-    return [StartMode(held_square(vectors, cell_size, hole - 0.5 * vectors.sum(axis=0)), 0.0)]
-
-
-def _assembled(
-    modes: Sequence[StartMode],
-    cell_size: float,
-    cellular: Box,
-    domain: Box,
-    options: StartOptions,
-) -> tuple[Ansatz, FloatArray]:
-    """The ansatz, and unknowns in which every v_i is a constant."""
-    taper = Taper(cellular, 0.5 * cell_size)
-    fourier = tuple(FourierMode.scaled(mode.family, cell_size, taper) for mode in modes)
-    ansatz = Ansatz(domain, fourier, options.v0_degree, options.v_degree, options.brightness)
-    a = ansatz.start()
-    for i, mode in enumerate(modes):
-        a[ansatz.v_slice(i)][0] = mode.amplitude / fourier[i].scale or HELD_AMPLITUDE
-    return ansatz, a
-
-
-def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, held: bool) -> RobustFit:
-    x, y, u = local.valid_points()
-    points = np.column_stack([x, y])
-    degrees = min(SLOW_DEGREE, ansatz.v0_degree), min(AMPLITUDE_DEGREE, ansatz.v_degree)
-    if not held:
-        return fit_unknowns(ansatz, a, points, u, *degrees)
-    # A mode that can't be seen isn't fitted either.
-    without = replace(ansatz, modes=())
-    fit = fit_unknowns(without, np.zeros(without.size), points, u, degrees[0], -1)
-    a = a.copy()
-    n = 2 * ansatz.v0_space.size
-    a[:n] = fit.coefficients[:n]
-    return replace(fit, coefficients=a)
-
-
-def _fit_words(ansatz: Ansatz, sd: float, outliers: int, held: bool) -> str:
-    what = "v0" if held else "v0 and " + ", ".join(f"v{i + 1}" for i in range(len(ansatz.modes)))
-    return f"{what} through the field: leaves {1e3 * sd:.0f} µm, {outliers} components set aside."

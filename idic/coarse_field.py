@@ -33,7 +33,7 @@ BLUR = 2.0
 """Of the binned images [binned px]."""
 RADIUS = 7
 """Of a window [binned px]."""
-WARPS = 20
+WARPS = 8
 """Iterations on each level of the flow's own pyramid."""
 STEP = 2
 """Distance of the field's points [binned px]."""

@@ -13,13 +13,17 @@ from modeharvest.idic.waves import Peak, Wave, explained, find_peaks, fit_waves
 
 FloatArray = NDArray[np.float64]
 
-SECONDARY_PEAK = 0.25
-"""A peak belongs to the pattern if it has this share of the largest one's density."""
+SECONDARY_PEAK = 0.05
+"""A peak may belong to the pattern if it has this share of the largest one's density. A wave half
+as strong has a quarter; the holes take more away from a wave that changes sign from cell to cell,
+if they lie where it is largest."""
+MOST_PEAKS = 8
+"""No more peaks than this are looked at."""
 MOST_WAVES = 4
-"""No more peaks than this are fitted as waves."""
-COPY = 0.25
-"""A wave weaker than this share of the strongest, once all are fitted, has a peak only because the
-holes repeat another wave there, and is left out."""
+"""No more waves than this are fitted."""
+GROWTH = 0.05
+"""A further wave belongs to the pattern if it describes this much more of the field than those
+before; a peak that is there only because the holes repeat another wave describes nothing more."""
 SMALLEST_AMPLITUDE = 0.005
 """Mean amplitude of the strongest wave [l] below which there is no pattern."""
 SMALLEST_CONTRAST = 100.0
@@ -92,7 +96,7 @@ def read_pattern(spectrum: Spectrum) -> Pattern:
         return _no_pattern(None, "No pattern: no maximum outside the lines of the edges.")
     largest = peaks[0]
     chosen = [p for p in peaks if p.density >= SECONDARY_PEAK * largest.density]
-    waves = _without_copies(spectrum, chosen[:MOST_WAVES])
+    waves = fit_waves(spectrum, _pursued(spectrum, chosen[:MOST_PEAKS]))
     strength = max(w.strength for w in waves)
     share = explained(spectrum, waves)
     hidden = largest.contrast < SMALLEST_CONTRAST and share < LARGE_SHARE
@@ -109,11 +113,17 @@ def read_pattern(spectrum: Spectrum) -> Pattern:
     return _described(tuple(waves), largest, spectrum.pitch)
 
 
-def _without_copies(spectrum: Spectrum, peaks: list[Peak]) -> list[Wave]:
-    waves = fit_waves(spectrum, peaks)
-    least = COPY * max(w.strength for w in waves)
-    kept = [p for p, w in zip(peaks, waves, strict=True) if w.strength >= least]
-    return waves if len(kept) == len(peaks) else fit_waves(spectrum, kept)
+def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
+    """Take the largest peak, then whichever describes most of what is left (matching pursuit)."""
+    chosen, left, share = [peaks[0]], peaks[1:], explained(spectrum, peaks[:1])
+    while left and len(chosen) < MOST_WAVES:
+        shares = [explained(spectrum, [*chosen, peak]) for peak in left]
+        best = int(np.argmax(shares))
+        if shares[best] < (1.0 + GROWTH) * share:
+            break
+        chosen.append(left.pop(best))
+        share = shares[best]
+    return chosen
 
 
 def _no_pattern(largest: Peak | None, sentence: str) -> Pattern:

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 HUBER = 1.345
 """Residual beyond which a point counts less [standard deviations]; 95 % efficient for normal
@@ -23,8 +20,6 @@ SET_ASIDE = 5.0
 MOST_POINTS = 6000
 """Points of a field that are used; more would not make a start better."""
 _ROUNDS = 30
-_AFFINE = 3
-"""Terms of a plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,29 +112,3 @@ def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.int
     places = [ansatz.v0_slice(c).start + k for c in (0, 1) for k in low0]
     places += [ansatz.v_slice(m).start + k for m in range(len(ansatz.modes)) for k in low]
     return np.array(places, dtype=np.intp)
-
-
-def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> FloatArray | None:
-    """Affine motion that takes one outline to the other, by area, centre and second moments.
-
-    The holes are filled, so that it doesn't matter how they close. A rotation can't be seen in
-    moments and is taken to be none.
-
-    Returns
-    -------
-    (2, 3) u_i = affine[i] · (1, x, y) [mm], [-], [-]; None if material reaches the image's border,
-    where an outline says nothing.
-    """
-    moments = []
-    for inside in (mask, deformed_mask):
-        if inside[[0, -1]].any() or inside[:, [0, -1]].any():
-            return None
-        row, col = np.nonzero(ndimage.binary_fill_holes(inside))
-        points = np.column_stack(grid.to_mm(row, col))
-        moments.append((points.mean(axis=0), points.std(axis=0)))
-    (centre, size), (centre_now, size_now) = moments
-    stretch = size_now / size
-    affine = np.zeros((2, _AFFINE))
-    affine[:, 0] = centre_now - stretch * centre
-    affine[0, 1], affine[1, 2] = stretch - 1.0
-    return affine

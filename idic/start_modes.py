@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.equivalents import mode_equivalent
 from modeharvest.idic.fourier import ModeFamily, free_family, square_family
 from modeharvest.idic.pattern import Pattern
+from modeharvest.idic.start_motion import WRONG_CELL, hole_centres, require_hole_distance
 from modeharvest.idic.waves import Wave
+from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
 
-WRONG_CELL = 0.07
-"""Relative difference of the cell size that peaks belong to from the one given, beyond which they
-contradict it: over the paper's six cells the phase then drifts by 1.3 rad, and a correlation may
-settle in a local minimum. Peaks of a measured field are known to a few hundredths."""
 DIAGONAL = 0.1
 """Difference of |kx| and |ky|, relative, up to which a wave lies along a diagonal."""
 SAME_WAVE = 0.15
@@ -43,13 +43,78 @@ class StartMode:
     amplitude: float
 
 
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The lattice of holes.
+
+    Parameters
+    ----------
+    cell_size
+        l, the distance of neighbouring holes [mm].
+    vectors
+        (2, 2) lattice vectors as rows [mm].
+    given
+        Whether they were given, or are square for want of better knowledge.
+    hole
+        (2,) centre of one hole [mm].
+    """
+
+    cell_size: float
+    vectors: FloatArray
+    given: bool
+    hole: FloatArray
+
+    @classmethod
+    def found(
+        cls,
+        cell_size: float,
+        lattice: ArrayLike | None,
+        mask: NDArray[np.bool_] | None,
+        grid: PixelGrid,
+        boxes: Sequence[Box],
+        holes: tuple[ArrayLike, ArrayLike] | None,
+    ) -> Cells:
+        """Take what is given, and look at the mask for the rest; raises InputError if at odds."""
+        if not cell_size > 0:
+            raise InputError(f"automatic start: expected a positive cell size, got {cell_size} mm")
+        vectors = lattice_vectors(cell_size, lattice)
+        centres = np.zeros((0, 2)) if holes is None else np.asarray(holes[0], np.float64)
+        if not len(centres) and mask is not None:
+            centres = np.vstack([hole_centres(mask, grid, box, cell_size) for box in boxes])
+        centres = centres[np.isfinite(centres).all(axis=1)]
+        require_hole_distance(centres, cell_size)
+        corner = np.array([boxes[0].x_min, boxes[0].y_min])
+        hole = _middle_hole(centres, vectors) if len(centres) else corner + vectors.sum(axis=0) / 2
+        return cls(cell_size, vectors, lattice is not None, hole)
+
+    @property
+    def square(self) -> bool:
+        """Whether the lattice vectors are as long as each other, and at right angles."""
+        a, b = np.linalg.norm(self.vectors, axis=1)
+        cosine = abs(self.vectors[0] @ self.vectors[1]) / (a * b)
+        return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
+
+    @property
+    def junction(self) -> FloatArray:
+        """(2,) the middle of the solid between four holes [mm]."""
+        return np.asarray(self.hole - 0.5 * self.vectors.sum(axis=0))
+
+
+def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(2,) where the hole in the middle should be, by itself and its neighbours [mm]."""
+    middle = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
+    steps = np.linalg.solve(vectors.T, (centres - middle).T).T
+    near = np.abs(steps).max(axis=1) < 1.5
+    return np.asarray((centres - np.round(steps) @ vectors)[near].mean(axis=0))
+
+
 def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
 
     Raises
     ------
     InputError
-        If the lattice given isn't one, or has no distance that is the cell size within 7 %.
+        If the lattice given isn't one, or its shortest distance isn't the cell size within 7 %.
     """
     if lattice is None:
         return cell_size * np.eye(2)
@@ -58,26 +123,19 @@ def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
         raise InputError(
             f"automatic start: expected two lattice vectors [mm] as rows, got {vectors.tolist()}"
         )
-    i = np.arange(-3, 4)
-    lengths = np.linalg.norm(np.stack(np.meshgrid(i, i), -1).reshape(-1, 2) @ vectors, axis=1)
-    lengths = np.sort(lengths[lengths > 0])
-    nearest = lengths[np.argmin(np.abs(lengths - cell_size))]
-    if abs(nearest - cell_size) > WRONG_CELL * cell_size:
+    i = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
+    lengths = np.linalg.norm(i[np.any(i != 0, axis=1)] @ vectors, axis=1)
+    shortest = float(lengths.min())
+    if abs(shortest - cell_size) > WRONG_CELL * cell_size:
         raise InputError(
-            f"automatic start: expected a cell size that is a distance of holes, got {cell_size:g} "
-            f"mm where the holes repeat every {lengths[0]:.3g} mm; give cell size {lengths[0]:.3g}"
+            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got a "
+            f"lattice of holes {shortest:.3g} mm apart; give cell size {shortest:.3g} mm, or check "
+            "the pixel size"
         )
-    if abs(vectors[1, 0]) * abs(vectors[0, 1]) > abs(vectors[0, 0]) * abs(vectors[1, 1]):
+    if np.prod(np.abs(np.diag(vectors[::-1]))) > np.prod(np.abs(np.diag(vectors))):
         vectors = vectors[::-1]
-    signs = np.sign([vectors[0, 0] or 1.0, vectors[1, 1] or 1.0])
+    signs = np.where(np.diag(vectors) < 0, -1.0, 1.0)
     return np.asarray(vectors * signs[:, None])
-
-
-def is_square(vectors: FloatArray) -> bool:
-    """Whether two lattice vectors are as long as each other, and at right angles."""
-    a, b = np.linalg.norm(vectors, axis=1)
-    cosine = abs(vectors[0] @ vectors[1]) / (a * b)
-    return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
 
 
 def require_cell_size(pattern: Pattern, cell_size: float) -> None:
@@ -99,7 +157,7 @@ def require_cell_size(pattern: Pattern, cell_size: float) -> None:
         )
 
 
-def modes_of(pattern: Pattern, vectors: FloatArray, cell_size: float) -> list[StartMode]:
+def modes_of(pattern: Pattern, cells: Cells) -> list[StartMode]:
     """Modes for the waves of a pattern: the paper's family if it is the square one, else free ones.
 
     Waves whose vectors differ by one of the reciprocal lattice are coupled by the holes, and make
@@ -109,11 +167,10 @@ def modes_of(pattern: Pattern, vectors: FloatArray, cell_size: float) -> list[St
     ----------
     pattern
         With at least one wave.
-    vectors
-        (2, 2) of the lattice of holes [mm].
-    cell_size
-        l [mm].
+    cells
+        The lattice of holes.
     """
+    cell_size = cells.cell_size
     if pattern.start is not None:
         family = square_family()
         off = []
@@ -125,7 +182,7 @@ def modes_of(pattern: Pattern, vectors: FloatArray, cell_size: float) -> list[St
         return [StartMode(replace(family, name="square"), sign * pattern.start_amplitude)]
     groups: list[list[Wave]] = []
     for wave in pattern.waves:
-        home = next((g for g in groups if _coupled(g[0], wave, vectors, cell_size)), None)
+        home = next((g for g in groups if _coupled(g[0], wave, cells)), None)
         if home is None:
             groups.append([wave])
         else:
@@ -133,15 +190,13 @@ def modes_of(pattern: Pattern, vectors: FloatArray, cell_size: float) -> list[St
     return [_free_mode(group) for group in groups]
 
 
-def _coupled(one: Wave, other: Wave, vectors: FloatArray, cell_size: float) -> bool:
+def _coupled(one: Wave, other: Wave, cells: Cells) -> bool:
     """Whether two wave vectors, or one and the other's opposite, differ by a reciprocal vector."""
     for sign in (1.0, -1.0):
-        difference = (np.array(other.xi) - sign * np.array(one.xi)) / cell_size
-        periods = vectors @ difference
-        if (
-            np.abs((periods - np.round(periods)) @ np.linalg.inv(vectors).T).max() * cell_size
-            <= SAME_WAVE
-        ):
+        apart = (np.array(other.xi) - sign * np.array(one.xi)) / cells.cell_size
+        periods = cells.vectors @ apart
+        left = np.linalg.solve(cells.vectors, periods - np.round(periods)) * cells.cell_size
+        if np.linalg.norm(left) <= SAME_WAVE:
             return True
     return False
 
@@ -154,19 +209,8 @@ def _free_mode(waves: list[Wave]) -> StartMode:
     return StartMode(free_family(rows, f"{count}, free"), amplitude)
 
 
-def held_square(vectors: FloatArray, cell_size: float, junction: ArrayLike) -> ModeFamily:
-    """The square pattern that the holes allow, without parameters: for images that show none.
-
-    Parameters
-    ----------
-    vectors
-        (2, 2) of the lattice of holes [mm].
-    cell_size
-        l [mm].
-    junction
-        (2,) a point of the solid between four holes [mm].
-    """
-    first, second = cell_size * np.linalg.inv(vectors).T
-    family = square_family()
+def held_square(cells: Cells) -> ModeFamily:
+    """The square pattern that the holes allow, without parameters: for images that show none."""
+    first, second = cells.cell_size * np.linalg.inv(cells.vectors).T
     start = np.array([1.0, *(first + second), *(second - first), 0.0, 0.0])
-    return replace(family, start=start).moved(junction).held()
+    return replace(square_family(), start=start).moved(cells.junction).held()

@@ -4,7 +4,9 @@ Peaks are looked for away from the lines that the specimen's edges cause. The ju
 deformation at a vertical edge spreads energy along ξ2 = 0, at a horizontal edge along ξ1 = 0,
 about l/L wide, L being the material's height or width; and as the holes repeat with the
 period l, copies of the lines stand at whole numbers of ξ1 and ξ2. Wave vectors within two
-such widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are left out.
+such widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are left out, unless they
+stand out against the line itself, which falls off slowly along its length, where a wave is a peak
+(one of the three waves of a hexagonal lattice lies on such a line).
 
 The peak tells where a wave is. Its amplitude and phase can't be read off û alone, because the
 holes couple waves whose vectors differ by whole numbers of 1/l, and the diagonals of the
@@ -28,6 +30,10 @@ FloatArray = NDArray[np.float64]
 
 EDGE_LINE_WIDTHS = 2.0
 """Distance from whole numbers of ξ [l/L] within which a maximum is taken for an edge line."""
+LINE_CONTRAST = 10.0
+"""Ratio of a maximum on a line to the largest density 1.5 to 2.5 l/L further along it, either way,
+from which it is a wave's: a wave's own side lobes give 20, the lines of the paper's
+specimen before buckling less than 3."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,8 @@ class Peak:
     Parameters
     ----------
     xi
-        Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, since S(−ξ) = S(ξ).
+        Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since
+        S(−ξ) = S(ξ).
     density
         S_xx + S_yy there [mm⁶].
     contrast
@@ -51,7 +58,7 @@ class Peak:
 
 @dataclass(frozen=True)
 class Wave:
-    """One plane wave, A sin(π/l (k·x + c)), directed upwards (k_y > 0).
+    """One plane wave, A sin(π/l (k·x + c)), directed upwards (k_y > 0) or, if level, to the right.
 
     Parameters
     ----------
@@ -96,12 +103,37 @@ def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
     lobe = spectrum.pitch / max(spectrum.extent)
     distance = max(1, round(lobe / (xi1[1] - xi1[0])))
     # Maxima of the whole plane that are searched, so the foot of a line is not one of them.
-    found = np.argwhere((maximum_filter(S, 2 * distance + 1) == S) & searched)
+    maxima = maximum_filter(S, 2 * distance + 1) == S
+    found = np.vstack([np.argwhere(maxima & searched), _on_lines(S, maxima, xi1, xi2, spectrum)])
     peaks = [
         Peak((float(xi1[c]), float(xi2[r])), float(S[r, c]), float(S[r, c]) / median)
         for r, c in found
     ]
     return sorted(peaks, key=lambda p: -p.density)
+
+
+def _on_lines(
+    S: FloatArray, maxima: NDArray[np.bool_], xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
+) -> NDArray[np.intp]:
+    """(n, 2) indices of maxima on one of the edges' lines, not where two cross, that stand out."""
+    lobes = [spectrum.pitch / size for size in spectrum.extent]
+    near = [
+        np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
+        for xi, lobe in zip((xi1, xi2), lobes, strict=True)
+    ]
+    half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1[None, :] > 0.5 * lobes[0])
+    half_plane &= xi2[:, None] > -0.5 * lobes[1]
+    one_line = near[0][None, :] != near[1][:, None]
+    found = []
+    for r, c in np.argwhere(maxima & one_line & half_plane):
+        along, at, xi, lobe = (
+            (S[:, c], r, xi2, lobes[1]) if near[0][c] else (S[r], c, xi1, lobes[0])
+        )
+        away = np.abs(xi - xi[at]) / lobe
+        beside = along[(away >= 1.5) & (away <= 2.5)]
+        if beside.size and S[r, c] >= LINE_CONTRAST * beside.max():
+            found.append((r, c))
+    return np.array(found, dtype=np.intp).reshape(-1, 2)
 
 
 def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[Wave]:
@@ -122,8 +154,8 @@ def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[Wave]:
     return [_wave(*pair, spectrum.pitch) for pair in zip(xi, z, strict=True)]
 
 
-def explained(spectrum: Spectrum, waves: Sequence[Wave]) -> float:
-    """Share of the field's square, under the Hann taper, that these waves describe together [-]."""
+def explained(spectrum: Spectrum, waves: Sequence[Wave | Peak]) -> float:
+    """Share of the field's square, under the Hann taper, that waves there describe together [-]."""
     return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
 
 
