@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -36,8 +37,33 @@ ComplexArray = NDArray[np.complex128]
 DEGREE = 7
 _TAPS = DEGREE + 1
 _FINER = (1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0)
-_BLOCK = 256  # points that one thread takes at a time; their weights fit into the fastest cache
+BLOCK = 256
+"""Points that one thread takes at a time; their weights fit into the fastest cache."""
 _NOWHERE = -(2**62)
+
+
+class Table(NamedTuple):
+    """A spline in a compiled kernel.
+
+    coefficients : (rows + 7, cols + 7) as those of :class:`PeriodicSpline`.
+    weights : (8, 8) coefficient of t^d in the weight of tap j.
+    finer_row, finer_col : samples a pixel.
+    """
+
+    coefficients: FloatArray
+    weights: FloatArray
+    finer_row: float
+    finer_col: float
+
+
+class Desk(NamedTuple):
+    """Room for a kernel's work on ``BLOCK`` points: their samples, tap weights and fractions."""
+
+    i: IntArray
+    j: IntArray
+    w: FloatArray
+    v: FloatArray
+    beyond: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +118,15 @@ class PeriodicSpline:
             np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
         )
         out = np.empty(row.size)
+        _sample(self.table, row.ravel(), col.ravel(), out)
+        return out.reshape(row.shape)
+
+    @property
+    def table(self) -> Table:
+        """The spline as kernels take it."""
         finer_row = (self.coefficients.shape[0] - DEGREE) / self.period[0]
         finer_col = (self.coefficients.shape[1] - DEGREE) / self.period[1]
-        _sample(
-            self.coefficients, _weights(), finer_row, finer_col, row.ravel(), col.ravel(), out
-        )  # fmt: skip
-        return out.reshape(row.shape)
+        return Table(self.coefficients, _weights(), finer_row, finer_col)
 
 
 def _fine_period(period: tuple[int, int], finer: float) -> tuple[int, int]:
@@ -147,43 +176,48 @@ def _weights() -> FloatArray:
     return np.ascontiguousarray(pieces.c[::-1, whole[::-1]])
 
 
-@compiled(parallel=True, relaxed=True)
-def _sample(
-    c: FloatArray,
-    weights: FloatArray,
-    finer_row: float,
-    finer_col: float,
-    row: FloatArray,
-    col: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Evaluate the spline block by block: places and weights in vector instructions, then sums."""
+@compiled(parallel=True)
+def _sample(table: Table, row: FloatArray, col: FloatArray, out: FloatArray) -> None:
+    for block in prange((out.size + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        past = min(first + BLOCK, out.size)
+        sample(table, row[first:past], col[first:past], out[first:past], desk())
+
+
+@compiled()
+def desk() -> Desk:
+    """Make room for :func:`sample`."""
+    return Desk(
+        np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK, dtype=np.int64),
+        np.empty((_TAPS, BLOCK)), np.empty((_TAPS, BLOCK)), np.empty(BLOCK),
+    )  # fmt: skip
+
+
+@compiled(relaxed=True)
+def sample(table: Table, row: FloatArray, col: FloatArray, out: FloatArray, desk: Desk) -> None:
+    """Evaluate up to ``BLOCK`` points: places and weights in vector instructions, then sums."""
+    c, w, v = table.coefficients, desk.w, desk.v
     rows, cols = c.shape[0] - DEGREE, c.shape[1] - DEGREE
-    for block in prange((out.size + _BLOCK - 1) // _BLOCK):
-        first = block * _BLOCK
-        count = min(_BLOCK, out.size - first)
-        i, j = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-        w, v = np.empty((_TAPS, count)), np.empty((_TAPS, count))
-        place = np.empty(count)
-        _place(row[first:], finer_row, i, place)
-        _tap_weights(weights, place, w)
-        _place(col[first:], finer_col, j, place)
-        _tap_weights(weights, place, v)
-        for k in range(count):
-            if i[k] == _NOWHERE or j[k] == _NOWHERE:
-                out[first + k] = np.nan
-                continue
-            if not 0 <= i[k] < rows:
-                i[k] %= rows
-            if not 0 <= j[k] < cols:
-                j[k] %= cols
-            out[first + k] = _patch(c, i[k], j[k], w, v, k)
+    _place(row, table.finer_row, desk.i, desk.beyond)
+    _tap_weights(table.weights, desk.beyond[: out.size], w)
+    _place(col, table.finer_col, desk.j, desk.beyond)
+    _tap_weights(table.weights, desk.beyond[: out.size], v)
+    for k in range(out.size):
+        i, j = desk.i[k], desk.j[k]
+        if i == _NOWHERE or j == _NOWHERE:
+            out[k] = np.nan
+            continue
+        if not 0 <= i < rows:
+            i %= rows
+        if not 0 <= j < cols:
+            j %= cols
+        out[k] = _patch(c, i, j, w, v, k)
 
 
 @compiled(relaxed=True)
 def _place(position: FloatArray, finer: float, sample: IntArray, beyond: FloatArray) -> None:
     """Split positions [px] into the sample before them and how far they lie beyond it."""
-    for k in range(sample.size):
+    for k in range(position.size):
         at = position[k] * finer
         whole = np.floor(at)
         beyond[k] = at - whole

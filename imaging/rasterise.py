@@ -160,9 +160,12 @@ def _fill_element(
 ) -> None:
     """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
+    polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
+    affine, curved = elements.affine[e], not elements.triangular
     count = 0
     for image_row in range(first, last):
-        low, high = ends(elements.sides[e], elements.corners, float(image_row - centre_row))
+        row = float(image_row - centre_row)
+        low, high = ends(sides, corners, row)
         if not low[0] <= high[0]:
             continue
         col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
@@ -180,14 +183,12 @@ def _fill_element(
                 while until < stop and state[row_begin + until - begin] != _NOT_WANTED:
                     until += 1
                 stop = until
-            n = stop - col
-            row, col_from = float(image_row - centre_row), float(col - centre_col)
-            s, t = batch.s[count : count + n], batch.t[count : count + n]
-            if elements.affine[e]:
-                start_affine(elements.polynomials[e], row, col_from, s, t)
+            n, col_from = stop - col, float(col - centre_col)
+            if affine:
+                start_affine(polynomial, row, col_from, batch.s, batch.t, count, count + n)
             else:
                 start_cubic(
-                    elements.polynomials[e], not elements.triangular, low, high, col_from, s, t
+                    polynomial, curved, low, high, col_from, batch.s, batch.t, count, count + n
                 )
             for k in range(n):
                 batch.row[count + k] = row

@@ -13,16 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.elements import bezier_matrix, reference_element
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import Located, interpolate, locate
-from modeharvest.imaging.jacobian import require_positive_jacobian
+from modeharvest.imaging.isoparametric import Located, interpolate, locate, map_back
+from modeharvest.imaging.paint import paint
 from modeharvest.imaging.speckle import Speckle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-_ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,39 +136,13 @@ def render_image(
 ) -> Rendering:
     """Show the deformed specimen as :func:`render_deformed` does, without the truth.
 
-    A strip of rows is shown at a time, so that little memory is needed besides the image.
+    Nothing is kept of the mapping, so that it is faster and needs little memory besides the image.
     """
-    nodes = mesh.nodes + displacement
-    require_positive_jacobian(nodes, mesh.cells, mesh.element, where)
+    if speckle.spec.ink is None:
+        return Rendering(*paint(mesh, displacement, grid, speckle.spline, background, where))
+    nodes, home = mesh.nodes + displacement, np.stack(grid.to_px(*mesh.nodes.T), axis=1)
+    found = map_back(nodes, mesh.cells, mesh.element, grid, home, where)
+    mask = found.element >= 0
     image = np.full(grid.shape, background, dtype=np.float32)
-    mask = np.zeros(grid.shape, dtype=np.bool_)
-    low, high = _row_bounds(mesh, grid.to_px(nodes[:, 0], nodes[:, 1])[0])
-    twice = 0
-    for top in range(0, grid.rows, _ROWS_AT_ONCE):
-        strip = slice(top, min(top + _ROWS_AT_ONCE, grid.rows))
-        cells = mesh.cells[(high >= top) & (low < strip.stop)]
-        if not len(cells):
-            continue
-        y0 = grid.y0 - top * grid.pixel_size
-        part = PixelGrid(strip.stop - top, grid.cols, grid.pixel_size, grid.x0, y0)
-        located = locate(nodes, cells, mesh.element, part, where)
-        x, y = interpolate(located, cells, mesh.element, mesh.nodes)
-        shown = located.mask
-        mask[strip] = shown
-        image[strip][shown] = speckle(*grid.to_px(x[shown], y[shown]))
-        twice += located.doubly_covered
-    return Rendering(image, mask, twice)
-
-
-def _row_bounds(mesh: Mesh, row: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rows (m,) between which each element lies, from those of the nodes, with a pixel to spare.
-
-    An element lies within its Bézier control points. They are sums of the nodes with weights
-    that add up to 1, so those with weights below 0 lie outside by as many extents.
-    """
-    element = reference_element(mesh.element)
-    weights = bezier_matrix(element.triangular) @ element.coefficients
-    rows = row[mesh.cells]
-    low, high = rows.min(axis=1), rows.max(axis=1)
-    reach = 1.0 + (high - low) * float(np.maximum(-weights, 0.0).sum(axis=1).max())
-    return low - reach, high + reach
+    image[mask] = speckle(*found.values[:, mask])
+    return Rendering(image, mask, found.doubly_covered)

@@ -69,19 +69,24 @@ def _roots(a: float, b: float, c: float) -> tuple[float, float]:
 def start_affine(
     polynomial: FloatArray,
     row: float,
-    first: float,
+    col: float,
     s: FloatArray,
     t: FloatArray,
+    first: int,
+    past: int,
 ) -> None:
-    """Local coordinates of the pixels first, first + 1, ... of a row, where the map is affine."""
+    """Local coordinates of the pixels col, col + 1, ... of a row, where the map is affine.
+
+    They go to s, t from ``first`` to ``past`` - 1.
+    """
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     inverse = 1.0 / (a[1] * b[2] - a[2] * b[1])
-    dp, dq = row - a[0], first - b[0]
+    dp, dq = row - a[0], col - b[0]
     s0, t0 = (b[2] * dp - a[2] * dq) * inverse, (a[1] * dq - b[1] * dp) * inverse
     ds, dt = -a[2] * inverse, a[1] * inverse
-    for k in range(s.size):
-        s[k] = s0 + k * ds
-        t[k] = t0 + k * dt
+    for k in range(first, past):
+        s[k] = s0 + (k - first) * ds
+        t[k] = t0 + (k - first) * dt
 
 
 @compiled(relaxed=True)
@@ -90,20 +95,25 @@ def start_cubic(
     curved: bool,
     low: End,
     high: End,
-    first: float,
+    col: float,
     s: FloatArray,
     t: FloatArray,
+    first: int,
+    past: int,
 ) -> None:
-    """Start for the pixels first, first + 1, ... of a row between its two ends."""
+    """Start for the pixels col, col + 1, ... of a row between its two ends.
+
+    They go to s, t from ``first`` to ``past`` - 1.
+    """
     length = max(high[0] - low[0], 1e-3)
     ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])
     ds_high, dt_high = _along_row(polynomial, curved, high[1], high[2])
     s1, s2, s3 = _hermite(low[1], high[1], ds_low * length, ds_high * length)
     t1, t2, t3 = _hermite(low[2], high[2], dt_low * length, dt_high * length)
     step = 1.0 / length
-    begin = (first - low[0]) * step
-    for k in range(s.size):
-        x = begin + k * step
+    begin = (col - low[0]) * step
+    for k in range(first, past):
+        x = begin + (k - first) * step
         s[k] = low[1] + x * (s1 + x * (s2 + x * s3))
         t[k] = low[2] + x * (t1 + x * (t2 + x * t3))
 
