@@ -117,8 +117,9 @@ def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     assert "the motion of 59 hole centres: a polynomial of degree 3" in sentence
     assert "2 of 118 components set aside" in sentence
     off = motion(np.stack(np.meshgrid(grid.x, grid.y), -1)) - images.truth(0.128).displacement
-    # The pattern, of 2 px, is all that is left.
-    assert np.sqrt(np.mean(off[mask] ** 2)) / PIXEL < 2.2
+    # The best cubic through all the material leaves 2.0 px, the pattern; here the solid strips
+    # beyond the holes are extrapolated.
+    assert np.sqrt(np.mean(off[mask] ** 2)) / PIXEL < 2.6
 
 
 def patterned(grid: PixelGrid, shift=(0.0, 0.0), amplitude: float = 0.15) -> np.ndarray:
