@@ -7,18 +7,19 @@ the reference, or the motion is larger than expected.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_cdt
+from scipy.ndimage import distance_transform_cdt, map_coordinates
 from skimage.feature import match_template
 
 from modeharvest.errors import InputError
+from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 Expected = Callable[[FloatArray], FloatArray]
 """From (n, 2) (row, col) in the reference to (n, 2) (row, col) in the deformed image [px]."""
@@ -27,6 +28,8 @@ BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
 """About so many blocks of such an edge, smaller where ligaments are too narrow for it."""
 REACH_PX = 24
 """A block may be so far from where it is expected, along rows and along columns."""
+TURNS_DEG = (0.0, -12.0, 12.0, -24.0, 24.0)
+"""Blocks are turned so [degrees]: where holes buckle, what lies between them turns that much."""
 _SAME = 0.5
 """Share of blocks that must be found."""
 _CLEAR = 0.1
@@ -71,6 +74,16 @@ class SceneMatch:
         """Whether the images show the same surface."""
         return self.share >= _SAME
 
+    def in_mm(self, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
+        """(positions, displacements) of the blocks found, both (m, 2) along x and y [mm].
+
+        To about a pixel; enough for a start.
+        """
+        row, col = self.before[self.found].T
+        x, y = grid.to_mm(row, col)
+        x2, y2 = grid.to_mm(*self.after[self.found].T)
+        return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+
     @property
     def sentence(self) -> str:
         """What was found."""
@@ -106,7 +119,7 @@ def compare_scenes(
     InputError
         If the images' sizes differ or there is no room for blocks.
     """
-    f, g = np.asarray(reference, dtype=np.float32), np.asarray(deformed, dtype=np.float32)
+    f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
     if f.ndim != 2 or f.shape != g.shape:
         raise InputError(f"expected two images of one size, got {f.shape} and {g.shape}")
     material = np.ones(f.shape, dtype=np.bool_) if mask is None else np.asarray(mask, np.bool_)
@@ -162,21 +175,32 @@ def _blocks(material: BoolArray) -> tuple[NDArray[np.int64], int]:
 
 
 def _search(
-    f: NDArray[Any],
-    g: NDArray[Any],
+    f: FloatImage,
+    g: FloatImage,
     centre: NDArray[np.int64],
     aim: NDArray[np.int64],
     half: int,
     reach: int,
 ) -> tuple[NDArray[np.int64], float]:
-    """Where around ``aim`` the block around ``centre`` fits best, and how well."""
-    row, col = centre
-    block = f[row - half : row + half + 1, col - half : col + half + 1]
+    """Where around ``aim`` the block around ``centre``, turned or not, fits best; how well."""
     low = np.maximum(aim - half - reach, 0)
     high = np.minimum(aim + half + reach + 1, g.shape)
     window = g[low[0] : high[0], low[1] : high[1]]
-    if np.ptp(block) == 0.0 or np.ptp(window) == 0.0:
-        return aim, 0.0
-    score = np.asarray(match_template(window, block))  # type: ignore[no-untyped-call]
-    best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
-    return low + best + half, float(score[best[0], best[1]])
+    place, value = aim, 0.0
+    for block in _turned(f, centre, half):
+        if np.ptp(block) == 0.0 or np.ptp(window) == 0.0:
+            continue
+        score = np.asarray(match_template(window, block))  # type: ignore[no-untyped-call]
+        best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
+        if score[best[0], best[1]] > value:
+            place, value = low + best + half, float(score[best[0], best[1]])
+    return place, value
+
+
+def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> Iterator[FloatImage]:
+    """The block around a pixel, turned by each of ``TURNS_DEG``."""
+    row, col = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
+    for degrees in TURNS_DEG:
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        at = centre[0] + c * row - s * col, centre[1] + s * row + c * col
+        yield map_coordinates(f, at, order=1, mode="nearest").astype(np.float32)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.idic.hole_motion import HoleMotion
 from modeharvest.idic.scene import compare_scenes, require_same_scene
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 SHAPE = (300, 340)
@@ -53,6 +54,23 @@ def test_large_motion_is_found_where_it_is_expected() -> None:
     # Whole pixels, and where in the block the contrast is: 5 % of half a block is 1 px.
     assert np.median(np.abs(found.after - aims)[found.found], axis=0).max() < 1.5
     assert found.found.mean() > 0.9
+
+
+def test_turned_blocks_are_found() -> None:
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    c, s = np.cos(np.radians(18.0)), np.sin(np.radians(18.0))
+    turn, middle = np.array([[c, s], [-s, c]]), np.array([150.0, 170.0])
+    back = (np.stack([row, col], axis=-1) - middle) @ turn.T + middle
+    image = SPECKLE(back[..., 0], back[..., 1])
+    match = compare_scenes(SPECKLE.image(), image, expected=lambda p: (p - middle) @ turn + middle)
+    assert match.share > 0.8
+    assert np.median(np.abs(match.after - (match.before - middle) @ turn - middle)) < 1.0
+
+
+def test_blocks_in_mm_have_y_upwards() -> None:
+    match = compare_scenes(SPECKLE.image(), moved((5.0, -8.0)))
+    _, u = match.in_mm(PixelGrid.centred(*SHAPE, 0.5))
+    np.testing.assert_allclose(np.median(u, axis=0), [-4.0, -2.5])
 
 
 def test_blocks_lie_on_material() -> None:
