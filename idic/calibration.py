@@ -20,7 +20,7 @@ from scipy import ndimage
 from skimage.registration import phase_cross_correlation
 
 from modeharvest.errors import InputError
-from modeharvest.idic.calibration_fit import Fit, Pose, View, fit_views, with_poses
+from modeharvest.idic.calibration_fit import Fit, Pose, View, fit_views, lit_alike, with_poses
 from modeharvest.idic.calibration_model import PolynomialModel
 from modeharvest.idic.calibration_noise import sampled_noise
 from modeharvest.idic.calibration_result import Calibration, DegreeTrial, calibration_of
@@ -111,22 +111,23 @@ def calibrate(
     shape = (rows, cols)
     known = shifts is not None
     start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
-    poses = [Pose((float(row), float(col))) for row, col in start]
-    free = (not known, not known, not known and options.rotations, True, True)
+    poses = lit_alike(photographs, start)
+    moving = (not known, not known, not known and options.rotations)
     model = PolynomialModel(
         shape, min(_COARSE_DEGREE, options.degrees[-1]), fixed=1 if known else 3
     )
     c = model.start
     report = _reporter(progress, len(options.blurs_px) + len(options.degrees))
     for blur in options.blurs_px[:-1]:
-        views = _views(photographs, poses, free, blur, options.order)
+        # Where they don't match yet, a fit of the light would sooner wipe out the contrast.
+        views = _views(photographs, poses, (*moving, False, False), blur, options.order)
         points, _ = _points(shape, poses, options.points // 4)
         fit = fit_views(model, c, views, points, tolerance_px=0.02, max_iterations=10)
         c, poses = fit.coefficients, list(fit.poses)
         report()
     _require_shifts(poses)
     _require_matches(fit)
-    views = _views(photographs, poses, free, options.blurs_px[-1], options.order)
+    views = _views(photographs, poses, (*moving, True, True), options.blurs_px[-1], options.order)
     points, stride = _points(shape, poses, options.points)
     trials: list[tuple[PolynomialModel, Fit]] = []
     for degree in options.degrees:

@@ -297,3 +297,17 @@ def _correlations(sums: FloatArray) -> FloatArray:
 def with_poses(views: Sequence[View], poses: Sequence[Pose]) -> list[View]:
     """The same views, in other poses."""
     return [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
+
+
+def lit_alike(
+    images: Sequence[NDArray[np.float32]], shifts: FloatArray | None = None
+) -> list[Pose]:
+    """Poses with (m, 2) shifts [px] that give all images the mean and spread of the first one."""
+    mean, spread = float(images[0].mean(dtype=np.float64)), float(images[0].std(dtype=np.float64))
+    poses = []
+    for n, image in enumerate(images):
+        contrast = spread / float(image.std(dtype=np.float64))
+        brightness = mean - contrast * float(image.mean(dtype=np.float64))
+        row, col = (0.0, 0.0) if shifts is None else shifts[n]
+        poses.append(Pose((float(row), float(col)), 0.0, contrast, brightness))
+    return poses
