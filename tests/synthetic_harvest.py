@@ -82,12 +82,12 @@ def frame(name: str, strain: float, amplitude: float, held: bool = False) -> Har
     _, deformed, seen = photographs(kinematics, a)
     steps = ((8, 1, 3.0), (8, 2, 0.1), (1, 1, 0.2), (1, 2, 1e-4))
     result = Result(
-        kinematics, GRID, a, 1e-9 * np.eye(kinematics.size), 60.0, int(MASK.sum()), 0,
+        kinematics, GRID, a, 1e-13 * np.eye(kinematics.size), 45.0, int(MASK.sum()), 0,
         Outcome.CONVERGED, 1e3, tuple(Iteration(f, n, 60.0, s, 0.0, 100) for f, n, s in steps),
         residual_correlation=0.1,
     )  # fmt: skip
     x, y = GRID.x[::8], GRID.y[::8]
-    leftover = 1e-6 * np.eye(kinematics.size)
+    leftover = 1e-8 * np.eye(kinematics.size)
     u = result.displacement() + wave()
     spectrum = spectral_density(u, GRID, MASK, PITCH)
     rng = np.random.default_rng(1)

@@ -58,7 +58,7 @@ class HarvestPanel:
 
 
 SECTIONS = (
-    ("photographs", "The photographs and their pattern"),
+    ("photographs", "Photographs and pattern"),
     ("found", "What was measured"),
     ("left", "What is left over"),
     ("sure", "How sure it is"),
@@ -144,7 +144,8 @@ _LEFT = (
     HarvestPanel(
         "left", "residual", "f − g∘φ", "Residual", "real (g) and (o)",
         "In the deformed configuration; single pixels, not averages. The colours end at the 99th "
-        "percentile. Camera noise is in it, and what the ansatz can’t describe.",
+        "percentile. Camera noise is in it, and what the ansatz can’t describe. Blank along the "
+        "edges: not compared there.",
         maps.draw_residual, exact=True,
     ),
     HarvestPanel(

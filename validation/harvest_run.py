@@ -295,6 +295,11 @@ class Harvest:
         return int(self.experiment.get("correlation", {}).get("order", 5))
 
     @property
+    def edge_px(self) -> int:
+        """Width of the rim of the material that was not compared [px]."""
+        return int(self.experiment.get("correlation", {}).get("edge_px", 0))
+
+    @property
     def lens(self) -> Distortion | None:
         """The optics' distortion, given or calibrated."""
         if self.distortion is None and self.calibration is not None:

@@ -11,6 +11,7 @@ Summary = Mapping[str, Any]
 Frame = Mapping[str, Any]
 
 NBSP = "\N{NO-BREAK SPACE}"
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def percent(value: float | None, digits: int = 3) -> str:
@@ -68,15 +69,15 @@ def _buckling(summary: Summary) -> dict[str, str]:
 def _mode_keys(frame: Frame) -> list[dict[str, str]]:
     mode, at = frame["modes"][0], f"at {percent(frame['strain'])}"
     wave = mode["waves"][0]
-    xi = ", ".join(f"{value:.4f}".replace("-", "−") for value in wave["xi"])
+    xi = ", ".join(f"{value:.3f}".replace("-", "−") for value in wave["xi"])
     errors = [f"± {_micro(mode['v_max_sd_noise_mm'])} µm by noise"]
     if mode["v_max_sd_leftover_mm"] is not None:
         errors.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
     count = len(mode["waves"])
-    sd = "held fixed" if mode["held"] else f"± {max(_numbers(wave)):.1g}"
+    sd = "held fixed" if mode["held"] else f"± {_digits(max(_numbers(wave)), 1)}"
     return [
         _key("pattern", f"{mode['largest_px']:.3g}", "px", f"largest v₁φ₁ {at}"),
-        _key("largest v₁", _micro(mode["v_max_mm"]), "µm", ", ".join(errors)),
+        _key("largest v₁", _micro(mode["v_max_mm"], 4), "µm", ", ".join(errors)),
         _key("wave vector ξ", f"({xi})", "1/l", f"{sd}; the first of {count}"),
     ]
 
@@ -116,7 +117,7 @@ def fact(key: str, frame: Frame) -> str:
     if errors is None or field not in ("v0", "fluc1") or len(frame["modes"]) > 1:
         return ""
     name = {"v0": "v0", "fluc1": "fluctuation"}[field]
-    return "" if errors[name] is None else f"rms {errors[name]:.2g} px per component"
+    return "" if errors[name] is None else f"rms {_digits(errors[name], 2)} px per component"
 
 
 def _residual(frame: Frame) -> str:
@@ -131,8 +132,9 @@ def _amplitude(mode: Mapping[str, Any], n: str) -> str:
     sd = [f"{_micro(mode['v_max_sd_noise_mm'])} by noise"]
     if mode["v_max_sd_leftover_mm"] is not None:
         sd.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
-    said = f"largest among the holes {_micro(mode['v_max_mm'])} ± {' '.join(sd)} µm"
-    return said if mode["observable"] else f"{said}; too weak for φ{n} to mean anything"
+    subscript = n.translate(_SUBSCRIPTS)
+    said = f"largest among the holes {_micro(mode['v_max_mm'], 4)} ± {' '.join(sd)} µm"
+    return said if mode["observable"] else f"{said}; too weak for φ{subscript} to mean anything"
 
 
 FRAME_COLUMNS = (
@@ -194,16 +196,17 @@ def wave_rows(frames: Sequence[Frame]) -> list[dict[str, Any]]:
             for w, wave in enumerate(mode["waves"], start=1):
                 noise, left = wave["sd_noise"] or [None] * 2, wave["sd_leftover"] or [None] * 2
                 rows.append({
-                    "frame": frame, "mode": i, "wave": w, "held": mode["held"],
-                    "observable": mode["observable"],
+                    "frame": frame, "mode": i, "wave": w, "first": i == w == 1,
+                    "held": mode["held"], "observable": mode["observable"],
                     "cells": list(zip(wave["xi"], noise, left, strict=True)),
                 })  # fmt: skip
     return rows
 
 
 def error_text(noise: float | None, leftover: float | None) -> str:
-    """Both standard errors behind a value: "± 0.0002 ± 0.003"."""
-    return " ".join(f"± {value:.1g}" for value in (noise, leftover) if value is not None) or "–"
+    """Both standard errors behind a value of five decimals: "± 0.00020 ± 0.00310"."""
+    known = [value for value in (noise, leftover) if value is not None]
+    return " ".join(f"± {value:.5f}" if value >= 5e-6 else "< 0.00001" for value in known)
 
 
 def notes(summary: Summary) -> list[str]:
@@ -236,9 +239,9 @@ def _sentence(text: str) -> str:
     return text if text.endswith(".") else f"{text}."
 
 
-def _micro(millimetres: float | None) -> str:
-    """Micrometres to three digits."""
-    return "∞" if millimetres is None else short(float(f"{1e3 * millimetres:.3g}"))
+def _micro(millimetres: float | None, digits: int = 2) -> str:
+    """Micrometres; two digits do for errors."""
+    return "∞" if millimetres is None else _digits(1e3 * millimetres, digits)
 
 
 def _digits(value: float | None, digits: int) -> str:

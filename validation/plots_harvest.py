@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from modeharvest.idic.error_bars import FieldErrors
 from modeharvest.idic.pattern import Pattern
+from modeharvest.idic.pyramid import eroded
 from modeharvest.imaging.interpolation import SplineImage
 from modeharvest.validation import plots_fields as fields
 from modeharvest.validation.harvest_atlas import COARSE, FINE, SHAPE, SMOOTH, HarvestAtlas
@@ -41,8 +42,10 @@ def draw_deformed(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
     drawn = fields.draw_image(sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, moved)
     with style():
         path = sheet.outline.path(moved)
-        drawn.axes[0].add_patch(PathPatch(path, fill=False, ec=GOLD, lw=0.7, rasterized=True,
-                                          zorder=2))  # fmt: skip
+        axes, bar = drawn.axes
+        axes.add_patch(PathPatch(path, fill=False, ec=GOLD, lw=0.7, rasterized=True, zorder=2))
+        bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in atlas.levels])
+        bar.set_title("levels", fontsize=8, pad=6, loc="left")
     return drawn
 
 
@@ -184,7 +187,7 @@ def _pixels(sheet: Sheet) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> FloatArray:
-    """The residual at one pixel of each cell of the fine sheet [grey levels]; NaN off material."""
+    """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
     harvest, ansatz, a = atlas.harvest, frame.result.ansatz, frame.result.unknowns
     rows, cols = _pixels(atlas.sheet(FINE))
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
@@ -194,7 +197,7 @@ def _residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> FloatArray:
     gain, offset = ansatz.gain_and_offset(a, x, y)
     picked = np.ix_(rows, cols)
     residual = harvest.reference[picked] - gain * value - offset
-    return np.where(harvest.mask[picked], residual, np.nan)
+    return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
 
 
 def _sd(errors: FieldErrors, field: str) -> FloatArray:

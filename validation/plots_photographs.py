@@ -21,7 +21,7 @@ from modeharvest.validation.style import BLUE, GOLD, GREEN, GREY, INK, RED, SIZE
 
 FloatArray = NDArray[np.float64]
 
-WIDE = 5.2  # of a picture that takes a whole card [in]
+WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
 _LEGEND = 0.26  # [in]
 _PIXELS = 1000  # along the longer side
 _CELLS, _ARROWS = 120, 17  # of a distortion's map, along the longer side
@@ -32,7 +32,7 @@ def draw_reference(atlas: HarvestAtlas) -> Figure:
     """Draw the reference and all that was found in it, for a look whether that is right."""
     harvest = atlas.harvest
     with style():
-        drawn, axes = _picture(harvest.grid, above=_LEGEND)
+        drawn, axes = _picture(harvest.grid, WIDE, _LEGEND)
         factor = max(1, round(max(harvest.grid.shape) / _PIXELS))
         cells = harvest.grid.binned(factor)
         rows, cols = cells.shape
@@ -74,7 +74,7 @@ def draw_distortion(distortion: Distortion, grid: PixelGrid) -> Figure:
         step = max(grid.shape) / _ARROWS
         enlarged = _LENGTH * step / longest if longest > 0 else 1.0
         axes.quiver(col, row, enlarged * right, enlarged * down, angles="xy", scale_units="xy",
-                    scale=1.0, width=0.0028, color="white", pivot="mid")  # fmt: skip
+                    scale=1.0, width=0.0035, color="white", pivot="mid")  # fmt: skip
         colour_bar(drawn, axes, scale)
     return drawn
 
@@ -117,19 +117,20 @@ def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
     return along_row[:, None], along_col[None, :]
 
 
-def _picture(grid: PixelGrid, above: float, share: float = 1.0) -> tuple[Figure, Axes]:
-    """An empty picture as wide as a card, for the whole image; ``above`` it so much room [in]."""
-    tall = share * WIDE * grid.rows / grid.cols
-    drawn = figure(WIDE, tall + above + 0.04)
-    axes = drawn.add_axes((0.002, 0.02 / (tall + above + 0.04), share * 0.996,
-                           tall / (tall + above + 0.04)))  # fmt: skip
+def _picture(grid: PixelGrid, width: float, above: float, share: float = 1.0
+             ) -> tuple[Figure, Axes]:  # fmt: skip
+    """An empty picture for the whole image, over this share of its width; room above [in]."""
+    tall = share * width * grid.rows / grid.cols
+    height = tall + above + 0.04
+    drawn = figure(width, height)
+    axes = drawn.add_axes((0.002, 0.02 / height, 0.996 * share, tall / height))
     axes.set_axis_off()
     return drawn, axes
 
 
 def _coloured(grid: PixelGrid, length: FloatArray) -> tuple[Figure, Axes, Scale]:
     """A map of lengths [px] over the whole image, in its own frame: columns right, rows down."""
-    drawn, axes = _picture(grid, above=0.26, share=0.77)
+    drawn, axes = _picture(grid, NARROW, 0.26, 0.77)
     scale = Scale.size(length, "px")
     axes.imshow(length, extent=(-0.5, grid.cols - 0.5, grid.rows - 0.5, -0.5), cmap=SIZE,
                 norm=scale.normalise, interpolation="bilinear", rasterized=True,

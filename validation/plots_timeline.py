@@ -112,12 +112,12 @@ def _number(values: Sequence[float | None] | None, k: int) -> float:
 
 
 def _band(axes: Axes, strain: FloatArray, top: FloatArray, colour: str, name: str) -> None:
-    """What lies below ``top``; a single photograph has no band but a line across."""
-    if len(strain) > 1:
-        axes.fill_between(strain, 0, top, color=colour, alpha=0.18, lw=0, label=name)
-        axes.plot(strain, top, color=colour, lw=0.8)
-    else:
-        axes.axhline(float(top[0]), color=colour, lw=0.9, label=name)
+    """What lies below ``top``, carried on beyond the first and the last photograph."""
+    ends = [min(0.0, strain[0]), 2.0 * strain[-1] - min(0.0, strain[0]) + 1.0]
+    strain = np.concatenate([ends[:1], strain, ends[1:]])
+    top = np.concatenate([top[:1], top, top[-1:]])
+    axes.fill_between(strain, 0, top, color=colour, alpha=0.18, lw=0, label=name)
+    axes.plot(strain, top, color=colour, lw=0.8)
 
 
 def _mark(axes: Axes, buckling: BucklingPoint, strain: FloatArray, size: FloatArray, top: float

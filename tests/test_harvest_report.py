@@ -1,0 +1,288 @@
+"""The report of a harvest: whole, self-contained, right in its numbers, for every kind of test.
+
+Guards: nothing is loaded from elsewhere; every panel is there for every photograph; links and ids
+fit together; what is not known is left out and not made up; the outline follows the mask; numbers
+in the summary are those of the measurement they stand for.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_harvest as made_up
+from html_page import Page
+from matplotlib.path import Path
+
+from modeharvest.errors import InputError
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.error_bars import field_errors
+from modeharvest.idic.identifiability import identifiability
+from modeharvest.imaging.distortion import PolynomialDistortion
+from modeharvest.validation import harvest_words as words
+from modeharvest.validation.harvest_atlas import MOST, HarvestAtlas
+from modeharvest.validation.harvest_panels import panels
+from modeharvest.validation.harvest_report import write_harvest_report
+from modeharvest.validation.harvest_run import Harvest, HarvestedFrame
+from modeharvest.validation.harvest_summary import harvest_summary
+from modeharvest.validation.mask_outline import outline_of_mask
+from modeharvest.validation.plots_photographs import unaffine
+
+
+@pytest.fixture(scope="module")
+def harvest() -> Harvest:
+    return made_up.harvest()
+
+
+@pytest.fixture(scope="module")
+def summary(harvest: Harvest) -> dict[str, Any]:
+    return harvest_summary(harvest)
+
+
+@pytest.fixture(scope="module")
+def text(harvest: Harvest, tmp_path_factory: pytest.TempPathFactory) -> str:
+    return report(harvest, tmp_path_factory.mktemp("report"))
+
+
+def report(harvest: Harvest, folder: File) -> str:
+    path = folder / "report.html"
+    write_harvest_report(path, harvest)
+    return path.read_text("utf-8")
+
+
+def bare(harvest: Harvest) -> Harvest:
+    """One photograph of which only the correlation is known."""
+    frame = replace(harvest.frames[1], mask=None, by_leftover=None, leftover_covariance=None,
+                    spectrum=None, pattern=None, local=None, start_sentences=())  # fmt: skip
+    return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
+                   calibration=None, full_scale=None, sentences=(), truth=None,
+                   timings={}, versions={})  # fmt: skip
+
+
+def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
+    page = Page(text)
+    assert page.open == []
+    assert page.sources
+    assert all(source.startswith("data:") for source in page.sources)
+    outside = {link for link in page.links if not link.startswith("#")}
+    assert all(link.startswith("https://doi.org/") for link in outside)
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert len(text.encode()) < 8e6
+
+
+def test_every_panel_is_there_for_every_photograph(harvest: Harvest, text: str) -> None:
+    ids = Page(text).ids
+    every = panels(HarvestAtlas(harvest))
+    assert {"image", "Sxx", "v0y", "v1", "phi1", "fluc1x", "residual", "w", "v0-noise",
+            "fluc1-leftover", "loss"} <= {panel.key for panel in every}  # fmt: skip
+    for panel in every:
+        assert all(ids[f"{panel.key}-{k}"] == 1 for k in (1, 2))
+    for name in ("hero", "keys", "reference", "distortion", "distortion-sd", "distortion-error",
+                 "degrees", "skipped", "obtained", "timeline-pattern", "timeline-waves", "frames",
+                 "mode", "waves", "notes"):  # fmt: skip
+        assert ids[name] == 1, name
+    assert "Before buckling · 4\N{NO-BREAK SPACE}%" in text
+    assert "After buckling · 7\N{NO-BREAK SPACE}%" in text
+
+
+def test_ids_are_unique_and_links_lead_somewhere(text: str) -> None:
+    page = Page(text)
+    assert [name for name, count in page.ids.items() if count > 1] == []
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    assert set(re.findall(r"url\(#([^)]+)\)", text)) <= set(page.ids)
+
+
+def test_words_of_users_are_escaped_and_said(text: str) -> None:
+    assert "Made up &lt;for tests&gt;" in text
+    assert "expected an image &lt;of 290 x 250 px&gt;, got a damaged file" in text
+    assert "<for tests>" not in text
+    for said in ("The material was found by its speckle.", "v0 starts from the local DIC.",
+                 "S is a polynomial of degree 3.", "measured from 3 exposures",
+                 "modeharvest harvest EXPERIMENT.toml"):  # fmt: skip
+        assert said in text
+    assert text.count("✗ missed") == text.count("✓ met") == 1
+
+
+def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None:
+    told: list[float] = []
+    write_harvest_report(tmp_path / "report.html", bare(harvest),
+                         progress=lambda done, total, what: told.append(done / total))  # fmt: skip
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    page = Page((tmp_path / "report.html").read_text("utf-8"))
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    for panel in panels(HarvestAtlas(harvest)):
+        known = panel.key not in ("Sxx", "Syy", "w", "true_w", "best", "loss")
+        known &= not panel.key.endswith("leftover")
+        assert (f"{panel.key}-1" in page.ids) is known, panel.key
+    for name in ("skipped", "optics", "obtained", "timeline", "truth"):
+        assert name not in page.ids
+
+
+def test_a_plain_global_dic_has_a_report_too(harvest: Harvest, tmp_path: File) -> None:
+    frame = bare(harvest).frames[0]
+    plain = Ansatz(made_up.DOMAIN, (), v0_degree=3)
+    result = replace(frame.result, ansatz=plain, unknowns=plain.start(0.05),
+                     inverse=1e-12 * np.eye(plain.size))  # fmt: skip
+    errors = field_errors(result, frame.error_x, frame.error_y, result.covariance(made_up.NOISE))
+    frame = replace(frame, result=result, by_noise=errors,
+                    identifiability=identifiability(result, made_up.MASK))  # fmt: skip
+    ids = Page(report(replace(bare(harvest), frames=(frame,)), tmp_path)).ids
+    assert "v0x-1" in ids
+    assert "v1-1" not in ids
+    assert "mode" not in ids
+
+
+def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) -> None:
+    strains = np.linspace(0.01, 0.2, 20)
+    frames = tuple(
+        replace(harvest.frames[int(e > 0.085)], name=f"IMG_{k}", strain_x=e)
+        for k, e in enumerate(strains)
+    )
+    moments = [made_up.moment(frame) for frame in frames]
+    long = replace(harvest, frames=frames, timeline=moments, truth=None)
+    shown = HarvestAtlas(long).shown
+    assert len(shown) == MOST
+    first = next(k for k, moment in enumerate(moments) if moment.has_pattern)
+    assert {frames[0], frames[first - 1], frames[first], frames[-1]} <= set(shown)
+    assert len(words.frame_rows(harvest_summary(long))) == 20
+
+
+def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    unknown = bare(harvest)
+    lost = replace(unknown.frames[0].result, inverse=np.diag([np.inf] * 77))
+    frame = replace(unknown.frames[0], result=lost)
+    told = harvest_summary(replace(unknown, frames=(frame,)))
+    assert json.dumps(told, allow_nan=False)
+    assert told["frames"][0]["modes"][0]["parameters"][0]["sd_noise"] is None
+
+
+def test_the_summary_tells_the_measured_numbers(harvest: Harvest, summary: dict[str, Any]) -> None:
+    frame, told = harvest.frames[1], summary["frames"][1]
+    mode, result = told["modes"][0], frame.result
+    part = result.ansatz.phi_slice(0)
+    # v is a constant, phi's two waves are the diagonals, with a wavelength of two cells.
+    assert mode["v_max_mm"] == pytest.approx(0.9)
+    assert [wave["xi"] for wave in mode["waves"]] == [[0.5, 0.5], [-0.5, 0.5]]
+    # The wave vector is half the parameter, so its error is half the parameter's.
+    errors = result.standard_errors(made_up.NOISE)[part]
+    assert [p["sd_noise"] for p in mode["parameters"]] == pytest.approx(errors)
+    assert mode["waves"][0]["sd_noise"] == pytest.approx(errors[1:3] / 2)
+    assert mode["waves"][0]["sd_leftover"] == pytest.approx([0.5e-4, 0.5e-4])
+    # w was made up: two waves of 4 um, of 0.32 px, on top of what was measured; as seen at the
+    # local DIC's points, of which every sixth pixel has one.
+    at = made_up.wave()[3::6, 3::6][made_up.MASK[3::6, 3::6]] / made_up.GRID.pixel_size
+    assert told["local"]["w_beyond_noise_px"] == pytest.approx(np.sqrt((at**2).mean()), rel=1e-2)
+    held = summary["frames"][0]["modes"][0]
+    assert held["held"]
+    assert held["waves"][0]["sd_noise"] is None
+    assert summary["lattice"]["pitch_px"] == pytest.approx(40.0, abs=0.1)
+    assert summary["buckling"]["before"] == 0.04
+
+
+def test_units_of_a_mode_of_another_length(harvest: Harvest) -> None:
+    frame = harvest.frames[1]
+    mode = replace(frame.result.ansatz.modes[0], half_wavelength=2 * made_up.PITCH)
+    result = replace(frame.result, ansatz=replace(frame.result.ansatz, modes=(mode,)))
+    told = harvest_summary(replace(harvest, frames=(replace(frame, result=result),)))
+    # The same k is a wave twice as long.
+    assert told["frames"][0]["modes"][0]["waves"][0]["xi"] == [0.25, 0.25]
+
+
+def test_the_outline_follows_the_mask() -> None:
+    outline = outline_of_mask(made_up.MASK, made_up.GRID)
+    assert len(outline.loops) == 31  # the edge and 30 holes
+    areas = [_area(outline.nodes[loop[:, 0]]) for loop in outline.loops]
+    edge = int(np.argmax(np.abs(areas)))
+    assert abs(areas[edge]) == pytest.approx(2.8 * 3.3, rel=0.01)
+    # Holes run the other way round, so that they stay open when the outline is filled.
+    holes = np.sign(-areas[edge]) * np.delete(areas, edge)
+    # A circle of pixels has the circle's area within half a pixel along its edge.
+    area = np.pi * made_up.DIAMETER**2 / 4
+    assert holes == pytest.approx(area, rel=2 * made_up.GRID.pixel_size / made_up.DIAMETER)
+    x, y = np.meshgrid(made_up.GRID.x, made_up.GRID.y)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    inside = np.logical_xor.reduce(
+        [Path(outline.nodes[loop[:, 0]]).contains_points(points) for loop in outline.loops]
+    )
+    # It runs between the pixels, at most a third of one off: they are told apart but for a few.
+    assert np.mean(inside != made_up.MASK.ravel()) < 0.01
+
+
+def test_specks_and_an_empty_mask_have_no_outline() -> None:
+    mask = np.zeros(made_up.GRID.shape, dtype=np.bool_)
+    assert not outline_of_mask(mask, made_up.GRID).loops
+    mask[50:53, 50:53] = True
+    assert len(outline_of_mask(mask, made_up.GRID).loops) == 1
+    assert not outline_of_mask(mask, made_up.GRID, least=20 * made_up.GRID.pixel_size**2).loops
+
+
+def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:
+    found = made_up.lens()
+    c = found.coefficients.copy()
+    c[:, :3] += [[3.0, 1.0, -2.0], [1.0, 0.5, 0.2]]
+    same = PolynomialDistortion(found.shape, c)
+    assert np.abs(unaffine(found, same, made_up.GRID)).max() < 1e-10
+    assert np.abs(unaffine(found, made_up.lens(2.0), made_up.GRID)).max() > 0.5
+
+
+def test_warnings_outcomes_and_the_noise_are_told(summary: dict[str, Any]) -> None:
+    change = {"outcome": "stagnated", "outcome_why": "No step.", "warnings": ["beware of this"]}
+    frame = summary["frames"][1] | change
+    said = words.notes(summary | {"frames": [frame]})
+    at = "IMG_2, 7\N{NO-BREAK SPACE}%: "
+    assert f"{at}the correlation ended as “stagnated”: No step." in said
+    assert f"{at}beware of this." in said
+    assert any("25 grey levels, 0.61 % of full scale, measured" in note for note in said)
+
+
+@pytest.mark.parametrize(
+    ("buckling", "value"),
+    [
+        (None, "–"),
+        ({"before": None, "after": None, "estimate": None}, "–"),
+        ({"before": None, "after": 0.05, "estimate": None}, "< 5"),
+        ({"before": 0.04, "after": 0.05, "estimate": 0.045}, "4 … 5"),
+    ],
+)
+def test_buckling_is_told_as_far_as_it_is_known(
+    summary: dict[str, Any], buckling: dict[str, Any] | None, value: str
+) -> None:
+    keys = words.key_numbers(summary | {"buckling": buckling, "truth": []})
+    assert next(key for key in keys if key["name"] == "buckling")["value"] == value
+    assert keys[0]["value"] == "2 of 3"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"frames": ()}, "expected at least one deformed photograph"),
+        ({"mask": np.ones((3, 3), dtype=np.bool_)}, r"got \(3, 3\) for mask"),
+        ({"experiment": {}}, "cell_size"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(
+    harvest: Harvest, change: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        replace(harvest, **change)
+
+
+def test_two_photographs_of_one_name_are_refused(harvest: Harvest) -> None:
+    frame: HarvestedFrame = harvest.frames[0]
+    with pytest.raises(InputError, match="names that differ"):
+        replace(harvest, frames=(frame, frame))
+    with pytest.raises(InputError, match="error bars of shape"):
+        replace(frame, error_x=frame.error_x[:-1])
+
+
+def _area(corners: np.ndarray[Any, Any]) -> float:
+    x, y = corners.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
