@@ -12,7 +12,7 @@ from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import SpecimenTable
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.hole_lattice import HoleLattice, find_hole_lattice
-from modeharvest.idic.hole_motion import match
+from modeharvest.idic.hole_motion import HoleMotion, match
 from modeharvest.idic.region import Region, region_of_lattice, region_of_mask, region_of_polygon
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import read_mask
@@ -42,12 +42,6 @@ class Geometry:
     region: Region
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was found."""
-        found = () if self.lattice is None else self.lattice.sentences
-        return (*found, *self.region.sentences)
-
-    @property
     def lattice_mm(self) -> FloatArray | None:
         """(2, 2) vectors of the lattice as rows, along x and y [mm]; None for a square one.
 
@@ -64,10 +58,15 @@ class Geometry:
         assert self.lattice is not None
         return self.lattice.kind == "square" and abs(self.lattice.rotation_deg) < _UPRIGHT_DEG
 
-    def holes_in(self, mask: NDArray[np.bool_]) -> tuple[tuple[FloatArray, FloatArray] | None, str]:
-        """Centres and displacements (n, 2) [mm] of the holes in a deformed image, and a sentence.
+    def motion_in(self, mask: NDArray[np.bool_]) -> tuple[HoleMotion | None, str]:
+        """How the holes have moved in a deformed image, and a sentence about it.
 
-        None where the holes can't be matched; the sentence says why.
+        None where they can't be followed; the sentence says why.
+
+        Parameters
+        ----------
+        mask
+            (rows, cols) True on material of the deformed image.
         """
         if self.lattice is None:
             return None, "The reference shows no lattice of holes to follow."
@@ -75,7 +74,7 @@ class Geometry:
             motion = match(self.lattice, find_hole_lattice(mask))
         except InputError as error:
             return None, f"The holes could not be followed: {error}."
-        return motion.in_mm(self.grid), " ".join(motion.sentences)
+        return motion, " ".join(motion.sentences)
 
 
 _UPRIGHT_DEG = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from modeharvest.idic.gauss_newton import Outcome
 from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.region import junction
 from modeharvest.idic.result import Result
+from modeharvest.idic.scene import Expected, compare_scenes, require_same_scene
 from modeharvest.idic.support import Taper
 from modeharvest.progress import Progress, silent
 
@@ -94,11 +96,20 @@ def measure(
         unknowns are the start; the start is found anew if that leads nowhere.
     progress
         Listener.
+
+    Raises
+    ------
+    InputError
+        If the two images don't show the same surface, or the spectrum contradicts the cell size.
     """
-    holes, said = geometry.holes_in(pair.deformed_mask)
-    if holes is None and before is not None:
-        holes = _moved_cells(before.result, geometry)
+    motion, said = geometry.motion_in(pair.deformed_mask)
+    holes = None if motion is None else motion.in_mm(geometry.grid)
+    expected: Expected | None = None if motion is None else motion.at
+    if motion is None and before is not None:
+        holes, expected = _moved_holes(before.result, geometry), partial(_moved_to, before.result)
         said += " v0 starts from the photograph before."
+    if expected is not None:
+        said += " " + _same_surface(pair, expected)
     options = StartOptions(how.v0_degree, how.v_degree, how.brightness())
     start = automatic_start(
         pair.reference, pair.deformed, geometry.grid, cell_size, geometry.region.cellular,
@@ -115,6 +126,13 @@ def measure(
             return Measured(found, start.local, before.held, (*sentences, words))
     found = _correlated(pair, geometry, ansatz, unknowns, how, progress)
     return Measured(found, start.local, held, sentences)
+
+
+def _same_surface(pair: Pair, expected: Expected) -> str:
+    """A sentence about blocks of the reference that were found where they are expected."""
+    seen = compare_scenes(pair.reference, pair.deformed, pair.mask, expected)
+    require_same_scene(seen, "the reference", "the deformed one")
+    return seen.sentence
 
 
 def chosen_modes(
@@ -162,13 +180,23 @@ def _goes_on(before: Measured, held: bool) -> bool:
     return before.result.outcome is Outcome.CONVERGED and before.held == held
 
 
-def _moved_cells(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Positions over the cellular part and v0 there, as if holes had been followed [mm]."""
-    box = geometry.region.cellular
-    x, y = (np.linspace(a, b, 8) for a, b in ((box.x_min, box.x_max), (box.y_min, box.y_max)))
-    positions = np.stack(np.meshgrid(x, y), axis=-1)
-    moved = result.ansatz.v0(result.unknowns, x, y)
-    return positions.reshape(-1, 2), moved.reshape(-1, 2)
+def _moved_holes(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray] | None:
+    """The reference's holes and v0 there [mm], as if they had been followed; None without any."""
+    if geometry.lattice is None:
+        return None
+    x, y = geometry.grid.to_mm(*geometry.lattice.centres.T)
+    moved = result.ansatz.v0(result.unknowns, x[:, None], y[:, None])[:, 0]
+    return np.column_stack([x, y]), moved
+
+
+def _moved_to(result: Result, points: FloatArray) -> FloatArray:
+    """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px]."""
+    grid = result.grid
+    x, y = grid.to_mm(points[:, 0], points[:, 1])
+    moved = np.column_stack([x, y]) + result.ansatz.displacement_at(
+        result.unknowns, np.column_stack([x, y])
+    )
+    return np.column_stack(grid.to_px(moved[:, 0], moved[:, 1]))
 
 
 def _correlated(

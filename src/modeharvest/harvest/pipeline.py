@@ -30,6 +30,7 @@ from modeharvest.harvest.optics import Optics, find_optics
 from modeharvest.harvest.prepare import RECORD, Prepared, named_files, prepare
 from modeharvest.harvest.told import harvest_of
 from modeharvest.idic.field_files import read_field, write_field
+from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.result import Result
 from modeharvest.progress import Progress, silent
@@ -92,25 +93,53 @@ class Harvesting:
         return find_geometry(self.prepared(), self.experiment.specimen, self.base)
 
     def results(self) -> dict[str, Measured]:
-        """Correlate every photograph, each after the one before; leaves ``results/``."""
-        prepared, found = self.prepared(), {}
+        """Correlate every photograph, each after the one before; leaves ``results/``.
+
+        One that can't be measured is left out (see :meth:`failures`), and the next goes on from
+        the last that could.
+
+        Raises
+        ------
+        InputError
+            If none can be measured.
+        """
+        prepared = self.prepared()
+        found: dict[str, Measured] = {}
         before: Measured | None = None
         key = digest([self._prepared_key(), self._how()])
         for number, name in enumerate(prepared.names):
             key = digest([key, name, self._local_digest(number)])
             self._measure_one(prepared, number, before, key)
-            before = found[name] = self._read(name)
+            if not self._told(name)["failed"]:
+                before = found[name] = self._read(name)
+        if not found:
+            name = prepared.names[0]
+            raise InputError(f"{name}: {self._told(name)['failed']}")
         return found
+
+    def failures(self) -> tuple[tuple[str, str], ...]:
+        """Names of the photographs that were read but could not be measured, and why."""
+        told = {name: self._told(name)["failed"] for name in self.prepared().names}
+        return tuple((name, reason) for name, reason in told.items() if reason)
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
         names = ("optics", "prepare", *(f"correlate {name}" for name in self.prepared().names))
         seconds = {name: float(self.stages.finished(name).get("seconds", 0.0)) for name in names}
         return harvest_of(
-            self.experiment, self.prepared(), self.geometry, self.optics, self.results(),
-            truth=truth, source=self.source, folder=self.folder, timings=seconds,
-            versions=versions(), progress=self.progress,
-        )  # fmt: skip
+            self.experiment,
+            self.prepared(),
+            self.geometry,
+            self.optics,
+            self.results(),
+            skipped=(*self.prepared().skipped, *self.failures()),
+            truth=truth,
+            source=self.source,
+            folder=self.folder,
+            timings=seconds,
+            versions=versions(),
+            progress=self.progress,
+        )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
         """Do everything that is not finished; returns the content of ``summary.json``."""
@@ -131,21 +160,27 @@ class Harvesting:
         result, field, start = self._paths(name)
 
         def work() -> None:
-            found = measure(
-                self._pair(prepared, number, before),
-                self.geometry,
-                self.experiment.specimen.cell_size,
-                self.experiment.correlation,
-                local_field(self.experiment, self.base, prepared, number, self.optics.distortion),
-                before,
-                self.progress,
-            )
+            try:
+                found = measure(
+                    self._pair(prepared, number, before),
+                    self.geometry,
+                    self.experiment.specimen.cell_size,
+                    self.experiment.correlation,
+                    self._local(prepared, number),
+                    before,
+                    self.progress,
+                )
+            except InputError as error:
+                write_json(start, {"failed": str(error)})
+                return
             write_field(field, found.local)
-            told = {"held": found.held, "source": found.local.source, "said": found.sentences}
-            write_json(start, told)
             found.result.write(result)
+            write_json(start, {"failed": "", "held": found.held, "said": found.sentences})
 
-        self.stages.do(f"correlate {name}", key, work, result, field, start)
+        self.stages.do(f"correlate {name}", key, work, start)
+
+    def _local(self, prepared: Prepared, number: int) -> LocalField | None:
+        return local_field(self.experiment, self.base, prepared, number, self.optics.distortion)
 
     def _pair(self, prepared: Prepared, number: int, before: Measured | None) -> Pair:
         """The photograph and what it is correlated with."""
@@ -159,11 +194,14 @@ class Harvesting:
         return Pair(reference, prepared.image(name), mask, prepared.mask(name))
 
     def _read(self, name: str) -> Measured:
-        result, field, start = self._paths(name)
-        told = read_json(start)
+        result, field, _ = self._paths(name)
+        told = self._told(name)
         return Measured(
             Result.read(result), read_field(field), bool(told["held"]), tuple(told["said"])
         )
+
+    def _told(self, name: str) -> dict[str, Any]:
+        return dict(read_json(self._paths(name)[2]))
 
     def _paths(self, name: str) -> tuple[Path, Path, Path]:
         folder = self.folder / "results"

@@ -24,7 +24,7 @@ from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.noise import Noise, estimated_noise, measured_noise
-from modeharvest.idic.material import find_material
+from modeharvest.idic.material import MaterialOptions, find_material
 from modeharvest.imaging.distortion import undistorted, undistorted_mask
 from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.grid import PixelGrid
@@ -117,7 +117,8 @@ def prepare(
     """
     images, table = experiment.images, experiment.specimen
     reference = read_reference(base / images.reference)
-    ready = _Maker(folder, distortion)
+    cell_px = table.cell_size / experiment.scale.mm_per_px
+    ready = _Maker(folder, distortion, material_options(cell_px))
     mask = ready.save("reference", reference, _given(base, table.material))
     deformed = named_files(base, images.deformed)
     names, skipped, notes = [], [], list(reference.notes) + ready.sentences
@@ -180,11 +181,26 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
     return tuple(paths)
 
 
+def material_options(cell_px: float) -> MaterialOptions:
+    """How material is told from background where cells are that large [px].
+
+    Buckled holes are narrow: the window has to fit into them.
+    """
+    window = int(np.clip(_WINDOW * cell_px, 9, 25)) // 2 * 2 + 1
+    return MaterialOptions(window_px=window, reach_px=0.4 * window)
+
+
+_WINDOW = 0.15
+"""Window in which the speckle's contrast is looked at, as a share of the cell."""
+
+
 class _Maker:
     """Frees photographs from distortion and finds their material."""
 
-    def __init__(self, folder: Path, distortion: Distortion | None) -> None:
-        self._folder, self._distortion = folder, distortion
+    def __init__(
+        self, folder: Path, distortion: Distortion | None, options: MaterialOptions
+    ) -> None:
+        self._folder, self._distortion, self._options = folder, distortion, options
         self.sentences: list[str] = []
 
     def save(self, name: str, photograph: Photograph, given: Path | None) -> BoolArray:
@@ -193,7 +209,7 @@ class _Maker:
             mask = read_mask(given)
             require_same_shape(photograph.image, mask, str(photograph.path), str(given))
         else:
-            material = find_material(photograph.image)
+            material = find_material(photograph.image, self._options)
             mask = material.mask
             self.sentences += [s for s in material.sentences if s not in self.sentences]
         image, shown = photograph.image, mask

@@ -36,6 +36,7 @@ def harvest_of(
     optics: Optics,
     results: Mapping[str, Measured],
     *,
+    skipped: tuple[tuple[str, str], ...] = (),
     truth: HarvestTruth | None = None,
     source: str,
     folder: Path,
@@ -49,6 +50,8 @@ def harvest_of(
     ----------
     experiment, prepared, geometry, optics, results
         The stages' outcomes.
+    skipped
+        Names of photographs that were not used, and why.
     truth
         Of photographs made by a simulation.
     source, folder
@@ -77,13 +80,13 @@ def harvest_of(
         noise_sd=noise.sd,
         noise_source=noise.source,
         lattice=geometry.lattice,
-        skipped=prepared.skipped,
+        skipped=skipped,
         timeline=tuple(moments),
         buckling=find_buckling(moments),
         calibration=optics.calibration,
         distortion=optics.distortion,
         full_scale=float(prepared.info["full_scale"]),
-        sentences=(*prepared.info["notes"], *geometry.sentences),
+        sentences=(*prepared.info["notes"], *geometry.region.sentences),
         truth=truth,
         command=f"modeharvest harvest {source} --out {folder}",
         toml=path.read_text("utf-8") if path.is_file() else "",
@@ -109,6 +112,7 @@ def _frame(
     seen = identifiability(result, prepared.mask())
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
+    pattern = read_pattern(spectrum)
     return HarvestedFrame(
         name=name,
         strain_x=along,
@@ -124,10 +128,10 @@ def _frame(
         by_leftover=None if leftover is None else field_errors(result, x, y, leftover),
         leftover_covariance=leftover,
         spectrum=spectrum,
-        pattern=read_pattern(spectrum),
+        pattern=pattern,
         local=measured.local if experiment.local.code != "none" else None,
-        start_sentences=measured.sentences,
-        warnings=(*warnings, *seen.warnings),
+        start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
+        warnings=tuple(warnings),
     )
 
 
