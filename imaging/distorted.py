@@ -6,6 +6,9 @@ coordinates of the material there, then the speckle at its reference point.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
@@ -23,6 +26,8 @@ FloatArray = NDArray[np.float64]
 Positions = tuple[FloatArray, FloatArray]
 
 _DEGREE = 9
+_NEGLIGIBLE_PX = 1e-12
+_STRIP = 64  # rows that a thread takes at a time
 
 
 def seen_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
@@ -34,14 +39,18 @@ def seen_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
         If the distortion folds in the image.
     """
     row, col = np.ogrid[: shape[0], : shape[1]]
-    return distortion.ideal(row, col)
+    strips = [slice(k, k + _STRIP) for k in range(0, shape[0], _STRIP)]
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        found = list(pool.map(lambda strip: distortion.ideal(row[strip], col), strips))
+    return np.concatenate([r for r, _ in found]), np.concatenate([c for _, c in found])
 
 
 def without_affine(distortion: Distortion, shape: tuple[int, int]) -> PolynomialDistortion:
-    """The same distortion without its affine part, as a polynomial of degree 9.
+    """The same distortion without its affine part, as a polynomial.
 
-    The terms 1, xi, eta of its Chebyshev series over the image are left out; exact for lenses
-    that are polynomials (k1 ... k3, p1, p2).
+    The terms 1, xi, eta of its Chebyshev series over the image are left out, and those of the
+    highest degrees where they are negligible; exact for lenses that are polynomials of degree 9
+    or less (those of k1 ... k3, p1, p2).
 
     Parameters
     ----------
@@ -59,7 +68,12 @@ def without_affine(distortion: Distortion, shape: tuple[int, int]) -> Polynomial
     orders = PolynomialDistortion.orders(_DEGREE)
     coefficients = np.array([[s[j, i] for i, j in orders] for s in series])
     coefficients[:, :3] = 0.0
-    return PolynomialDistortion(shape, coefficients)
+    degree = max(
+        (i + j for (i, j), c in zip(orders, coefficients.T, strict=True)
+         if np.abs(c).max() > _NEGLIGIBLE_PX),
+        default=0,
+    )  # fmt: skip
+    return PolynomialDistortion(shape, coefficients[:, : PolynomialDistortion.size_of(degree)])
 
 
 def render_seen(

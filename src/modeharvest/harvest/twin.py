@@ -114,7 +114,7 @@ def make_twin(
     key = digest([image_key(solution, strains, spec), plain(case.calibration)])
     if _is_finished(twin, key):
         return twin
-    (truth / _SIDECAR).unlink(missing_ok=True)
+    _discard(twin)
     solution.write(truth / "solution.h5")
     images = make_images(solution, strains, spec, truth / "images", progress)
     _copy_photographs(images, photographs)
@@ -129,18 +129,34 @@ def make_twin(
     with atomic(twin.experiment) as temporary:
         temporary.write_text(_experiment_text(case, images), "utf-8")
     write_json(
-        truth / _SIDECAR, {"key": key, "stage_shifts_row_col_px": target.true_shifts.tolist()}
+        truth / _SIDECAR,
+        {
+            "key": key,
+            "stage_shifts_row_col_px": target.true_shifts.tolist(),
+            "photographs": {p.name: p.stat().st_size for p in sorted(photographs.glob("*.tif"))},
+        },
     )
     return twin
 
 
 def _is_finished(twin: Twin, key: str) -> bool:
+    """Whether all is there, of the listed sizes, and of that key."""
     try:
-        images = twin.folder / "truth" / "images"
-        whole = is_complete(images, ImageSet.read(images).info["key"])
-        return whole and bool(twin.info["key"] == key) and twin.experiment.is_file()
-    except (InputError, KeyError, TypeError):
+        info, images = twin.info, twin.folder / "truth" / "images"
+        sizes: dict[str, int] = info["photographs"]
+        whole = all((twin.experiment.parent / n).stat().st_size == s for n, s in sizes.items())
+        whole = whole and is_complete(images, ImageSet.read(images).info["key"])
+        return whole and bool(info["key"] == key) and twin.experiment.is_file()
+    except (InputError, OSError, KeyError, TypeError):
         return False
+
+
+def _discard(twin: Twin) -> None:
+    """Take away an older or an unfinished twin's photographs, the mark of completeness first."""
+    (twin.folder / "truth" / _SIDECAR).unlink(missing_ok=True)
+    for pattern in ("reference*.tif", "deformed_*.tif", "calibration_*.tif"):
+        for path in twin.experiment.parent.glob(pattern):
+            path.unlink()
 
 
 def _copy_photographs(images: ImageSet, folder: Path) -> None:
