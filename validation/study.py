@@ -19,9 +19,12 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
     ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
     ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
-    ``residual_verdict``, ``identifiability_warnings``, ``pixels``, ``details_px`` (more
-    statistics of w, best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral
-    densities, in words).
+    ``noise_sd`` (of the images that were correlated, rms over the material and both images
+    [fraction of full scale]; null for the noise-free ones), ``chi_square`` (the residual against
+    that noise, or null), ``gain_min``, ``gain_max``, ``offset_min``, ``offset_max`` (over the
+    material, where they were unknowns), ``residual_verdict``, ``identifiability_warnings``,
+    ``pixels``, ``details_px`` (more statistics of w, best-fit error and IDIC - best fit),
+    ``pattern_reading`` (the spectral densities, in words).
 ``expected``
     Rows of expected and obtained values.
 ``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
@@ -184,6 +187,8 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
     }
     px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
     seen = identifiability(result, mask)
+    noise_sd = _noise_sd(measured, comparison.strain)
+    agreement = result.agreement(noise_sd, order=measured.how.order)
     return {
         "nominal_strain": comparison.strain,
         "branch": state.branch,
@@ -196,13 +201,16 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
         "rms_residual": result.residual_rms,
         **_mode(comparison, measured),
+        **_brightness(comparison),
         "mode_observable": not seen.unobservable,
         "leftover_estimate_px": seen.leftover_px,
         "mode_polynomial_overlap": seen.overlap[0],
         "worst_determined": [str(combination) for combination in seen.worst],
         "residual_correlation": result.residual_correlation,
+        "noise_sd": noise_sd,
+        "chi_square": None if noise_sd is None else agreement.chi_square,
         "identifiability_warnings": list(seen.warnings),
-        "residual_verdict": result.agreement().sentence,
+        "residual_verdict": agreement.sentence,
         "iterations": result.iterations,
         "iterations_all_levels": len(result.history),
         "outcome": result.outcome.name.lower(),
@@ -213,6 +221,36 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "details_px": px,
         "pattern_reading": list(pattern.sentences),
     }
+
+
+def _noise_sd(measured: Measured, strain: float) -> float | None:
+    """Noise of the exposures [fraction of full scale]; None if noise-free images were measured.
+
+    The root of the mean variance, since chi squared compares sums of squares.
+    """
+    if not measured.how.camera:
+        return None
+    images = measured.images
+    in_f = images.noise_sd()[images.mask()]
+    in_g = images.noise_sd(strain)[images.deformed_mask(strain)]
+    return float(np.sqrt(0.5 * ((in_f**2).mean() + (in_g**2).mean())))
+
+
+def _brightness(comparison: Comparison) -> dict[str, float]:
+    """Gain [-] and offset [fraction of full scale] over the material; nothing if not unknown."""
+    result, grid = comparison.result, comparison.grid
+    fields = zip(
+        ("gain", "offset"),
+        (result.ansatz.brightness.gain_degree, result.ansatz.brightness.offset_degree),
+        result.ansatz.gain_and_offset(result.unknowns, grid.x, grid.y),
+        strict=True,
+    )
+    found = {}
+    for name, degree, values in fields:
+        if degree is not None:
+            seen = np.broadcast_to(values, grid.shape)[comparison.mask]
+            found |= {f"{name}_min": float(seen.min()), f"{name}_max": float(seen.max())}
+    return found
 
 
 def _mode(comparison: Comparison, measured: Measured) -> dict[str, Any]:

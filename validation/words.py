@@ -23,6 +23,12 @@ _NUMBERS = (
     ("iterations on all levels", "–", "iterations_all_levels"),
     ("condition number", "–", "condition_number"),
     ("autocorrelation of the residual, 4 to 12 px", "–", "residual_correlation"),
+    ("noise of the camera images, rms, as a fraction of full scale", "–", "noise_sd"),
+    ("χ² of the residual: 1 if it is that noise and no more", "–", "chi_square"),
+    ("gain between the images, smallest", "–", "gain_min"),
+    ("… largest", "–", "gain_max"),
+    ("offset between the images, smallest, as a fraction of full scale", "–", "offset_min"),
+    ("… largest", "–", "offset_max"),
     ("w, estimated from the images alone, rms", "px", "leftover_estimate_px"),
     ("overlap of the mode's part with v₀", "–", "mode_polynomial_overlap"),
     ("outcome", "", "outcome"),
@@ -43,7 +49,8 @@ def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
         _key("critical strain", None if critical is None else 100 * critical, "%",
              "none found" if critical is None else "where the pattern sets in", 4),
         _key("pattern", last["pattern_amplitude_px"], "px", f"largest v₁φ₁ {at}", 3),
-        _key("mode off the ideal", _worst(last), "%", f"the worst of a₁ … a₇ {at}", 2),
+        _key("mode off the ideal", _worst(last), "%",
+             f"the worst of a₁ … a₇ {at}" if _is_free(last) else "held at the ideal pattern", 2),
         _key("best possible fit", last["rms_best_fit_px"], "px", "rms, what the model can't say",
              3),
         _key("IDIC − best fit", last["rms_idic_to_best_fit_px"], "px",
@@ -59,7 +66,7 @@ def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [
         {"label": label, "unit": unit, "values": [s.get(key) for s in snapshots]}
         for label, unit, key in _NUMBERS
-        if any(key in s for s in snapshots)
+        if any(s.get(key) is not None for s in snapshots)
     ]
 
 
@@ -103,10 +110,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     for snapshot in summary["snapshots"]:
         said += _about(snapshot)
     said += [
-        "Standard errors take the whole residual for white noise in both images. No noise was "
-        "added to these images: the residual is what the ansatz can't say, so a standard error "
-        "tells how firmly the images hold a parameter, not how far it is from the truth. Compare "
-        "it with the best fit beside it.",
+        _standard_errors(summary),
         "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
         "gradient and leaves out the rims of the holes: even without any noise the two differ.",
         "rms is per component: the root of the mean square over both components of all material "
@@ -119,6 +123,30 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             "material."
         )
     return said
+
+
+def _standard_errors(summary: Mapping[str, Any]) -> str:
+    """What the standard errors mean for these images."""
+    noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
+    sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
+    if noise:
+        said = (
+            "The images are single exposures of the virtual camera, with a predicted noise of "
+            f"{max(noise):.2g} of full scale (rms; rounding to whole grey levels is part of it): "
+            "where χ² is above 1, the rest of the residual is"
+        )
+    elif sensor.get("read_noise") or sensor.get("full_well"):
+        said = (
+            "The sensor makes noise, but what was measured are its noise-free averages "
+            "(“camera = true” measures the exposures): the residual is"
+        )
+    else:
+        said = "No noise was added to these images: the residual is"
+    return (
+        f"Standard errors take the whole residual for white noise in both images. {said} what "
+        "the ansatz can't say, so a standard error tells how firmly the images hold a parameter, "
+        "not how far it is from the truth. Compare it with the best fit beside it."
+    )
 
 
 def _expected(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -155,13 +183,22 @@ def _about(snapshot: Snapshot) -> list[str]:
         said.append(f"{at} {verdict[0].lower()}{verdict[1:]}")
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
+        describes = (
+            f"The mode's parameters (up to {_worst(snapshot):.0f} % off the ideal) describe"
+            if _is_free(snapshot)
+            else "Held at the ideal pattern, the mode describes"
+        )
         said.append(
-            f"{at} there is no pattern to be observed: v₁φ₁ is at most {inner:.2g} px inside. The "
-            f"mode's parameters (up to {_worst(snapshot):.0f} % off the ideal) describe the edge "
-            f"effect in the corner cells ({corners:.2g} px) that the mode takes up, as in the "
-            "paper; the best fit to the truth does the same."
+            f"{at} there is no pattern to be observed: v₁φ₁ is at most {inner:.2g} px inside. "
+            f"{describes} the edge effect in the corner cells ({corners:.2g} px) that the mode "
+            "takes up, as in the paper; the best fit to the truth does the same."
         )
     return said
+
+
+def _is_free(snapshot: Snapshot) -> bool:
+    """Whether the mode's parameters were unknowns."""
+    return bool(snapshot.get("mode_deviation_percent"))
 
 
 def _worst(snapshot: Snapshot) -> float:

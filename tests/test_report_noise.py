@@ -1,0 +1,107 @@
+"""Camera images: the residual against the noise they have, and what the report says of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_report as made_up
+
+from modeharvest.case import read_case, shipped_solution
+from modeharvest.files import read_json
+from modeharvest.idic.agreement import spline_noise
+from modeharvest.pipeline import Run
+from modeharvest.validation import words
+
+CASE = """
+[experiment]
+strains = [0.128]
+[imaging]
+pixel_size = 0.06
+bits = 10
+[imaging.sensor]
+read_noise = 0.02
+full_well = 5000
+"""
+
+
+def finished(folder: Path, correlation: str) -> Run:
+    """A run of the shipped solution, correlated."""
+    path = folder / "case.toml"
+    path.write_text(f"{CASE}\n[correlation]\n{correlation}\n", "utf-8")
+    run = Run(read_case(path), folder / "out", solution=shipped_solution("paper-virtual"))
+    run.image()
+    run.correlate()
+    return run
+
+
+@pytest.fixture(scope="module")
+def exposed(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    options = "camera = true\ngain_degree = 1\noffset_degree = 0"
+    run = finished(tmp_path_factory.mktemp("camera"), options)
+    run.validate()
+    return run
+
+
+def test_chi_squared_is_noise_and_what_noise_free_images_leave(
+    exposed: Run, tmp_path: Path
+) -> None:
+    """Independent of each other, their squares add up; the images' own predictions go in."""
+    (snapshot,) = read_json(exposed.folder / "summary.json")["snapshots"]
+    (clean,) = finished(tmp_path, "camera = false").correlate().values()
+    info = exposed.image().info
+    variance = np.mean([info["reference"]["noise_sd"] ** 2, info["snapshots"][0]["noise_sd"] ** 2])
+    assert snapshot["noise_sd"] == pytest.approx(np.sqrt(variance), rel=1e-6)
+    noise = variance * (1 + spline_noise(5))
+    # 5e4 px: the noise's square scatters by 1 %, and w is not quite the same without noise.
+    assert snapshot["chi_square"] == pytest.approx(1 + clean.residual_rms**2 / noise, rel=0.04)
+    assert snapshot["chi_square"] > 1.1  # w is seen
+    assert "chi squared is" in snapshot["residual_verdict"]
+
+
+def test_gain_and_offset_are_told_where_they_were_unknown(exposed: Run) -> None:
+    (snapshot,) = read_json(exposed.folder / "summary.json")["snapshots"]
+    assert 0.9 < snapshot["gain_min"] < snapshot["gain_max"] < 1.1
+    assert snapshot["offset_min"] == snapshot["offset_max"]  # of degree 0
+    assert abs(snapshot["offset_min"]) < 0.05
+    page = (exposed.folder / "report.html").read_text("utf-8")
+    assert "gain between the images" in page
+    assert "χ² of the residual" in page
+    assert "single exposures of the virtual camera" in page
+
+
+def summary(**snapshot: Any) -> dict[str, Any]:
+    made = made_up.summary(made_up.atlas((0.1,)))
+    made["snapshots"][0] |= {"pattern_inner_px": 0.2} | snapshot
+    return made
+
+
+def note(made: dict[str, Any], about: str) -> str:
+    (found,) = (said for said in words.notes(made) if about in said)
+    return found
+
+
+def test_rows_that_no_snapshot_has_are_left_out() -> None:
+    labels = [row["label"] for row in words.number_rows(summary(noise_sd=None, chi_square=None))]
+    assert not any("χ²" in label or "gain" in label for label in labels)
+    labels = [row["label"] for row in words.number_rows(summary(noise_sd=0.01, chi_square=1.2))]
+    assert sum("χ²" in label for label in labels) == 1
+
+
+def test_what_standard_errors_mean_depends_on_the_images() -> None:
+    about = "Standard errors take the whole residual"
+    assert "No noise was added" in note(summary(), about)
+    assert "predicted noise of 0.01 of full scale" in note(summary(noise_sd=0.01), about)
+    noisy = summary() | {"case": {"imaging": {"sensor": {"read_noise": 0.01, "full_well": 0.0}}}}
+    assert "noise-free averages" in note(noisy, about)
+
+
+def test_a_held_mode_has_no_parameters_off_the_ideal() -> None:
+    held = summary(mode=[], mode_deviation_percent=[])
+    assert "Held at the ideal pattern" in note(held, "there is no pattern")
+    assert not any("nan" in said for said in words.notes(held))
+    (key,) = (k for k in words.key_numbers(held) if k["name"] == "mode off the ideal")
+    assert (key["value"], key["remark"]) == ("–", "held at the ideal pattern")
+    assert "% off the ideal" in note(summary(), "there is no pattern")
