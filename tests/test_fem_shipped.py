@@ -1,12 +1,19 @@
-"""The solution that ships with the package is what the project's own code computes."""
+"""The solutions that ship with the package are what the project's own code computes."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from modeharvest.case import read_case, shipped_solution
+from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.field import Solution
+from modeharvest.fem.imperfection import perturb
+from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.simulate import simulate
+
+FloatArray = NDArray[np.float64]
 
 
 def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
@@ -25,3 +32,33 @@ def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
         assert (old.branch, old.negative_pivots) == (new.branch, new.negative_pivots)
         assert new.negative_pivots == 0
         np.testing.assert_allclose(old.displacement, new.displacement, rtol=0, atol=1e-7)
+
+
+def test_shipped_twin_is_in_stable_equilibrium_under_its_tilted_and_guided_loading() -> None:
+    """Without walking its path again: residual and inertia at what is shipped."""
+    case, path = read_case("paper-real-twin"), shipped_solution("paper-real-twin")
+    assert path is not None
+    shipped, experiment = Solution.read(path), case.experiment
+    spec = experiment.specimen
+    mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
+    np.testing.assert_array_equal(shipped.mesh.cells, mesh.cells)
+    np.testing.assert_allclose(shipped.mesh.nodes, mesh.nodes, rtol=0, atol=1e-12)
+    loading = Loading(
+        spec.half_size[0], spec.length, "clamped", experiment.tilt, spec.mid_junctions
+    )
+    structure = Structure(mesh, experiment.material, loading)
+    places = cKDTree(mesh.nodes)
+    for snapshot in shipped.snapshots:
+
+        def nodal(points: FloatArray, u: FloatArray = snapshot.displacement) -> FloatArray:
+            return np.asarray(u[places.query(points)[1]])
+
+        u = structure.from_function(nodal)
+        structure.prescribe(u, snapshot.nominal_strain)
+        np.testing.assert_allclose(structure.nodal(u), snapshot.displacement, rtol=0, atol=1e-12)
+        # As small as a change of the strain by 1e-10 would make; the solver stops at 1e-11.
+        assert structure.residual(u).norm() < 1e-10 * structure.load(u).norm()
+        assert structure.factor(u).negative_pivots == 0
+        assert abs(structure.energy(u) - snapshot.energy) < 1e-9 * snapshot.energy
+        force = structure.reaction(u, spec.length)
+        assert abs(force - snapshot.reaction) < 1e-7 * snapshot.reaction
