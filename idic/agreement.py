@@ -8,6 +8,7 @@ chi squared tells, too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.residual_sums import block_moments, lagged_products
 from modeharvest.imaging.interpolation import SplineImage
 
 LAGS_PX = (4, 6, 8, 10, 12)
@@ -141,19 +143,17 @@ def autocorrelation(residual: NDArray[Any]) -> float:
     residual
         (rows, cols) f - g(x + u), NaN where no pixel counts.
     """
-    used = np.isfinite(residual)
-    zeroed = np.where(used, residual, np.float32(0.0))
-    variance = float(np.vdot(zeroed, zeroed)) / max(1, int(used.sum()))
-    if variance == 0.0:
+    lags = np.array([0, *LAGS_PX])
+    sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
+    kernel: Callable[..., None] = lagged_products
+    kernel(np.ascontiguousarray(residual), lags, sums, counts)
+    products, pairs = sums.sum(axis=0), counts.sum(axis=0)
+    variance = products[0, 0] / max(1.0, pairs[0, 0])
+    seen = pairs[:, 1:] > 0
+    if variance == 0.0 or not seen.any():
         return 0.0
-    found = []
-    for values, counts in ((zeroed, used), (zeroed.T, used.T)):
-        for lag in LAGS_PX:
-            pairs = int(np.count_nonzero(counts[lag:] & counts[:-lag]))
-            if pairs:
-                product = np.einsum("ij,ij->", values[lag:], values[:-lag], dtype=np.float64)
-                found.append(float(product) / pairs / variance)
-    return float(np.sqrt(np.mean(np.square(found)))) if found else 0.0
+    found = products[:, 1:][seen] / pairs[:, 1:][seen] / variance
+    return float(np.sqrt(np.mean(found**2)))
 
 
 def unmatched(reference: NDArray[Any], residual: NDArray[Any]) -> float:
@@ -170,22 +170,16 @@ def unmatched(reference: NDArray[Any], residual: NDArray[Any]) -> float:
     residual
         (rows, cols) f - g(x + u), NaN where no pixel counts.
     """
-    used = np.isfinite(residual)
-    f = np.where(used, reference, np.float32(0.0))
-    g = np.where(used, reference - residual, np.float32(0.0))
-    count = np.maximum(_block_sums(used), 1.0)
-    mean_f, mean_g = _block_sums(f) / count, _block_sums(g) / count
-    cov = _block_sums(f * g) / count - mean_f * mean_g
-    var_f, var_g = (_block_sums(a * a) / count - m * m for a, m in ((f, mean_f), (g, mean_g)))
+    blocks = [-(-size // BLOCK_PX) for size in residual.shape]
+    sums = np.empty((*blocks, 6))
+    kernel: Callable[..., None] = block_moments
+    kernel(np.ascontiguousarray(reference), np.ascontiguousarray(residual), BLOCK_PX, sums)
+    count = sums[..., 0]
+    f, g, fg, ff, gg = np.moveaxis(sums[..., 1:] / np.maximum(count, 1.0)[..., None], -1, 0)
+    cov, var_f, var_g = fg - f * g, ff - f * f, gg - g * g
     # Blocks with a third of their pixels, and with a speckle in them.
     judged = (count > BLOCK_PX**2 / 3) & (var_f > 1e-6 * var_f.max(initial=0.0))
     if not judged.any():
         return 0.0
     product = np.sqrt(np.maximum(var_f * var_g, 0.0))[judged]
     return float(np.mean(cov[judged] < MATCH * product))
-
-
-def _block_sums(image: NDArray[Any]) -> NDArray[np.float64]:
-    rows, cols = (np.arange(0, size, BLOCK_PX) for size in image.shape)
-    along = np.add.reduceat(image, rows, axis=0, dtype=np.float64)
-    return np.asarray(np.add.reduceat(along, cols, axis=1))

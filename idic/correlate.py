@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,24 +21,21 @@ from modeharvest.idic.gauss_newton import (
     Minimum,
     Outcome,
     ScaledEigen,
-    StepLength,
     minimise,
 )
 from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen, where
-from modeharvest.idic.normal_equations import Assembly, NormalEquations
-from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, Pair, prepare
+from modeharvest.idic.level_search import LevelSearch, step_length
+from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, prepare
 from modeharvest.idic.result import Result
+from modeharvest.idic.warp import residual
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.progress import Progress, silent
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_BAND = 64
-"""Rows that are looked at in one go."""
 _WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
-_ROUNDS, _SETTLED = 5, 1e-2
-"""The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 
 
 @dataclass(frozen=True)
@@ -114,44 +111,32 @@ def correlate(
     """
     options = options or CorrelationOptions()
     clock = _Clock()
-    f, g = checked_image(reference, "reference", grid), checked_image(deformed, "deformed", grid)
-    f_mask, g_mask = (
-        checked_mask(mask, "mask", grid),
-        checked_mask(deformed_mask, "deformed mask", grid),
-    )
-    require_contrast(seen(f, f_mask), "reference")
-    require_contrast(seen(g, g_mask), "deformed")
-    a = before = _lit_alike(ansatz, ansatz.checked(start), seen(f, f_mask), seen(g, g_mask))
-    kinematics = replace(ansatz, brightness=Brightness())
-    has_brightness = ansatz.brightness.size > 0
+    images = _Images.checked(reference, deformed, grid, mask, deformed_mask)
+    a = before = _lit_alike(ansatz, ansatz.checked(start), *images.grey)
+    clock.lap("check")
     levels = _useful(options.levels, ansatz, grid)
     history: tuple[Iteration, ...] = ()
     for k, level in enumerate(levels):
-        finest = k == len(levels) - 1
-        # Coarse levels see images that are lit alike: what the brightness could absorb there is
-        # much of the blurred speckle itself.
-        levelled = has_brightness and not finest
-        pair = prepare(f, g, grid, f_mask, g_mask, level, options.edge_px, options.order, levelled)
+        report = _reporter(progress, k, len(levels), options.gauss_newton)
+        search = _level_search(images, ansatz, level, level is levels[-1], options, report)
         clock.lap(f"prepare level {level.factor}")
-        model = ansatz if finest else kinematics
-        before = _better(pair, model, a[: model.size], before[: model.size])
-        found = _minimise_pair(
-            pair, model, before, level.factor, finest, options.gauss_newton,
-            _reporter(progress, k, len(levels), options.gauss_newton),
-        )  # fmt: skip
+        n = search.ansatz.size
+        before = np.append(search.better(a[:n], before[:n]), a[n:])
+        found, assembly = search.minimum(before[:n])
         clock.lap(f"iterate level {level.factor}")
         history += found.history
-        a, before = (np.concatenate([x, a[x.size :]]) for x in (found.unknowns, before))
+        a = np.append(found.unknowns, a[n:])
         if found.outcome in _WITHOUT_RESULT:
             break
-    residual = _residual(pair, model, found.unknowns)
-    lost = unmatched(pair.reference, residual)
+    pair = search.pair
+    left = residual(assembly, found.unknowns, pair.reference, pair.deformed)
+    lost = unmatched(pair.reference, left)
     if lost > TRAPPED and found.outcome not in _WITHOUT_RESULT:
         found = replace(found, outcome=Outcome.TRAPPED)
-    correlation = autocorrelation(residual)
+    correlation = autocorrelation(left)
     clock.lap("judge the residual")
     progress(len(levels), len(levels), "correlate")
-    result = _result(model, grid, found, history, clock.laps)
+    result = _result(search.ansatz, pair.grid, found, history, clock.laps)
     return replace(result, residual_correlation=correlation, unmatched=lost)
 
 
@@ -210,7 +195,7 @@ def fit_displacement(
     assembly = Assembly(ansatz, grid, inside)
     found = minimise(
         lambda a, with_matrix: assembly.displacement(a, target, with_matrix),
-        _step_length(ansatz, grid, inside, 1),
+        step_length(ansatz, grid, inside, 1),
         start[: ansatz.size],
         options,
         options.tolerance_px,
@@ -220,88 +205,70 @@ def fit_displacement(
     return _result(ansatz, grid, found, found.history, clock.laps)
 
 
-def _minimise_pair(
-    pair: Pair,
-    ansatz: Ansatz,
-    start: FloatArray,
-    factor: int,
-    finest: bool,
-    options: GaussNewtonOptions,
-    on_iteration: Callable[[int], None],
-) -> Minimum:
-    tolerance = options.tolerance_px if finest else options.coarse_tolerance_px * factor
-    history: tuple[Iteration, ...] = ()
-    landed = _landed(pair, ansatz, start)
-    for _ in range(_ROUNDS):
-        assembly = Assembly(ansatz, pair.grid, landed)
-        found = minimise(
-            partial(_images, assembly, pair),
-            _step_length(ansatz, pair.grid, landed, factor),
-            start,
-            options,
-            tolerance,
-            factor,
-            on_iteration,
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """What is correlated, checked."""
+
+    f: NDArray[Any]
+    g: NDArray[Any]
+    grid: PixelGrid
+    f_mask: BoolArray | None
+    g_mask: BoolArray | None
+
+    @classmethod
+    def checked(
+        cls,
+        reference: ArrayLike,
+        deformed: ArrayLike,
+        grid: PixelGrid,
+        mask: ArrayLike | None,
+        deformed_mask: ArrayLike | None,
+    ) -> _Images:
+        images = cls(
+            checked_image(reference, "reference", grid),
+            checked_image(deformed, "deformed", grid),
+            grid,
+            checked_mask(mask, "mask", grid),
+            checked_mask(deformed_mask, "deformed mask", grid),
         )
-        history += found.history
-        previous, landed = landed, _landed(pair, ansatz, found.unknowns)
-        if (landed != previous).sum() <= _SETTLED * landed.sum():
-            break
-        start = found.unknowns
-    return replace(found, history=history)
+        for grey, what in zip(images.grey, ("reference", "deformed"), strict=True):
+            require_contrast(grey, what)
+        return images
+
+    @cached_property
+    def grey(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The grey levels of the material, of f and of g."""
+        return seen(self.f, self.f_mask), seen(self.g, self.g_mask)
 
 
-def _better(pair: Pair, ansatz: Ansatz, a: FloatArray, before: FloatArray) -> FloatArray:
-    """Choose what fits this level better: the last level's unknowns, or those it began with.
+def _level_search(
+    images: _Images,
+    ansatz: Ansatz,
+    level: Level,
+    finest: bool,
+    options: CorrelationOptions,
+    report: Callable[[int], None],
+) -> LevelSearch:
+    """Prepare a level of the images, and what to look for there.
 
-    A speckle that is too fine for a coarse blur leaves no information there, and the level
-    leads astray; this takes its steps back.
+    Coarse levels see images that are lit alike: what the brightness could absorb there is much
+    of the blurred speckle itself.
     """
-    if np.array_equal(a, before):
-        return a
-    assembly = Assembly(ansatz, pair.grid, pair.mask)
-    costs = [_images(assembly, pair, x, False).mean_square for x in (a, before)]
-    return a if costs[0] <= costs[1] else before
-
-
-def _images(assembly: Assembly, pair: Pair, a: FloatArray, with_matrix: bool) -> NormalEquations:
-    return assembly.images(a, pair.reference, pair.deformed, with_matrix)
-
-
-def _landed(pair: Pair, ansatz: Ansatz, a: FloatArray) -> BoolArray:
-    """Keep the pixels that these unknowns map onto material of the deformed image.
-
-    The set is frozen while the cost is minimised: pixels that came and went with every step
-    would make the cost jump, and the iteration stagnate.
-    """
-    if pair.allowed is None:
-        return pair.mask
-    grid, landed = pair.grid, pair.mask.copy()
-    for first in range(0, grid.rows, _BAND):  # in bands: whole images of u would be large
-        band = slice(first, first + _BAND)
-        row, col = np.nonzero(pair.mask[band])
-        u = (ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size)[row, col]
-        to_row = np.rint(first + row - u[:, 1]).astype(int)
-        to_col = np.rint(col + u[:, 0]).astype(int)
-        inside = (to_row >= 0) & (to_row < grid.rows) & (to_col >= 0) & (to_col < grid.cols)
-        # A pixel off the image stays in: the iteration counts those and says so.
-        to = pair.allowed[to_row[inside], to_col[inside]]
-        landed[first + row[inside], col[inside]] = to
-    return landed
-
-
-def _residual(pair: Pair, ansatz: Ansatz, a: FloatArray) -> NDArray[np.float32]:
-    """(rows, cols) f - g(x + u) at the pixels that count, NaN at the others."""
-    grid, landed = pair.grid, _landed(pair, ansatz, a)
-    residual = np.full(grid.shape, np.nan, dtype=np.float32)
-    for first in range(0, grid.rows, _BAND):
-        band = slice(first, first + _BAND)
-        row, col = np.nonzero(landed[band])
-        u = (ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size)[row, col]
-        gain, offset = (b[row, col] for b in ansatz.gain_and_offset(a, grid.x, grid.y[band]))
-        value, _, _ = pair.deformed.sample(first + row - u[:, 1], col + u[:, 0])
-        residual[first + row, col] = pair.reference[first + row, col] - gain * value - offset
-    return residual
+    levelled = ansatz.brightness.size > 0 and not finest
+    pair = prepare(
+        images.f, images.g, images.grid, images.f_mask, images.g_mask, level, options.edge_px,
+        options.order, levelled,
+    )  # fmt: skip
+    coarse_px = options.gauss_newton.coarse_tolerance_px * level.factor
+    return LevelSearch(
+        pair,
+        ansatz if finest else replace(ansatz, brightness=Brightness()),
+        level.factor,
+        options.gauss_newton.tolerance_px if finest else coarse_px,
+        coarse_px,
+        options.gauss_newton,
+        report,
+    )
 
 
 def _result(
@@ -337,23 +304,6 @@ def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple
         return blur_px <= quarter_px and min(grid.shape) // level.factor >= 32
 
     return (*(level for level in levels[:-1] if keeps(level)), levels[-1])
-
-
-def _step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
-    """Rms difference of two displacements over about 10^4 of the pixels [px of the full image]."""
-    stride = max(1, int(np.sqrt(mask.sum() / 1e4)))
-    some = mask[::stride, ::stride]
-    if not some.any():
-        stride, some = 1, mask
-    x, y = grid.x[::stride], grid.y[::stride]
-    per_px = factor / grid.pixel_size  # a binned px is factor px
-
-    def length(a: FloatArray, b: FloatArray) -> float:
-        change = ansatz.displacement(b, x, y) - ansatz.displacement(a, x, y)
-        squares = (change[some] ** 2).sum(axis=-1)
-        return float(np.sqrt(squares.mean()) * per_px) if squares.size else 0.0
-
-    return length
 
 
 def _reporter(

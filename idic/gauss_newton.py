@@ -14,7 +14,7 @@ again where the iteration ends.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -203,12 +203,15 @@ class Minimum:
         Why it ended.
     history
         Every step.
+    curvature
+        (n, n): J'J corrected by what the steps did to the gradient; see :func:`minimise`.
     """
 
     unknowns: FloatArray
     equations: NormalEquations
     outcome: Outcome
     history: tuple[Iteration, ...]
+    curvature: FloatArray
 
 
 Evaluate = Callable[[FloatArray, bool], NormalEquations]
@@ -234,6 +237,7 @@ def minimise(
     tolerance_px: float,
     factor: int = 1,
     on_iteration: Callable[[int], None] = lambda number: None,
+    curvature: FloatArray | None = None,
 ) -> Minimum:
     """Minimise 1/2 sum r^2.
 
@@ -251,49 +255,96 @@ def minimise(
         Binning.
     on_iteration
         Called with the number of each finished iteration.
+    curvature
+        (n, n) what to begin with in place of J'J, if something is known already.
     """
-    a, equations = start, evaluate(start, True)
-    matrix, is_assembled = equations.matrix, True
+    at = _Point.of(start, evaluate(start, curvature is None), curvature)
+    limits = _Limits(options, tolerance_px, _SHORT * factor)
     history: list[Iteration] = []
-    damping, previous = 0.0, np.inf
-
-    def ended(outcome: Outcome) -> Minimum:
-        there = equations if is_assembled else evaluate(a, True)
-        return Minimum(a, there, outcome, tuple(history))
-
-    if _left(equations) > options.max_left:
-        return ended(Outcome.LEFT_IMAGE)
-    for number in range(1, options.max_iterations + 1):
-        if not np.any(matrix):
-            return ended(Outcome.SINGULAR)
-        eigen = ScaledEigen.of(matrix)
-        while True:
-            candidate = a - eigen.solve(equations.gradient, damping)
-            step = step_length(a, candidate)
-            # While the cost still falls a lot, Gauss-Newton's own matrix is the best.
-            has_fallen = equations.mean_square < _FALLING * previous
-            is_settling = damping == 0.0 and step < _SHORT * factor and not has_fallen
-            trial = evaluate(candidate, not is_settling)
-            descends = trial.mean_square <= equations.mean_square
-            accepted = descends and _left(trial) <= options.max_left
-            if accepted or step <= tolerance_px or damping >= _LARGEST_DAMPING:
-                break
-            damping = max(_FIRST_DAMPING, 10.0 * damping)
-        if accepted:
-            change = trial.gradient - equations.gradient
-            matrix = _corrected(matrix, candidate - a, change) if is_settling else trial.matrix
-            previous = equations.mean_square
-            a, equations, is_assembled = candidate, trial, not is_settling
+    outcome = Outcome.LEFT_IMAGE if _left(at.equations) > options.max_left else None
+    while outcome is None:
+        if not np.any(at.curvature):
+            outcome = Outcome.SINGULAR
+            break
+        step = _descend(at, evaluate, step_length, limits)
+        at = step.to if step.accepted else at
+        number, damping, here = len(history) + 1, step.damping, at.equations
         history.append(
-            Iteration(factor, number, equations.mean_square, step, damping, equations.pixels)
+            Iteration(factor, number, here.mean_square, step.length_px, damping, here.pixels)
         )
         on_iteration(number)
-        if step <= tolerance_px and damping <= _FIRST_DAMPING:
-            return ended(Outcome.CONVERGED)
-        if not accepted:
-            return ended(Outcome.STAGNATED)
-        damping = 0.0 if damping <= _FIRST_DAMPING else 0.1 * damping
-    return ended(Outcome.MAX_ITERATIONS)
+        outcome = _ending(step, number, limits)
+        at = replace(at, damping=0.0 if damping <= _FIRST_DAMPING else 0.1 * damping)
+    there = at.equations if at.is_assembled else evaluate(at.a, True)
+    return Minimum(at.a, there, outcome, tuple(history), at.curvature)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Where the iteration is, and what it knows there."""
+
+    a: FloatArray
+    equations: NormalEquations
+    is_assembled: bool
+    curvature: FloatArray
+    has_fallen: bool = True
+    """Whether the cost still falls a lot: then Gauss-Newton's own matrix is the best."""
+    damping: float = 0.0
+
+    @classmethod
+    def of(cls, a: FloatArray, equations: NormalEquations, known: FloatArray | None) -> _Point:
+        if known is None:
+            return cls(a, equations, True, equations.matrix)
+        return cls(a, equations, False, known, has_fallen=False)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    options: GaussNewtonOptions
+    tolerance_px: float
+    short_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step from one point to another, and whether it was good enough to be taken."""
+
+    to: _Point
+    length_px: float
+    damping: float
+    accepted: bool
+
+
+def _descend(at: _Point, evaluate: Evaluate, step_length: StepLength, limits: _Limits) -> _Step:
+    """Take a step that lowers the cost, damped as much as it takes."""
+    eigen, damping = ScaledEigen.of(at.curvature), at.damping
+    while True:
+        a = at.a - eigen.solve(at.equations.gradient, damping)
+        length = step_length(at.a, a)
+        is_settling = damping == 0.0 and length < limits.short_px and not at.has_fallen
+        # The last step's matrix is wanted for the covariance.
+        is_assembled = not is_settling or length <= limits.tolerance_px
+        found = evaluate(a, is_assembled)
+        descends = found.mean_square <= at.equations.mean_square
+        accepted = descends and _left(found) <= limits.options.max_left
+        if accepted or length <= limits.tolerance_px or damping >= _LARGEST_DAMPING:
+            break
+        damping = max(_FIRST_DAMPING, 10.0 * damping)
+    curvature = found.matrix
+    if is_settling:
+        change = found.gradient - at.equations.gradient
+        curvature = _corrected(at.curvature, a - at.a, change)
+    has_fallen = found.mean_square < _FALLING * at.equations.mean_square
+    return _Step(_Point(a, found, is_assembled, curvature, has_fallen), length, damping, accepted)
+
+
+def _ending(step: _Step, number: int, limits: _Limits) -> Outcome | None:
+    """Why to stop after this step, if there is a reason."""
+    if step.length_px <= limits.tolerance_px and step.damping <= _FIRST_DAMPING:
+        return Outcome.CONVERGED
+    if not step.accepted:
+        return Outcome.STAGNATED
+    return Outcome.MAX_ITERATIONS if number >= limits.options.max_iterations else None
 
 
 def _corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:

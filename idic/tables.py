@@ -73,9 +73,10 @@ def runs_of(mask: BoolArray) -> Runs:
     edges = np.zeros((mask.shape[0], mask.shape[1] + 1), dtype=np.bool_)
     edges[:, 1:-1] = mask[:, 1:] != mask[:, :-1]
     edges[:, 0], edges[:, -1] = mask[:, 0], mask[:, -1]
-    columns = np.nonzero(edges)[1].astype(np.int32)  # where runs begin and end, in turns
-    per_row = edges.sum(axis=1, dtype=np.int64) // 2
-    return Runs(columns[::2], columns[1::2], np.concatenate([[0], np.cumsum(per_row)]))
+    row, column = np.nonzero(edges)  # where runs begin and end, in turns
+    per_row = np.bincount(row[::2], minlength=len(mask))
+    limits = column.astype(np.int32)
+    return Runs(limits[::2], limits[1::2], np.concatenate([[0], np.cumsum(per_row)]))
 
 
 def tables_of(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:

@@ -1,0 +1,168 @@
+"""The minimum on one level of the pyramid: which pixels count, and with how many to begin.
+
+The set of pixels is frozen while the cost is minimised: pixels that came and went with every
+step would make the cost jump, and the iteration stagnate. It is chosen anew at the minimum.
+
+Where there are far more pixels than it takes to find the unknowns, every few rows lead most of
+the way, and hand over what they know of the cost's curvature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.gauss_newton import (
+    GaussNewtonOptions,
+    Iteration,
+    Minimum,
+    Outcome,
+    StepLength,
+    minimise,
+)
+from modeharvest.idic.normal_equations import Assembly, NormalEquations
+from modeharvest.idic.pyramid import Pair
+from modeharvest.idic.warp import landed
+from modeharvest.imaging.grid import PixelGrid
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_ROUNDS, _SETTLED = 5, 1e-2
+"""The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
+_PLENTY, _STRIDE = 1000, 4
+"""Pixels an unknown that suffice to lead the way, and of how many rows one is taken then."""
+
+_ACROSS = 128
+"""Rows and columns, at most, over which the length of a step is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSearch:
+    """One level of a correlation.
+
+    Parameters
+    ----------
+    pair
+        Its images.
+    ansatz
+        The kinematics.
+    factor
+        Its binning.
+    tolerance_px, rough_px
+        Steps to stop at, with all pixels and with every few rows [px].
+    options
+        Limits.
+    on_iteration
+        Called with the number of each finished iteration.
+    """
+
+    pair: Pair
+    ansatz: Ansatz
+    factor: int
+    tolerance_px: float
+    rough_px: float
+    options: GaussNewtonOptions
+    on_iteration: Callable[[int], None]
+
+    def better(self, a: FloatArray, before: FloatArray) -> FloatArray:
+        """Choose what fits better: the last level's unknowns, or those it began with.
+
+        A speckle that is too fine for a coarse blur leaves no information there, and the level
+        leads astray; this takes its steps back.
+        """
+        if np.array_equal(a, before):
+            return a
+        some = self._thinned(self._everything)
+        costs = [self._equations(some, x, False).mean_square for x in (a, before)]
+        return a if costs[0] <= costs[1] else before
+
+    def minimum(self, start: FloatArray) -> tuple[Minimum, Assembly]:
+        """Find it, and the pixels it was found with."""
+        assembly = self._landed(start)
+        history: tuple[Iteration, ...] = ()
+        curvature = None
+        some = self._thinned(assembly)
+        if some is not assembly:
+            rough = self._minimise(some, start, self.rough_px, None)
+            history += rough.history
+            if rough.outcome is Outcome.CONVERGED:
+                start = rough.unknowns
+                curvature = rough.curvature * (assembly.mask.sum() / some.mask.sum())
+        for _ in range(_ROUNDS):
+            found = self._minimise(assembly, start, self.tolerance_px, curvature)
+            history += found.history
+            used, start, curvature = assembly, found.unknowns, found.curvature
+            if self.pair.allowed is None:
+                break
+            assembly = self._landed(start)
+            if (assembly.mask != used.mask).sum() <= _SETTLED * assembly.mask.sum():
+                break
+        return replace(found, history=history), used
+
+    def _landed(self, a: FloatArray) -> Assembly:
+        """All pixels, less those that these unknowns map onto no material."""
+        pair = self.pair
+        if pair.allowed is None:
+            return self._everything
+        kept = landed(self._everything, a, pair.reference, pair.deformed, pair.allowed)
+        return replace(self._everything, mask=kept)
+
+    @cached_property
+    def _everything(self) -> Assembly:
+        return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
+
+    def _thinned(self, assembly: Assembly) -> Assembly:
+        """One row of a few, if that leaves plenty of pixels."""
+        if assembly.mask.sum() < _STRIDE * _PLENTY * self.ansatz.size:
+            return assembly
+        rows = np.zeros_like(assembly.mask)
+        rows[_STRIDE // 2 :: _STRIDE] = assembly.mask[_STRIDE // 2 :: _STRIDE]
+        return replace(assembly, mask=rows)
+
+    def _minimise(
+        self, assembly: Assembly, start: FloatArray, tolerance: float, curvature: FloatArray | None
+    ) -> Minimum:
+        return minimise(
+            partial(self._equations, assembly),
+            step_length(self.ansatz, assembly.grid, assembly.mask, self.factor),
+            start,
+            self.options,
+            tolerance,
+            self.factor,
+            self.on_iteration,
+            curvature,
+        )
+
+    def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
+        return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)
+
+
+def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
+    """Rms difference of two displacements over some 10^4 of the pixels [px of the full image].
+
+    Parameters
+    ----------
+    ansatz, grid
+        The kinematics, and where the pixels are.
+    mask
+        (rows, cols) pixels that count.
+    factor
+        Binning: a binned px is so many px.
+    """
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
+    some, x, y = mask[np.ix_(rows, cols)], grid.x[cols], grid.y[rows]
+    per_px = factor / grid.pixel_size
+
+    def length(a: FloatArray, b: FloatArray) -> float:
+        change = ansatz.displacement(b, x, y) - ansatz.displacement(a, x, y)
+        squares = (change[some] ** 2).sum(axis=-1)
+        return float(np.sqrt(squares.mean()) * per_px) if squares.size else 0.0
+
+    return length
