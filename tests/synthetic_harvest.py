@@ -35,10 +35,10 @@ from modeharvest.validation.harvest_run import (
 
 FloatArray = NDArray[np.float64]
 
-PITCH, HOLES, DIAMETER = 0.5, (5, 6), 0.38
-GRID = PixelGrid.centred(290, 250, 0.0125)
+PITCH, HOLES, DIAMETER = 0.5, (4, 6), 0.38
+GRID = PixelGrid.centred(290, 210, 0.0125)
 CELLULAR = Box.centred(PITCH * HOLES[0], PITCH * HOLES[1])
-DOMAIN = Box.centred(2.8, 3.3)
+DOMAIN = Box.centred(2.3, 3.3)
 LEVELS = 4095.0
 NOISE = 25.0
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from modeharvest.validation import plots_harvest as maps
 from modeharvest.validation.harvest_atlas import HarvestAtlas
 from modeharvest.validation.harvest_run import HarvestedFrame
+from modeharvest.validation.plots_photographs import CLOSE, draw_closeup
 
 Draw = Callable[[HarvestAtlas, HarvestedFrame], Figure]
 Shows = Callable[[HarvestAtlas, HarvestedFrame], bool]
@@ -22,28 +23,18 @@ def _always(atlas: HarvestAtlas, frame: HarvestedFrame) -> bool:
 
 @dataclass(frozen=True)
 class HarvestPanel:
-    """One quantity, drawn for every photograph that has it.
+    """One quantity, drawn for every photograph that has it; as a panel of a validation.
 
     Parameters
     ----------
     section
         Anchor of the part of the page where it is.
-    key
-        Its name in the page.
-    symbol
-        HTML.
-    title
-        In words.
-    paper
-        The panel's name in the paper, empty if it has none.
-    caption
-        What is seen, HTML.
+    key, symbol, title, paper, caption, exact
+        As in :class:`modeharvest.validation.plots.Panel`.
     draw
         Makes the picture of a frame.
     shows
         Whether there is something to draw for a frame.
-    exact
-        Whether the picture's pixels are to be kept exactly.
     """
 
     section: str
@@ -110,6 +101,11 @@ _PHOTOGRAPHS = (
         "As it was correlated, free from optical distortion. Over it, in yellow, the material’s "
         "outline in the reference, moved by what was measured: it should run along the edges.",
         maps.draw_deformed,
+    ),
+    HarvestPanel(
+        "photographs", "closeup", "", "A closer look", "",
+        f"{CLOSE} × {CLOSE} cells in the middle, pixel by pixel, with the outline as above.",
+        draw_closeup,
     ),
     HarvestPanel(
         "photographs", "Sxx", "S<sub>xx</sub>", "Spectral density along x", "spect_real (b)",

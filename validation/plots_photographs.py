@@ -16,12 +16,15 @@ from modeharvest.idic.hole_lattice import HoleLattice
 from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.harvest_atlas import HarvestAtlas
-from modeharvest.validation.plots_fields import Scale, colour_bar
+from modeharvest.validation.harvest_run import HarvestedFrame
+from modeharvest.validation.plots_fields import WIDTH, Scale, colour_bar
 from modeharvest.validation.style import BLUE, GOLD, GREEN, GREY, INK, RED, SIZE, figure, style
 
 FloatArray = NDArray[np.float64]
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
+CLOSE = 3
+"""Cells along the side of a closer look."""
 _LEGEND = 0.26  # [in]
 _PIXELS = 1000  # along the longer side
 _CELLS, _ARROWS = 120, 17  # of a distortion's map, along the longer side
@@ -50,6 +53,31 @@ def draw_reference(atlas: HarvestAtlas) -> Figure:
         axes.legend(handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown),
                     frameon=False, fontsize=7.5, handlelength=1.6, columnspacing=1.4,
                     borderaxespad=0.1)  # fmt: skip
+    return drawn
+
+
+def draw_closeup(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
+    """Draw some cells of a deformed photograph, pixel by pixel, with the outline as measured."""
+    grid, motion = atlas.harvest.grid, atlas.motion(frame)
+    middle = np.array(atlas.harvest.cellular.centre)
+    x, y = middle + motion(*middle[:, None, None])[0, 0]
+    half = 0.5 * CLOSE * atlas.harvest.pitch
+    rows, cols = (np.rint(edge).astype(int) for edge in grid.to_px(
+        np.array([x - half, x + half]), np.array([y + half, y - half])))  # fmt: skip
+    top, left = max(0, rows[0]), max(0, cols[0])
+    part = atlas.grey(frame.image[top : rows[1] + 1, left : cols[1] + 1])
+    (x0, y0), px = grid.to_mm(top, left), grid.pixel_size
+    extent = (x0 - px / 2, x0 + (part.shape[1] - 0.5) * px, y0 - (part.shape[0] - 0.5) * px,
+              y0 + px / 2)  # fmt: skip
+    with style():
+        drawn = figure(WIDTH, WIDTH)
+        axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        axes.imshow(part, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, rasterized=True,
+                    interpolation="antialiased", aspect="auto")  # fmt: skip
+        path = atlas.outline.path(atlas.sheet().moved_nodes(motion))
+        axes.add_patch(PathPatch(path, fill=False, ec=GOLD, lw=1.1, rasterized=True))
+        axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return drawn
 
 
