@@ -31,8 +31,8 @@ class Noise:
 def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> Noise:
     """Measure the noise from exposures of one and the same state.
 
-    Half the variance of the difference of two of them, without its mean (the lamp may have
-    flickered), pooled over neighbours in the series.
+    Half the variance of what is left of one when the other has been fitted to it by a gain and
+    an offset (the lamp may have flickered), pooled over neighbours in the series.
 
     Parameters
     ----------
@@ -41,11 +41,17 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> N
     mask
         (rows, cols) True on material.
     """
-    halves = [0.5 * np.var((b - a)[mask], dtype=np.float64) for a, b in pairwise(images)]
+    halves = [0.5 * _unexplained(a[mask], b[mask]) for a, b in pairwise(images)]
     return Noise(
         float(np.sqrt(np.mean(halves))),
         f"measured from {len(images)} exposures of the reference",
     )
+
+
+def _unexplained(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Variance of b - gain a - offset at the best gain and offset."""
+    covariance = np.cov(a, b, dtype=np.float64)
+    return float(covariance[1, 1] - covariance[0, 1] ** 2 / covariance[0, 0])
 
 
 def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> Noise:
