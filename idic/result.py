@@ -23,6 +23,10 @@ FloatArray = NDArray[np.float64]
 
 FORMAT = "modeharvest-result-2"
 
+_SLOPE_NOISE = 2.46
+"""Variance of a quintic spline's slope through white noise of variance 1, the mean over all
+positions between pixels [1/px^2]. A cubic's is 2.16."""
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -111,7 +115,7 @@ class Result:
         return float(self.residual_rms * np.sqrt(max(1, self.pixels) / freedom / 2.0))
 
     def covariance(self, noise_sd: float | None = None, noisy_images: int = 2) -> FloatArray:
-        """(n, n) covariance of the unknowns under white noise: the Cramer-Rao bound.
+        """(n, n) covariance of the unknowns under white noise: for weak noise the Cramer-Rao bound.
 
         Parameters
         ----------
@@ -119,18 +123,42 @@ class Result:
             Standard deviation of the noise in an image [grey levels]; by default the one that
             makes the residual nothing but noise.
         noisy_images
-            2 if both images are noisy, 2 s^2 M^-1; 1 if only one is, s^2 M^-1.
+            2 if both images are noisy, 2 s^2 M^-1; 1 if only the reference is, s^2 M^-1.
 
         Notes
         -----
-        The noise of the deformed image weighs 1/det F more than that: where the material has
-        shrunk, neighbouring pixels of the reference share noise.
+        Two things that noise s in the deformed image does beyond that, in both of which the
+        variance q s^2 of its own gradient counts against the speckle's G^2 (``_SLOPE_NOISE``):
+        it makes M larger, by 1 + q s^2/G^2, which is taken back; and it spoils the gradient that
+        the reference's noise is weighed with, which adds q s^2/(2 G^2) of the variance. Where
+        the noise isn't given, that is done if the residual is noise.
+
+        The noise of the deformed image weighs 1/det F more: where the material has shrunk,
+        neighbouring pixels of the reference share noise. That is not taken into account.
         """
         if noisy_images not in (1, 2):
             raise InputError(f"expected 1 or 2 noisy images, got {noisy_images}")
         # The residual holds the noise of however many images are noisy.
-        residual = 2.0 * self.noise_sd**2
-        return (residual if noise_sd is None else noisy_images * noise_sd**2) * self.inverse
+        variance = noisy_images * noise_sd**2 if noise_sd is not None else 2.0 * self.noise_sd**2
+        is_noise = noise_sd is not None or self.agreement().is_white
+        if noisy_images == 2 and is_noise and np.isfinite(self.residual_correlation):
+            share = self._noise_in_gradient(0.5 * variance)
+            variance *= (1.0 + share) * (1.0 + 0.5 * share)
+        return np.asarray(variance * self.inverse)
+
+    def _noise_in_gradient(self, variance: float) -> float:
+        """q s^2/G^2 [-]: the noise's share of the deformed image's squared gradient.
+
+        The columns of a constant v0 are the gradient; as large as 4 where noise is all there is.
+        """
+        kept = np.flatnonzero(np.isfinite(np.diag(self.inverse)))
+        matrix = np.linalg.inv(self.inverse[np.ix_(kept, kept)])
+        constants = np.isin(kept, [self.ansatz.v0_slice(c).start for c in (0, 1)])
+        if not constants.any():
+            return 0.0
+        seen = float(np.diag(matrix)[constants].mean()) / max(1, self.pixels)
+        noise = _SLOPE_NOISE * variance / self.grid.pixel_size**2
+        return noise / max(seen - noise, 0.25 * noise)
 
     def agreement(
         self, noise_sd: float | None = None, noisy_images: int = 2, order: int = 5

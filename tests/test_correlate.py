@@ -150,7 +150,7 @@ def test_covariance_against_monte_carlo(images: Images, ansatz: Ansatz) -> None:
     assert 0.3 < ratio.min() < ratio.max() < 2.0
     # The residual is nothing but that noise (the spline smooths that of g a little).
     assert found.noise_sd == pytest.approx(sd, rel=0.1)
-    np.testing.assert_allclose(found.covariance(sd, 1) * 2, covariance)
+    np.testing.assert_allclose(found.covariance(sd, 1), sd**2 * found.inverse)
 
 
 def test_grey_levels_do_not_matter(noisy: Images, ansatz: Ansatz) -> None:

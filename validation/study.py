@@ -245,7 +245,7 @@ def _brightness(comparison: Comparison) -> dict[str, float]:
         result.ansatz.gain_and_offset(result.unknowns, grid.x, grid.y),
         strict=True,
     )
-    found = {}
+    found: dict[str, float] = {}
     for name, degree, values in fields:
         if degree is not None:
             seen = np.broadcast_to(values, grid.shape)[comparison.mask]
