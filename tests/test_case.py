@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from modeharvest.case import Case, case_text, read_case, shipped_cases
+from modeharvest.case import Case, TwinCase, case_text, read_case, shipped_cases
 from modeharvest.errors import InputError
 from modeharvest.fem.materials import Ogden, TwoTermI1
 
@@ -89,3 +89,32 @@ def test_a_misspelt_case_name_is_met_with_the_nearest() -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nothing\.toml"):
         read_case(tmp_path / "nothing.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[imaging.distortion]\nk9 = 1.0",
+            r"unknown key imaging.distortion.k9; did you mean 'k\d'",
+        ),
+        ("[imaging.distortion]\nfx = 1.0", "expected fy, got none"),
+        ("[imaging.distortion]\nkind = 'fish-eye'", "kind among .'camera'., got 'fish-eye'"),
+        ("[imaging.speckle.ink]\ncovrage = 0.3", "did you mean 'coverage'?"),
+        ("[calibration]\nstage_sd = 0.3", "did you mean 'stage_sd_px'?"),
+        ("[calibration]\nshifts_px = []", "expected finite shifts"),
+        ("[experiment]\ntilt = 5.0", "tilt: expected at most 1.0 rad"),
+    ],
+)
+def test_what_a_twin_has_is_checked_too(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_case(written(tmp_path, text))
+
+
+def test_a_calibration_makes_a_case_a_twin(tmp_path: Path) -> None:
+    lens = "[imaging.distortion]\nfx = 10.0\nfy = 10.0\ncx = 0.0\ncy = 0.0\n"
+    assert type(read_case(written(tmp_path, lens))) is Case
+    twin = read_case(written(tmp_path, lens + "[calibration]\nseed = 3"))
+    assert isinstance(twin, TwinCase)
+    assert twin.calibration.seed == 3
+    assert type(twin).model_validate(twin.plain()) == twin

@@ -10,6 +10,7 @@ Python objects use the same names and units::
     [experiment.material]     # kind = "ogden" or "two-term-I1", and its constants
     [imaging]                 # imaging.spec.ImagingSpec
     [imaging.speckle]         # imaging.speckle.SpeckleSpec
+    [imaging.distortion]      # imaging.distortion.CameraDistortion
     [correlation]             # idic.setup.Identification
 
 A table ``[calibration]`` (imaging.calibration_target.CalibrationTarget) makes it the twin of a
@@ -43,9 +44,12 @@ from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.idic.setup import Identification
 from modeharvest.imaging.calibration_target import CalibrationTarget
+from modeharvest.imaging.distortion import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec
 
 __all__ = ["Case", "TwinCase", "case_text", "read_case", "shipped_cases", "shipped_solution"]
+
+_LENSES = {"camera": CameraDistortion}
 
 
 class Case(CaseModel):
@@ -61,6 +65,14 @@ class Case(CaseModel):
         if not isinstance(table, dict) or not isinstance(table.get("material"), dict):
             return table
         return {**table, "material": of_kind(table["material"], MATERIALS, "experiment.material")}
+
+    @field_validator("imaging", mode="before")
+    @classmethod
+    def _with_lens(cls, table: Any) -> Any:
+        if not isinstance(table, dict) or not isinstance(table.get("distortion"), dict):
+            return table
+        lens = of_kind(table["distortion"], _LENSES, "imaging.distortion")
+        return {**table, "distortion": lens}
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""
