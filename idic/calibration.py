@@ -10,6 +10,7 @@ project's own.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -48,7 +49,7 @@ class CalibrationOptions:
     Parameters
     ----------
     degrees
-        Total degrees of S to compare, ascending, from 2 on.
+        Total degrees of S to compare, ascending, from 2 on, until the criterion has risen twice.
     rotations
         Whether the target may turn a little between photographs; only where shifts are not
         known.
@@ -137,12 +138,14 @@ def calibrate(
         c, views = fit.coefficients, with_poses(views, fit.poses)
         trials.append((model, fit))
         report()
+        if _has_risen_twice([fit.bic for _, fit in trials]):
+            break
     best = int(np.argmin([fit.bic for _, fit in trials]))
     model, fit = trials[best]
     fit = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
     _require_matches(fit)
     trials[best] = model, fit
-    report()
+    progress(1, 1, "calibrate")
     return calibration_of(trials, known, sampled_noise(options.blurs_px[-1], options.order, stride))
 
 
@@ -227,12 +230,16 @@ def _points(
 
 
 def _reporter(progress: Progress, steps: int) -> Callable[[], None]:
-    done = iter(range(1, steps + 1))
+    done = itertools.count(1)
 
     def report() -> None:
         progress(next(done), steps, "calibrate")
 
     return report
+
+
+def _has_risen_twice(values: Sequence[float]) -> bool:
+    return len(values) > 2 and values[-3] < values[-2] < values[-1]
 
 
 def _require_matches(fit: Fit) -> None:

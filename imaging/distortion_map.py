@@ -83,3 +83,9 @@ def _folds(position: FloatArray) -> InputError:
         "expected a distortion that is one-to-one over the image, got one that folds at row "
         f"{position[0]:.0f}, column {position[1]:.0f}; check its coefficients and their units"
     )
+
+
+def require_finite(values: FloatArray, what: str) -> None:
+    """Raise InputError if a number of a distortion isn't one."""
+    if not np.isfinite(values).all():
+        raise InputError(f"distortion: expected finite {what}, got NaN or infinity")

@@ -1,0 +1,102 @@
+"""What it costs to resample noisy images once, before they are correlated.
+
+Monte Carlo over noise: images of an exactly known motion, with a perfect lens, or seen through a
+lens and resampled (`undistorted`), correlated with an ansatz that holds the motion. Reported: the
+mean error of the displacement, its scatter over the prediction from the camera's noise, and the
+residual's variance. The same once more with both images blurred by 0.7 px before.
+
+Run: scripts/env python benchmarks/undistortion_noise.py
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.calibration_noise import undistorted_noise
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.pyramid import Level
+from modeharvest.imaging.distortion import CameraDistortion, undistorted
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+
+SEEDS = 100
+GRID = PixelGrid.centred(200, 240, 0.01)
+ANSATZ = Ansatz(Box.centred(2.4, 2.0), v0_degree=3)
+LENS = CameraDistortion(300.0, 300.0, 118.0, 103.0, k1=-0.1, p1=2e-3)  # S up to 9 px
+INNER = slice(15, -15)
+MARGIN = 50
+
+
+def moved_back(unknowns: FloatArray, row: FloatArray, col: FloatArray) -> tuple[FloatArray, ...]:
+    """The points that the motion brings to (row, col), by fixed-point iteration."""
+    at_row, at_col = row, col
+    for _ in range(60):
+        x, y = GRID.to_mm(at_row, at_col)
+        u = ANSATZ.displacement_at(unknowns, np.stack([x, y], -1)) / GRID.pixel_size
+        at_row, at_col = row + u[..., 1], col - u[..., 0]
+    return at_row, at_col
+
+
+def exact_pair(unknowns: FloatArray, lens: CameraDistortion | None) -> tuple[FloatArray, ...]:
+    """Reference and deformed image without noise."""
+    speckle = Speckle(SpeckleSpec(seed=3), (GRID.rows + 2 * MARGIN, GRID.cols + 2 * MARGIN))
+    seen = np.indices(GRID.shape, dtype=np.float64)
+    ideal = seen if lens is None else lens.ideal(*seen)
+    back = moved_back(unknowns, *ideal)
+    return tuple(speckle(row + MARGIN, col + MARGIN) for row, col in (ideal, back))
+
+
+def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: float) -> str:
+    """Repeat a measurement with other noise, and sum it up."""
+    unknowns = np.random.default_rng(1).normal(0.0, size_mm, ANSATZ.size)
+    images = exact_pair(unknowns, lens)
+    mask = np.zeros(GRID.shape, dtype=np.bool_)
+    mask[INNER, INNER] = True
+    options = CorrelationOptions(levels=(Level(1, 0.0),))
+    found, residual = [], []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(100 + seed)
+        noisy = [image + noise * rng.normal(size=GRID.shape) for image in images]
+        if lens is not None:
+            noisy = [undistorted(image, lens) for image in noisy]
+        if blur > 0.0:
+            noisy = [ndimage.gaussian_filter(image, blur) for image in noisy]
+        result = correlate(*noisy, GRID, ANSATZ, unknowns, mask, None, options)
+        found.append(result.unknowns)
+        residual.append(result.residual_rms**2 / (2 * noise**2))
+    x, y = GRID.x[INNER][::5], GRID.y[INNER][::5]
+    mean = np.mean(found, axis=0)
+    bias = ANSATZ.displacement(mean, x, y) - ANSATZ.displacement(unknowns, x, y)
+    sd = np.sqrt(np.mean(result.displacement_sd(x, y, noise) ** 2)) / GRID.pixel_size
+    off = np.array(found) - mean
+    inverse = np.linalg.inv(result.covariance(noise))
+    scatter = np.einsum("ni,ij,nj->", off, inverse, off) / (SEEDS - 1) / ANSATZ.size
+    rms = np.sqrt(np.mean(bias**2)) / GRID.pixel_size
+    motion = abs(ANSATZ.displacement(unknowns, x, y)).max() / GRID.pixel_size
+    return (
+        f"| {'lens' if lens else 'perfect'} | {100 * noise:g} % | {motion:.1f} | {blur:g} "
+        f"| {sd:.4f} | {rms:.4f} | {scatter:.2f} | {np.mean(residual):.3f} |"
+    )
+
+
+def main() -> None:
+    once, twice = undistorted_noise()
+    print(f"predicted residual: perfect {0.5 * (1 + once):.3f}, lens {0.5 * (once + twice):.3f}\n")
+    print(
+        "| lens | noise | motion, px | blur, px | sd, px | mean error, px | variance | residual |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for blur in (0.0, 0.7):
+        for noise, size in ((0.01, 0.004), (0.01, 0.04), (0.03, 0.004)):
+            for lens in (None, LENS):
+                print(trial(lens, noise, blur, size), flush=True)
+
+
+if __name__ == "__main__":
+    main()
