@@ -72,6 +72,10 @@ def _approach(
 
     ``modes`` are those at ``high``; afterwards ``walker.modes`` are those just below.
     """
+    narrowed = _with_negative_mode(walker, low, high, modes)
+    if narrowed is None:
+        return None
+    low, high, modes = narrowed
     estimate, critical = _first_crossing(walker, low, high, modes)
     history = [(high.strain, critical.eigenvalue)]
     state = high
@@ -89,13 +93,39 @@ def _approach(
         critical = max(nearby, key=lambda mode: abs(mode.overlap(critical.vector)))
         history.append((state.strain, critical.eigenvalue))
         if state.negative_pivots:
-            high, modes = state, nearby
+            high, modes = state, nearby if _has_negative(nearby) else modes
         else:
             low = state
         previous, estimate = estimate, _root(history)
         if abs(estimate - previous) < walker.options.critical_tolerance:
             break
     return low, *_prove(walker, estimate, state, nearby, history)
+
+
+def _with_negative_mode(
+    walker: Walker, low: State, high: State, modes: list[Mode]
+) -> tuple[State, State, list[Mode]] | None:
+    """The bracket, halved until the modes at its end tell which one is negative there.
+
+    A mode that is just critical hides those further from zero: next to its inverse eigenvalue,
+    theirs are lost in the eigensolver's tolerance.
+    """
+    while not _has_negative(modes):
+        if high.strain - low.strain < walker.options.critical_tolerance:
+            return None
+        strain = 0.5 * (low.strain + high.strain)
+        state = walker.equilibrium(strain, interpolate(low, high, strain))
+        if state is None:
+            return None
+        if state.negative_pivots:
+            high, modes = state, walker.modes
+        else:
+            low = state
+    return low, high, modes
+
+
+def _has_negative(modes: list[Mode]) -> bool:
+    return any(mode.eigenvalue < 0 for mode in modes)
 
 
 def _first_crossing(

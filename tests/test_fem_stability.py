@@ -170,6 +170,19 @@ def test_critical_strain_does_not_depend_on_the_steps() -> None:
     assert critical.strain == pytest.approx(reference.critical.strain, abs=2e-7)
 
 
+def test_critical_strain_is_found_where_the_negative_mode_is_hidden() -> None:
+    """At a state that is critical for another mode the eigensolver may lose the negative one."""
+    reference = buckled_column(8.0)
+    walker = Walker(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
+    path = [walker.start()]
+    walker.primary(path, [1.5 * reference.euler], until_unstable=True)
+    walker.modes = [mode for mode in walker.modes if mode.eigenvalue > 0]
+    critical = locate_critical(walker, path[-2], path[-1])
+    assert critical is not None
+    assert critical.strain == pytest.approx(reference.critical.strain, abs=2e-7)
+    assert (critical.below, critical.above) == (0, 1)
+
+
 def test_tangent_is_the_derivative_of_the_path_and_predicts_with_order_four() -> None:
     structure = small_structure()
     walker = Walker(structure)
