@@ -22,7 +22,9 @@ from matplotlib.path import Path
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.error_bars import field_errors
+from modeharvest.idic.fourier import FourierMode, free_family
 from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.support import Taper
 from modeharvest.imaging.distortion import PolynomialDistortion
 from modeharvest.validation import harvest_words as words
 from modeharvest.validation.harvest_atlas import MOST, HarvestAtlas
@@ -137,6 +139,41 @@ def test_a_plain_global_dic_has_a_report_too(harvest: Harvest, tmp_path: File) -
     assert "v0x-1" in ids
     assert "v1-1" not in ids
     assert "mode" not in ids
+
+
+def test_every_mode_has_its_panels(harvest: Harvest) -> None:
+    frame = bare(harvest).frames[0]
+    single = FourierMode.scaled(
+        free_family([[0.3, 1.0, 1.2, 0.4, 0.1]]), made_up.PITCH, Taper(made_up.CELLULAR, 0.25)
+    )
+    both = replace(frame.result.ansatz, modes=(*frame.result.ansatz.modes, single))
+    result = replace(frame.result, ansatz=both, unknowns=both.start(0.05, 0.4),
+                     inverse=1e-12 * np.eye(both.size))  # fmt: skip
+    errors = field_errors(result, frame.error_x, frame.error_y, result.covariance(made_up.NOISE))
+    frame = replace(frame, result=result, by_noise=errors,
+                    identifiability=identifiability(result, made_up.MASK))  # fmt: skip
+    atlas = HarvestAtlas(replace(bare(harvest), frames=(frame,)))
+    second = [panel for panel in panels(atlas) if "2" in panel.key]
+    assert [panel.key for panel in second] == [
+        "v2", "phi2", "fluc2x", "fluc2y", "v2-noise", "fluc2-noise"]  # fmt: skip
+    drawn = second[0].draw(atlas, frame)
+    drawn.canvas.draw()
+    told = harvest_summary(atlas.harvest)["frames"][0]
+    assert told["modes"][1]["waves"][0]["xi"] == pytest.approx([0.6, 0.2])
+    tables = words.mode_tables([told])
+    assert [len(table["rows"]) for table in tables] == [7, 4]
+    assert words.fact("v2", told).startswith("largest among the holes 400 ±")
+
+
+def test_advice_that_was_taken_is_not_given_again(harvest: Harvest) -> None:
+    held, free = harvest.frames[0], replace(harvest.frames[1], name="free")
+    weak = free.result.ansatz.start(0.05, 0.01)
+    result = replace(free.result, unknowns=weak)
+    free = replace(free, result=result, identifiability=identifiability(result, made_up.MASK))
+    told = harvest_summary(replace(harvest, frames=(held, free)))["frames"]
+    assert held.identifiability.unobservable == free.identifiability.unobservable == (0,)
+    assert told[0]["warnings"] == []
+    assert "phi1 is not observable" in told[1]["warnings"][0]
 
 
 def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) -> None:

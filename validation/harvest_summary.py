@@ -134,8 +134,16 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "modes": [_mode(harvest, frame, i) for i in frame.modes],
         "pattern_reading": () if frame.pattern is None else frame.pattern.sentences,
         "start": frame.start_sentences,
-        "warnings": (*seen.warnings, *frame.warnings),
+        "warnings": (*_warnings(frame), *frame.warnings),
     }  # fmt: skip
+
+
+def _warnings(frame: HarvestedFrame) -> list[str]:
+    """What identifiability warns of, but for modes that are held, as it advises."""
+    seen, modes = frame.identifiability, frame.result.ansatz.modes
+    said = dict(zip(seen.unobservable, seen.warnings, strict=False))  # those come first
+    return [w for w in seen.warnings
+            if not any(w == said[i] and not modes[i].family.size for i in said)]  # fmt: skip
 
 
 def _mode(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ NBSP = "\N{NO-BREAK SPACE}"
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
-def percent(value: float | None, digits: int = 3) -> str:
+def percent(value: float | None, digits: int = 4) -> str:
     """A strain in percent, with its sign."""
     if value is None:
         return "–"
@@ -58,8 +58,8 @@ def _buckling(summary: Summary) -> dict[str, str]:
     if found is None or found["after"] is None:
         return _key("buckling", "–", "", "no pattern that stands out")
     if found["before"] is None:
-        return _key("buckling", f"< {100 * found['after']:.3g}", "%", "all show the pattern")
-    span = f"{100 * found['before']:.3g} … {100 * found['after']:.3g}"
+        return _key("buckling", f"< {100 * found['after']:.4g}", "%", "all show the pattern")
+    span = f"{100 * found['before']:.4g} … {100 * found['after']:.4g}"
     remark = "the pattern appears between these strains"
     if found["estimate"] is not None:
         remark = f"its growth points back to {percent(found['estimate'])}"
@@ -154,7 +154,7 @@ def frame_rows(summary: Summary) -> list[dict[str, Any]]:
         rows.append({
             "name": frame["name"],
             "cells": [
-                _digits(100 * frame["strain_x"], 3), _digits(100 * frame["strain_y"], 3),
+                _digits(100 * frame["strain_x"], 4), _digits(100 * frame["strain_y"], 4),
                 _digits(max((m["amplitude_px"] for m in modes), default=None), 3),
                 _digits(max((m["largest_px"] for m in modes), default=None), 3),
                 *(_digits((errors[cause] or {}).get("fluctuation"), 2)

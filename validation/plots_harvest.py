@@ -166,11 +166,15 @@ def draw_hero(atlas: HarvestAtlas) -> Figure:
         pattern = pattern - frame.result.v0(sheet.grid)
     length = UM * np.linalg.norm(pattern, axis=-1)
     end = Scale.size(atlas.seen(length), "µm")
-    mask = frame.mask if frame.mask is not None else np.ones(frame.image.shape, dtype=np.bool_)
-    return fields.draw_blend(
-        sheet, atlas.grey(frame.image), mask, atlas.harvest.grid, length,
+    everywhere = np.ones(frame.image.shape, dtype=np.bool_)
+    drawn = fields.draw_blend(
+        sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, length,
         Scale(GLOW, 0.0, end.high, "µm"), atlas.motion(frame),
     )  # fmt: skip
+    # The photograph ends where the measured outline does: a mask of it may have ragged edges.
+    axes = drawn.axes[0]
+    axes.images[0].set_clip_path(axes.patches[0])
+    return drawn
 
 
 def _support(atlas: HarvestAtlas, frame: HarvestedFrame, i: int, cells: int = SMOOTH) -> FloatArray:

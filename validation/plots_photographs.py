@@ -62,13 +62,14 @@ def draw_closeup(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
     middle = np.array(atlas.harvest.cellular.centre)
     x, y = middle + motion(*middle[:, None, None])[0, 0]
     half = 0.5 * CLOSE * atlas.harvest.pitch
-    rows, cols = (np.rint(edge).astype(int) for edge in grid.to_px(
-        np.array([x - half, x + half]), np.array([y + half, y - half])))  # fmt: skip
-    top, left = max(0, rows[0]), max(0, cols[0])
-    part = atlas.grey(frame.image[top : rows[1] + 1, left : cols[1] + 1])
-    (x0, y0), px = grid.to_mm(top, left), grid.pixel_size
-    extent = (x0 - px / 2, x0 + (part.shape[1] - 0.5) * px, y0 - (part.shape[0] - 0.5) * px,
-              y0 + px / 2)  # fmt: skip
+    corners = grid.to_px([x - half, x + half], [y + half, y - half])
+    (top, bottom), (left, right) = (
+        np.clip(np.rint(edge).astype(int), 0, size - 1)
+        for edge, size in zip(corners, grid.shape, strict=True)
+    )
+    part = atlas.grey(frame.image[top : bottom + 1, left : right + 1])
+    x0, y0 = map(float, grid.to_mm(top, left))
+    extent = PixelGrid(bottom + 1 - top, right + 1 - left, grid.pixel_size, x0, y0).extent
     with style():
         drawn = figure(WIDTH, WIDTH)
         axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
