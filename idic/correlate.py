@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from modeharvest.idic.gauss_newton import (
     ScaledEigen,
     minimise,
 )
-from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen, where
+from modeharvest.idic.inputs import CheckedImages, checked_mask, where
 from modeharvest.idic.level_search import LevelSearch, step_length
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, prepare
@@ -35,6 +34,9 @@ from modeharvest.progress import Progress, silent
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+_LEAST = 1e-3
+"""On coarse levels, directions with an eigenvalue below this share of the largest one wait for
+the finest level: what a blur does to the images would send them into other valleys."""
 _WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
 
 
@@ -111,7 +113,7 @@ def correlate(
     """
     options = options or CorrelationOptions()
     clock = _Clock()
-    images = _Images.checked(reference, deformed, grid, mask, deformed_mask)
+    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
     a = before = _lit_alike(ansatz, ansatz.checked(start), *images.grey)
     clock.lap("check")
     levels = _useful(options.levels, ansatz, grid)
@@ -205,44 +207,8 @@ def fit_displacement(
     return _result(ansatz, grid, found, found.history, clock.laps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Images:
-    """What is correlated, checked."""
-
-    f: NDArray[Any]
-    g: NDArray[Any]
-    grid: PixelGrid
-    f_mask: BoolArray | None
-    g_mask: BoolArray | None
-
-    @classmethod
-    def checked(
-        cls,
-        reference: ArrayLike,
-        deformed: ArrayLike,
-        grid: PixelGrid,
-        mask: ArrayLike | None,
-        deformed_mask: ArrayLike | None,
-    ) -> _Images:
-        images = cls(
-            checked_image(reference, "reference", grid),
-            checked_image(deformed, "deformed", grid),
-            grid,
-            checked_mask(mask, "mask", grid),
-            checked_mask(deformed_mask, "deformed mask", grid),
-        )
-        for grey, what in zip(images.grey, ("reference", "deformed"), strict=True):
-            require_contrast(grey, what)
-        return images
-
-    @cached_property
-    def grey(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The grey levels of the material, of f and of g."""
-        return seen(self.f, self.f_mask), seen(self.g, self.g_mask)
-
-
 def _level_search(
-    images: _Images,
+    images: CheckedImages,
     ansatz: Ansatz,
     level: Level,
     finest: bool,
@@ -264,6 +230,7 @@ def _level_search(
         pair,
         ansatz if finest else replace(ansatz, brightness=Brightness()),
         level.factor,
+        0.0 if finest else _LEAST,
         options.gauss_newton.tolerance_px if finest else coarse_px,
         coarse_px,
         options.gauss_newton,

@@ -173,9 +173,12 @@ class ScaledEigen:
             return float("inf")
         return float(self.values[-1] / self.values[0])
 
-    def solve(self, right: FloatArray, damping: float = 0.0) -> FloatArray:
-        """Solve (matrix + damping diag) x = right on the determined directions."""
-        keep = self.determined
+    def solve(self, right: FloatArray, damping: float = 0.0, least: float = 0.0) -> FloatArray:
+        """Solve (matrix + damping diag) x = right on the determined directions.
+
+        Those with an eigenvalue below ``least`` times the largest one count as undetermined, too.
+        """
+        keep = self.determined & (self.values >= least * self.values[-1])
         part = self.vectors[:, keep].T @ (right / self.scale) / (self.values[keep] + damping)
         return np.asarray(self.vectors[:, keep] @ part / self.scale)
 
@@ -238,6 +241,7 @@ def minimise(
     factor: int = 1,
     on_iteration: Callable[[int], None] = lambda number: None,
     curvature: FloatArray | None = None,
+    least: float = 0.0,
 ) -> Minimum:
     """Minimise 1/2 sum r^2.
 
@@ -257,9 +261,11 @@ def minimise(
         Called with the number of each finished iteration.
     curvature
         (n, n) what to begin with in place of J'J, if something is known already.
+    least
+        Directions with an eigenvalue below this share of the largest one get no step [-].
     """
     at = _Point.of(start, evaluate(start, curvature is None), curvature)
-    limits = _Limits(options, tolerance_px, _SHORT * factor)
+    limits = _Limits(options, tolerance_px, _SHORT * factor, least)
     history: list[Iteration] = []
     outcome = Outcome.LEFT_IMAGE if _left(at.equations) > options.max_left else None
     while outcome is None:
@@ -303,6 +309,7 @@ class _Limits:
     options: GaussNewtonOptions
     tolerance_px: float
     short_px: float
+    least: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +326,7 @@ def _descend(at: _Point, evaluate: Evaluate, step_length: StepLength, limits: _L
     """Take a step that lowers the cost, damped as much as it takes."""
     eigen, damping = ScaledEigen.of(at.curvature), at.damping
     while True:
-        a = at.a - eigen.solve(at.equations.gradient, damping)
+        a = at.a - eigen.solve(at.equations.gradient, damping, limits.least)
         length = step_length(at.a, a)
         is_settling = damping == 0.0 and length < limits.short_px and not at.has_fallen
         # The last step's matrix is wanted for the covariance.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,59 @@ from modeharvest.errors import InputError
 from modeharvest.imaging.grid import PixelGrid
 
 BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedImages:
+    """What is correlated, checked.
+
+    Parameters
+    ----------
+    f, g
+        (rows, cols) float32: reference and deformed image.
+    grid
+        Their pixels.
+    f_mask, g_mask
+        (rows, cols) True on material; None for everywhere.
+    """
+
+    f: NDArray[Any]
+    g: NDArray[Any]
+    grid: PixelGrid
+    f_mask: BoolArray | None
+    g_mask: BoolArray | None
+
+    @classmethod
+    def checked(
+        cls,
+        reference: ArrayLike,
+        deformed: ArrayLike,
+        grid: PixelGrid,
+        mask: ArrayLike | None,
+        deformed_mask: ArrayLike | None,
+    ) -> CheckedImages:
+        """Check them.
+
+        Raises
+        ------
+        InputError
+            If sizes differ, a mask is empty, or an image holds NaN or is constant.
+        """
+        images = cls(
+            checked_image(reference, "reference", grid),
+            checked_image(deformed, "deformed", grid),
+            grid,
+            checked_mask(mask, "mask", grid),
+            checked_mask(deformed_mask, "deformed mask", grid),
+        )
+        for grey, what in zip(images.grey, ("reference", "deformed"), strict=True):
+            require_contrast(grey, what)
+        return images
+
+    @cached_property
+    def grey(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The grey levels of the material, of f and of g."""
+        return seen(self.f, self.f_mask), seen(self.g, self.g_mask)
 
 
 def seen(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:

@@ -54,6 +54,8 @@ class LevelSearch:
         The kinematics.
     factor
         Its binning.
+    least
+        Directions less determined than this share of the best one stay as they are [-].
     tolerance_px, rough_px
         Steps to stop at, with all pixels and with every few rows [px].
     options
@@ -65,6 +67,7 @@ class LevelSearch:
     pair: Pair
     ansatz: Ansatz
     factor: int
+    least: float
     tolerance_px: float
     rough_px: float
     options: GaussNewtonOptions
@@ -137,6 +140,7 @@ class LevelSearch:
             self.factor,
             self.on_iteration,
             curvature,
+            self.least,
         )
 
     def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
