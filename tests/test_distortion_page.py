@@ -1,0 +1,31 @@
+"""The examples of docs/distortion.md work as printed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from calibration_set import photographs, random_lens
+
+from modeharvest.idic.calibration_gauge import affine_aside
+from modeharvest.imaging.distortion_files import read_distortion
+
+PAGE = (Path(__file__).parents[1] / "docs" / "distortion.md").read_text("utf-8")
+SHAPE = (140, 170)
+
+
+def test_the_printed_examples_find_the_lens(tmp_path: Path) -> None:
+    calibrate, recover = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    lens = random_lens(SHAPE, 3, 2.0)
+    shifts = [[0, 0], [20, 2], [-19, 4], [3, 23], [-6, -21]]
+    images = photographs(lens, SHAPE, shifts)
+    names: dict[str, Any] = {"photographs": images, "folder": tmp_path}
+    exec(compile(calibrate, "docs/distortion.md", "exec"), names)
+    found = read_distortion(tmp_path / "lens.json")
+    assert affine_aside(found, lens, SHAPE).rms_px < 1e-3  # without noise: the splines' errors
+
+    names |= {"ideal_image": np.float32(names["ideal"]), "distorted_image": images[0]}
+    exec(compile(recover, "docs/distortion.md", "exec"), names)
+    assert names["lens"].match > 0.9
