@@ -1,0 +1,121 @@
+"""A displacement inside the ansatz, exact images of it, and the bound of any measurement of it.
+
+With J the derivatives of f(x) - g(x + u), made from the exact gradient of the pattern (the
+correlation's own matrix has no part in it), the Cramer-Rao bound is
+
+    (J' W J)^-1,   1/W = s_f^2 + s_g^2 / det F,
+
+because where the material has shrunk fewer pixels of g look at it. Noise s_f in f, s_g in g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions
+from modeharvest.idic.fourier import FourierMode, square_family
+from modeharvest.idic.pyramid import eroded
+from modeharvest.idic.support import Taper
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle
+
+FloatArray = NDArray[np.float64]
+
+PIXEL = 0.01
+GRID = PixelGrid.centred(360, 320, PIXEL)
+BORDER_PX = 40
+STRAIN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A displacement that the ansatz can describe, and what the bound needs of it.
+
+    Parameters
+    ----------
+    ansatz, a
+        Kinematics and true unknowns.
+    """
+
+    ansatz: Ansatz
+    a: FloatArray
+
+    @classmethod
+    def default(cls) -> Truth:
+        """Strain, pattern and everything else disturbed; up to 11 px of displacement."""
+        everywhere = Taper(Box.centred(3.4, 3.8), 0.5)
+        mode = FourierMode.scaled(square_family("junction"), 1.0, everywhere)
+        ansatz = Ansatz(Box.centred(2.6, 3.0), (mode,))
+        rng = np.random.default_rng(0)
+        a = ansatz.start(STRAIN, 1.5)
+        for c in (0, 1):
+            a[ansatz.v0_slice(c)] += 0.003 * rng.normal(size=ansatz.v0_space.size)
+        a[ansatz.v_slice(0)][1:] += 0.05 * rng.normal(size=ansatz.v_space.size - 1)
+        a[ansatz.phi_slice(0)] += 0.02 * rng.normal(size=mode.family.size)
+        return cls(ansatz, a)
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pixels that no noise and no displacement moves off the image."""
+        mask = np.zeros(GRID.shape, dtype=np.bool_)
+        mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+        return mask
+
+    @cached_property
+    def used(self) -> tuple[NDArray[np.intp], ...]:
+        """Rows and columns of the pixels that a correlation uses."""
+        return np.nonzero(eroded(self.mask, CorrelationOptions().edge_px))
+
+    @cached_property
+    def sensitivities(self) -> FloatArray:
+        """(pixels, 2, n) of the displacement, x and y."""
+        row, col = self.used
+        points = GRID.x[col, None], GRID.y[row, None]  # two-dimensional: points, not axes
+        return self.ansatz.sensitivities(self.a, *points)[:, 0]
+
+    @cached_property
+    def deformation_gradient(self) -> FloatArray:
+        """(pixels, 2, 2) F, by central differences: h^2 of the pattern's third derivative."""
+        row, col = self.used
+        at, h = np.stack([GRID.x[col], GRID.y[row]], axis=-1), 1e-5
+        F = np.tile(np.eye(2), (len(at), 1, 1))
+        for k, step in enumerate(h * np.eye(2)):
+            ahead, behind = (self.ansatz.displacement_at(self.a, at + s) for s in (step, -step))
+            F[:, :, k] += (ahead - behind) / (2 * h)
+        return F
+
+    @cached_property
+    def came_from(self) -> FloatArray:
+        """(rows, cols, 2) X with X + u(X) = x at the pixels x, by fixed-point iteration [mm]."""
+        at = np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+        low, high = at[-1, 0], at[0, -1]
+        point = at
+        for _ in range(300):
+            # Polynomials run away outside the image; what comes from there isn't correlated.
+            moved = at - self.ansatz.displacement_at(self.a, np.clip(point, low, high))
+            change = abs(moved - point).max()
+            point = moved
+            if change < 1e-12:
+                return point
+        raise AssertionError(f"the inverse of the displacement has not converged: {change} mm")
+
+    def images(self, speckle: Speckle) -> tuple[FloatArray, FloatArray]:
+        """Exact f and g [fraction of full scale]."""
+        row, col = GRID.to_px(self.came_from[..., 0], self.came_from[..., 1])
+        return speckle.image(), speckle.exact(row, col)
+
+    def bound(self, speckle: Speckle, in_f: float, in_g: float) -> FloatArray:
+        """(n, n) covariance that no unbiased estimator can undercut, for noise in f and in g."""
+        d_row, d_col = speckle.gradient(*self.used)
+        slope = np.stack([d_col, -d_row], axis=-1) / PIXEL  # of f along x and y [1/mm]
+        moved = np.linalg.solve(np.swapaxes(self.deformation_gradient, 1, 2), slope[..., None])
+        J = np.einsum("pc,pcn->pn", moved[..., 0], self.sensitivities)
+        det = np.linalg.det(self.deformation_gradient)
+        information = J.T @ (J / (in_f**2 + in_g**2 / det)[:, None])
+        return np.asarray(np.linalg.inv(information))
