@@ -18,7 +18,7 @@ from modeharvest.imaging import rasterise
 from modeharvest.imaging.elements import polynomials, reference_element
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.jacobian import require_positive_jacobian
-from modeharvest.imaging.layout import bands, lay
+from modeharvest.imaging.layout import Pixels, bands, lay
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -147,7 +147,7 @@ def map_back(
     elements = lay(nodes, cells, element, grid)
     start, visits = bands(elements.row_from, elements.row_to, grid.rows, rasterise.BAND)
     size, fields = grid.rows * grid.cols, polynomials(element, cells, nodal)
-    pixels = rasterise.Pixels(
+    pixels = Pixels(
         np.empty(size, dtype=np.int32), np.empty((fields.shape[1] or 2, size)),
         np.empty(size, dtype=np.float32), 0, grid.cols, float(grid.x0), float(grid.y0),
         float(grid.pixel_size),

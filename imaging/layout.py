@@ -25,6 +25,10 @@ BoolArray = NDArray[np.bool_]
 
 BEYOND = (0.25, 0.1, 0.03)
 """How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""
+CLEAR_OF_EDGES = 1e-6
+"""In xi, eta; pixels on an edge come out within some 1e-9."""
+NOBODYS, EDGE, INSIDE, TWICE, NOT_WANTED = 0, 1, 2, 3, 4
+"""States of a pixel: not claimed yet, claimed on an element's edge, inside it, inside two."""
 _AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
 
 
@@ -60,6 +64,27 @@ class Elements(NamedTuple):
     quarters: FloatArray
     middle: float
     triangular: bool
+
+
+class Pixels(NamedTuple):
+    """What is found, over some rows of an image, pixels in the order of memory.
+
+    element : (n,) int32 element, -1 where none is.
+    values : (c, n) fields at the pixels, NaN where no element is.
+    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted.
+    first_row : of these pixels in the image.
+    cols : pixels a row.
+    x0, y0, pixel_size : of the image's grid [mm].
+    """
+
+    element: NDArray[np.int32]
+    values: FloatArray
+    residual: NDArray[np.float32]
+    first_row: int
+    cols: int
+    x0: float
+    y0: float
+    pixel_size: float
 
 
 def lay(nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid) -> Elements:

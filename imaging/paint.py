@@ -16,9 +16,9 @@ from modeharvest.imaging.elements import polynomials
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import in_turn
 from modeharvest.imaging.jacobian import require_positive_jacobian
-from modeharvest.imaging.layout import Elements, bands, lay
+from modeharvest.imaging.layout import Elements, Pixels, bands, lay
 from modeharvest.imaging.periodic_spline import BLOCK, PeriodicSpline, Table, desk, sample
-from modeharvest.imaging.rasterise import Pixels, fill
+from modeharvest.imaging.rasterise import fill
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

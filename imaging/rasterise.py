@@ -17,6 +17,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from modeharvest.imaging.affine import fill_affine
 from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.inversion import (
     ACCEPTED_PX,
@@ -27,8 +28,18 @@ from modeharvest.imaging.inversion import (
     search,
     value,
 )
-from modeharvest.imaging.layout import Elements, proved_reach
-from modeharvest.imaging.scanline import ends, start_affine, start_cubic
+from modeharvest.imaging.layout import (
+    CLEAR_OF_EDGES,
+    EDGE,
+    INSIDE,
+    NOBODYS,
+    NOT_WANTED,
+    TWICE,
+    Elements,
+    Pixels,
+    proved_reach,
+)
+from modeharvest.imaging.scanline import ends, start_cubic
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,31 +47,7 @@ BoolArray = NDArray[np.bool_]
 
 BAND = 32  # rows
 _BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache
-_CLEAR_OF_EDGES = 1e-6  # in xi, eta; pixels on an edge come out within some 1e-9
 _MARGIN_PX = 1e-3  # beyond a row's ends; these are found much more closely
-
-_NOBODYS, _ON_EDGE, _INSIDE, _TWICE, _NOT_WANTED = 0, 1, 2, 3, 4
-
-
-class Pixels(NamedTuple):
-    """What is found, over some rows of an image, pixels in the order of memory.
-
-    element : (n,) int32 element, -1 where none is.
-    values : (c, n) fields at the pixels, NaN where no element is.
-    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted.
-    first_row : of these pixels in the image.
-    cols : pixels a row.
-    x0, y0, pixel_size : of the image's grid [mm].
-    """
-
-    element: NDArray[np.int32]
-    values: FloatArray
-    residual: NDArray[np.float32]
-    first_row: int
-    cols: int
-    x0: float
-    y0: float
-    pixel_size: float
 
 
 class Batch(NamedTuple):
@@ -123,24 +110,37 @@ def fill(
     if wanted.size:
         for k in range(end - begin):
             if not wanted[top * pixels.cols + k]:
-                state[k] = _NOT_WANTED
+                state[k] = NOT_WANTED
     real = np.empty((6, _BATCH))
     batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
     for e in visited:
         first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
-        _fill_element(
-            elements, fields, pixels, e, first, last, wanted.size > 0, state, begin, batch
-        )
+        if elements.affine[e]:
+            fill_affine(elements, fields, pixels, e, first, last, state, begin)
+        else:
+            _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
+    return _leave(pixels.element, pixels.values, pixels.residual, state, begin)
+
+
+@compiled()
+def _leave(
+    element: NDArray[np.int32],
+    values: FloatArray,
+    residual: NDArray[np.float32],
+    state: NDArray[np.uint8],
+    begin: int,
+) -> int:
+    """Mark what nobody claimed as background; count what two did."""
     twice = 0
-    for k in range(end - begin):
-        if state[k] == _NOBODYS or state[k] == _NOT_WANTED:
-            pixels.element[begin + k] = -1
-            for field in range(pixels.values.shape[0]):
-                pixels.values[field, begin + k] = np.nan
-            if pixels.residual.size:
-                pixels.residual[begin + k] = np.nan
-        elif state[k] == _TWICE:
+    for k in range(state.size):
+        if state[k] == NOBODYS or state[k] == NOT_WANTED:
+            element[begin + k] = -1
+            for field in range(values.shape[0]):
+                values[field, begin + k] = np.nan
+            if residual.size:
+                residual[begin + k] = np.nan
+        elif state[k] == TWICE:
             twice += 1
     return twice
 
@@ -153,7 +153,6 @@ def _fill_element(
     e: int,
     first: int,
     last: int,
-    picky: bool,
     state: NDArray[np.uint8],
     begin: int,
     batch: Batch,
@@ -161,7 +160,8 @@ def _fill_element(
     """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
-    affine, curved = elements.affine[e], not elements.triangular
+    curved, cols, first_row = not elements.triangular, pixels.cols, pixels.first_row
+    rows_, cols_, s, t, where = batch.row, batch.col, batch.s, batch.t, batch.where
     count = 0
     for image_row in range(first, last):
         row = float(image_row - centre_row)
@@ -169,31 +169,20 @@ def _fill_element(
         if not low[0] <= high[0]:
             continue
         col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
-        past = min(pixels.cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
-        row_begin = (image_row - pixels.first_row) * pixels.cols
+        past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
+        at = (image_row - first_row) * cols
         while col < past:
             if count == _BATCH:
                 _claim(elements, fields, pixels, e, state, begin, batch, count)
                 count = 0
             stop = min(past, col + _BATCH - count)
-            if picky:
-                while col < stop and state[row_begin + col - begin] == _NOT_WANTED:
-                    col += 1
-                until = col
-                while until < stop and state[row_begin + until - begin] != _NOT_WANTED:
-                    until += 1
-                stop = until
             n, col_from = stop - col, float(col - centre_col)
-            if affine:
-                start_affine(polynomial, row, col_from, batch.s, batch.t, count, count + n)
-            else:
-                start_cubic(
-                    polynomial, curved, low, high, col_from, batch.s, batch.t, count, count + n
-                )
+            start_cubic(polynomial, curved, low, high, col_from, s[count : count + n],
+                        t[count : count + n])  # fmt: skip
             for k in range(n):
-                batch.row[count + k] = row
-                batch.col[count + k] = col_from + k
-                batch.where[count + k] = row_begin + col + k
+                rows_[count + k] = row
+                cols_[count + k] = col_from + k
+                where[count + k] = at + col + k
             count += n
             col = stop
     _claim(elements, fields, pixels, e, state, begin, batch, count)
@@ -211,78 +200,94 @@ def _claim(
     count: int,
 ) -> None:
     """Invert a batch; claim those of its pixels that are inside and nobody's yet."""
-    if not elements.affine[e]:
-        invert(elements.polynomials[e], elements.triangular, batch.row, batch.col, batch.s, batch.t,
-               count)  # fmt: skip
-    _check(elements, pixels, e, batch, 0, count)
-    reach = np.inf if elements.affine[e] else np.nan  # it is proved when first needed
+    polynomial, triangular = elements.polynomials[e], elements.triangular
+    row, col, s, t, off, residual, where = batch
+    element, residuals = pixels.element, pixels.residual
+    invert(polynomial, triangular, row, col, s, t, count)
+    _check(elements, pixels, e, row, col, s, t, off, residual, count)
+    reach = np.nan  # it is proved when first needed
     claimed = 0
     for k in range(count):
-        depth = -outside(elements.triangular, batch.s[k], batch.t[k])
+        depth = -outside(triangular, s[k], t[k])
         if depth < -ON_EDGE and np.isnan(reach):
-            reach = proved_reach(elements.polynomials[e], elements.slopes, elements.middle)
-        if batch.off[k] > ACCEPTED_PX**2 or (depth < -ON_EDGE and depth <= -reach):
+            reach = proved_reach(polynomial, elements.slopes, elements.middle)
+        if off[k] > ACCEPTED_PX**2 or (depth < -ON_EDGE and depth <= -reach):
             # A root found outside, where the map is still one to one, is the only one; here
             # there may be another inside.
-            found, batch.s[k], batch.t[k] = search(
-                elements.polynomials[e], elements.bezier, elements.quarters, elements.triangular,
-                batch.row[k], batch.col[k],
-            )  # fmt: skip
+            found, s[k], t[k] = search(
+                polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
+            )
             if not found:
                 continue
-            depth = -outside(elements.triangular, batch.s[k], batch.t[k])
-            _check(elements, pixels, e, batch, k, k + 1)
+            depth = -outside(triangular, s[k], t[k])
+            _check(elements, pixels, e, row[k:], col[k:], s[k:], t[k:], off[k:], residual[k:], 1)
         if depth < -ON_EDGE:
             continue
-        at = batch.where[k]
-        if state[at - begin] == _NOBODYS:
-            state[at - begin] = _INSIDE if depth > _CLEAR_OF_EDGES else _ON_EDGE
-            pixels.element[at] = e
-            if pixels.residual.size:
-                pixels.residual[at] = batch.residual[k]
-            batch.where[claimed], batch.s[claimed], batch.t[claimed] = at, batch.s[k], batch.t[k]
+        at = where[k]
+        if state[at - begin] == NOBODYS:
+            state[at - begin] = INSIDE if depth > CLEAR_OF_EDGES else EDGE
+            element[at] = e
+            if residuals.size:
+                residuals[at] = residual[k]
+            where[claimed], s[claimed], t[claimed] = at, s[k], t[k]
             claimed += 1
-        elif depth > _CLEAR_OF_EDGES and state[at - begin] == _INSIDE:
-            state[at - begin] = _TWICE
-    _write(elements, fields, pixels, e, batch, claimed)
+        elif depth > CLEAR_OF_EDGES and state[at - begin] == INSIDE:
+            state[at - begin] = TWICE
+    _write(fields, pixels.values, e, triangular, where, s, t, claimed)
 
 
 @compiled(relaxed=True)
-def _check(elements: Elements, pixels: Pixels, e: int, batch: Batch, first: int, last: int) -> None:
-    """Compute the residuals of the pixels ``first`` ... ``last`` - 1 of a batch, two ways."""
+def _check(
+    elements: Elements,
+    pixels: Pixels,
+    e: int,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    off: FloatArray,
+    residual: FloatArray,
+    count: int,
+) -> None:
+    """Compute the residuals of the first ``count`` pixels, two ways: see Batch."""
     curved = not elements.triangular
     a = coefficients(elements.polynomials[e, 0])
     b = coefficients(elements.polynomials[e, 1])
-    for k in range(first, last):
-        p = value(a, curved, batch.s[k], batch.t[k]) - batch.row[k]
-        q = value(b, curved, batch.s[k], batch.t[k]) - batch.col[k]
-        batch.off[k] = p * p + q * q
+    for k in range(count):
+        p = value(a, curved, s[k], t[k]) - row[k]
+        q = value(b, curved, s[k], t[k]) - col[k]
+        off[k] = p * p + q * q
     if not pixels.residual.size:
         return
     x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
     h = pixels.pixel_size
     y0, x0 = pixels.y0 - h * elements.centres[e, 0], pixels.x0 + h * elements.centres[e, 1]
-    for k in range(first, last):
-        down = y0 - h * batch.row[k] - value(y, curved, batch.s[k], batch.t[k])
-        right = x0 + h * batch.col[k] - value(x, curved, batch.s[k], batch.t[k])
-        batch.residual[k] = np.sqrt(down * down + right * right) / h
+    for k in range(count):
+        down = y0 - h * row[k] - value(y, curved, s[k], t[k])
+        right = x0 + h * col[k] - value(x, curved, s[k], t[k])
+        residual[k] = np.sqrt(down * down + right * right) / h
 
 
 @compiled(relaxed=True)
 def _write(
-    elements: Elements, fields: FloatArray, pixels: Pixels, e: int, batch: Batch, count: int
+    fields: FloatArray,
+    values: FloatArray,
+    e: int,
+    triangular: bool,
+    where: IntArray,
+    s: FloatArray,
+    t: FloatArray,
+    count: int,
 ) -> None:
     """Write the fields, or the local coordinates, at the first ``count`` pixels of a batch."""
     if fields.shape[1] == 0:
         for k in range(count):
-            pixels.values[0, batch.where[k]] = batch.s[k]
-            pixels.values[1, batch.where[k]] = batch.t[k]
-        return
-    curved = not elements.triangular
+            values[0, where[k]] = s[k]
+            values[1, where[k]] = t[k]
     for field in range(fields.shape[1]):
-        a = coefficients(fields[e, field])
+        a, out = coefficients(fields[e, field]), values[field]
         for k in range(count):
-            pixels.values[field, batch.where[k]] = value(a, curved, batch.s[k], batch.t[k])
+            out[where[k]] = value(a, not triangular, s[k], t[k])
 
 
 @compiled(parallel=True, relaxed=True)

@@ -28,27 +28,30 @@ def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
 
     The first column is infinite if it doesn't. For ``sides`` and ``corners`` see Elements.
     """
-    low, low_s, low_t = np.inf, 0.0, 0.0
-    high, high_s, high_t = -np.inf, 0.0, 0.0
-    count = sides.shape[0]
-    for side in range(count):
+    low, low_at, high, high_at = np.inf, 0.0, -np.inf, 0.0
+    for side in range(sides.shape[0]):
         c0, b, a = sides[side, 0, 0] - row, sides[side, 0, 1], sides[side, 0, 2]
         u, v = _roots(a, b, c0)
         corner = 0.0 if abs(c0) <= _CLOSE_PX else np.nan
         for at in (u, v, corner):
-            if not -_CLOSE <= at <= 1.0 + _CLOSE:  # NaN isn't
-                continue
             col = sides[side, 1, 0] + at * (sides[side, 1, 1] + at * sides[side, 1, 2])
-            if col >= low and col <= high:
-                continue
-            after = (side + 1) % count
-            s = corners[side, 0] + at * (corners[after, 0] - corners[side, 0])
-            t = corners[side, 1] + at * (corners[after, 1] - corners[side, 1])
-            if col < low:
-                low, low_s, low_t = col, s, t
-            if col > high:
-                high, high_s, high_t = col, s, t
-    return (low, low_s, low_t), (high, high_s, high_t)
+            # Which root counts is hard to predict, so there are selections instead of branches.
+            on_side = (at >= -_CLOSE) & (at <= 1.0 + _CLOSE)  # NaN isn't
+            lower, higher = on_side & (col < low), on_side & (col > high)
+            low, low_at = col if lower else low, side + at if lower else low_at
+            high, high_at = col if higher else high, side + at if higher else high_at
+    return _end(corners, low, low_at), _end(corners, high, high_at)
+
+
+@compiled(inline=True, relaxed=True)
+def _end(corners: FloatArray, col: float, at: float) -> End:
+    """``at`` is the number of the side plus the parameter along it."""
+    whole = np.floor(at)
+    side, after = int(whole) % len(corners), (int(whole) + 1) % len(corners)
+    u = at - whole
+    s = corners[side, 0] + u * (corners[after, 0] - corners[side, 0])
+    t = corners[side, 1] + u * (corners[after, 1] - corners[side, 1])
+    return col, s, t
 
 
 @compiled(inline=True, relaxed=True)
@@ -66,30 +69,6 @@ def _roots(a: float, b: float, c: float) -> tuple[float, float]:
 
 
 @compiled(relaxed=True)
-def start_affine(
-    polynomial: FloatArray,
-    row: float,
-    col: float,
-    s: FloatArray,
-    t: FloatArray,
-    first: int,
-    past: int,
-) -> None:
-    """Local coordinates of the pixels col, col + 1, ... of a row, where the map is affine.
-
-    They go to s, t from ``first`` to ``past`` - 1.
-    """
-    a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
-    inverse = 1.0 / (a[1] * b[2] - a[2] * b[1])
-    dp, dq = row - a[0], col - b[0]
-    s0, t0 = (b[2] * dp - a[2] * dq) * inverse, (a[1] * dq - b[1] * dp) * inverse
-    ds, dt = -a[2] * inverse, a[1] * inverse
-    for k in range(first, past):
-        s[k] = s0 + (k - first) * ds
-        t[k] = t0 + (k - first) * dt
-
-
-@compiled(relaxed=True)
 def start_cubic(
     polynomial: FloatArray,
     curved: bool,
@@ -98,13 +77,8 @@ def start_cubic(
     col: float,
     s: FloatArray,
     t: FloatArray,
-    first: int,
-    past: int,
 ) -> None:
-    """Start for the pixels col, col + 1, ... of a row between its two ends.
-
-    They go to s, t from ``first`` to ``past`` - 1.
-    """
+    """Start for the pixels col, col + 1, ... of a row between its two ends."""
     length = max(high[0] - low[0], 1e-3)
     ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])
     ds_high, dt_high = _along_row(polynomial, curved, high[1], high[2])
@@ -112,8 +86,8 @@ def start_cubic(
     t1, t2, t3 = _hermite(low[2], high[2], dt_low * length, dt_high * length)
     step = 1.0 / length
     begin = (col - low[0]) * step
-    for k in range(first, past):
-        x = begin + (k - first) * step
+    for k in range(s.size):
+        x = begin + k * step
         s[k] = low[1] + x * (s1 + x * (s2 + x * s3))
         t[k] = low[2] + x * (t1 + x * (t2 + x * t3))
 
