@@ -165,6 +165,14 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
     assert words.fact("v2", told).startswith("largest among the holes 400 ±")
 
 
+def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]) -> None:
+    first, second = summary["frames"]
+    said = words.labels([first, second, second | {"name": "again"}])
+    at = "After buckling · 7\N{NO-BREAK SPACE}%"
+    assert list(said.values())[1:] == [f"{at} · IMG_2", f"{at} · again"]
+    assert "IMG_1" not in said["IMG_1"]
+
+
 def test_advice_that_was_taken_is_not_given_again(harvest: Harvest) -> None:
     held, free = harvest.frames[0], replace(harvest.frames[1], name="free")
     weak = free.result.ansatz.start(0.05, 0.01)

@@ -102,10 +102,3 @@ class HarvestAtlas:
         """The displacement that was measured in a frame."""
         result = frame.result
         return lambda x, y: result.ansatz.displacement(result.unknowns, x, y)
-
-    def state(self, frame: HarvestedFrame) -> str:
-        """Whether a frame shows the pattern, in words."""
-        told = {moment.name: moment.has_pattern for moment in self.harvest.timeline}
-        if frame.name not in told:
-            return "Deformed"
-        return "After buckling" if told[frame.name] else "Before buckling"

@@ -56,7 +56,7 @@ def write_harvest_report(
     atlas = HarvestAtlas(harvest)
     by_name = {frame["name"]: frame for frame in told["frames"]}
     shown = [by_name[frame.name] for frame in atlas.shown]
-    labels = {frame["name"]: words.label(frame, len(harvest.frames) > 2) for frame in shown}
+    labels = words.labels(shown)
     page = render(
         TEMPLATE,
         title=harvest.title,

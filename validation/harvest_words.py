@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,10 +28,16 @@ def state(frame: Frame) -> str:
     return "Deformed" if has is None else "After buckling" if has else "Before buckling"
 
 
-def label(frame: Frame, named: bool) -> str:
-    """How a photograph is called above its pictures; with its file's name where there are many."""
-    said = f"{state(frame)} · {percent(frame['strain'])}"
-    return f"{said} · {frame['name']}" if named else said
+def label(frame: Frame) -> str:
+    """How a photograph is called above its pictures."""
+    return f"{state(frame)} · {percent(frame['strain'])}"
+
+
+def labels(frames: Sequence[Frame]) -> dict[str, str]:
+    """Each photograph's label by its name, which is added where labels would be the same."""
+    said = {frame["name"]: label(frame) for frame in frames}
+    often = Counter(said.values())
+    return {name: text if often[text] == 1 else f"{text} · {name}" for name, text in said.items()}
 
 
 def key_numbers(summary: Summary) -> list[dict[str, str]]:
@@ -174,17 +181,17 @@ def mode_tables(frames: Sequence[Frame]) -> list[dict[str, Any]]:
     tables = []
     for i in range(max((len(frame["modes"]) for frame in frames), default=0)):
         of = [frame for frame in frames if i < len(frame["modes"])]
-        names = [(p["name"], p["unit"]) for p in max(
-            (frame["modes"][i]["parameters"] for frame in of), key=len)]  # fmt: skip
-        rows = []
-        for name, unit in names:
-            cells = [
-                next((p for p in frame["modes"][i]["parameters"] if p["name"] == name), None)
-                for frame in of
-            ]
-            rows.append({"name": name, "unit": unit, "cells": cells})
-        families = list(dict.fromkeys(frame["modes"][i]["family"] for frame in of))
-        tables.append({"number": i + 1, "frames": of, "rows": rows, "families": families})
+        free = [frame for frame in of if not frame["modes"][i]["held"]]
+        found = [{p["name"]: p for p in frame["modes"][i]["parameters"]} for frame in free]
+        units = {name: p["unit"] for column in found for name, p in column.items()}
+        tables.append({
+            "number": i + 1,
+            "families": list(dict.fromkeys(frame["modes"][i]["family"] for frame in free)),
+            "frames": free,
+            "held": [frame for frame in of if frame["modes"][i]["held"]],
+            "rows": [{"name": name, "unit": unit, "cells": [c.get(name) for c in found]}
+                     for name, unit in units.items()],
+        })  # fmt: skip
     return tables
 
 

@@ -135,4 +135,4 @@ def _mark(axes: Axes, buckling: BucklingPoint, strain: FloatArray, size: FloatAr
             grown = size[last] * np.sqrt((beyond - at) / (strain[last] - at))
             axes.plot(beyond, grown, color=MUTED, lw=0.9, ls=_DASHES)
         axes.plot([at], [0], "o", ms=8, mfc="none", mec=INK, mew=1.2, clip_on=False)
-        say(axes, at, 0.0, f"{at:.2f} %", INK, (-8, 6), "right")
+        say(axes, at, 0.0, f"{at:.2f} %", INK, (9, 5), "left")
