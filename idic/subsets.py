@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.coarse_field import CELL_PX, coarse_field
 from modeharvest.idic.field_files import read_field
 from modeharvest.idic.field_tables import read_table
 from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen
 from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.start_motion import first_motion
 from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]
@@ -39,7 +43,14 @@ HOW_TO_GET = (
     f"pyvale is not installed; give it an environment of its own and set {WHERE} to the Python "
     "there (docs/fields.md says how), or read the field of another code"
 )
-_TRIES = 4
+_TRIES = 3
+"""Seeds that are tried."""
+_SHARES = (1.0, 0.8, 1.25)
+"""Of the largest motion, that are tried with each: some sizes of the first window fail."""
+_MOST, _MARGIN = 0.998, 1.1
+"""Share of a rough field's points that move less than its largest motion, and what that lacks."""
+_COARSE_PX = 400
+"""Pixels across that are enough for a rough field."""
 _SIDE = Path(__file__).with_name("pyvale_side.py")
 
 
@@ -61,7 +72,9 @@ class SubsetOptions:
         Least share of a subset that is material [-]. pyvale takes the pixels of a hole for
         speckle, so at less than 1 there are more subsets at holes, and they are worse.
     largest_px
-        Largest motion along either axis [px]; None: a quarter of the smaller side of the image.
+        Largest motion along either axis [px]; None: looked up in a rough field of the images
+        (:mod:`modeharvest.idic.coarse_field`). pyvale's first windows are twice as large, and fail
+        if they are much larger than need be.
     threads
         For pyvale; None: all cores.
     """
@@ -109,6 +122,7 @@ def subset_field(
     deformed: ArrayLike,
     grid: PixelGrid,
     mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
     options: SubsetOptions | None = None,
 ) -> LocalField:
     """Measure a displacement field by subsets.
@@ -119,8 +133,8 @@ def subset_field(
         (rows, cols) grey levels.
     grid
         Their pixels.
-    mask
-        (rows, cols) True on material of the reference.
+    mask, deformed_mask
+        (rows, cols) True on material; the second only helps to find the largest motion.
     options
         Subsets.
 
@@ -144,11 +158,15 @@ def subset_field(
     inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
     require_contrast(seen(f, inside), "reference")
     require_contrast(g, "deformed")
+    seeds = _seeds(inside, options.subset_px)
+    landing = checked_mask(deformed_mask, "deformed mask", grid)
+    largest = options.largest_px or _largest_motion(f, g, grid, inside, landing)
     reason = ""
     with tempfile.TemporaryDirectory(prefix="modeharvest-pyvale-") as name:
         folder = Path(name)
-        for seed in _seeds(inside, options.subset_px):
-            reason = _run(python, folder, f, g, inside, _arguments(options, grid, seed))
+        for seed, share in product(seeds, _SHARES):
+            arguments = _arguments(options, grid, seed, round(share * largest))
+            reason = _run(python, folder, f, g, inside, arguments)
             results = sorted(folder.glob("subsets_*.csv"))
             if results:
                 field = read_field(results[0], grid)
@@ -156,6 +174,17 @@ def subset_field(
                 sd = predicted_sd(f, inside, grid, field, correlation, options)
                 return replace(field, sd=sd, source=f"pyvale, subsets of {options.subset_px} px")
     raise InputError(f"subset DIC: expected a result of pyvale, got none: {reason}")
+
+
+def _largest_motion(
+    f: NDArray[Any], g: NDArray[Any], grid: PixelGrid, mask: BoolArray, landing: BoolArray | None
+) -> int:
+    """Largest motion along either axis [px], by a rough field, with a margin."""
+    known, _ = first_motion(Box(*grid.extent), grid, mask, landing, None)
+    cell = CELL_PX * max(1, round(min(grid.shape) / _COARSE_PX)) * grid.pixel_size
+    rough = coarse_field(f, g, grid, cell, known, mask, landing)
+    most = float(np.quantile(np.abs(rough.u).max(axis=1), _MOST)) / grid.pixel_size
+    return int(np.ceil(_MARGIN * most)) + 4
 
 
 def predicted_sd(
@@ -241,9 +270,10 @@ def _seeds(mask: BoolArray, subset_px: int) -> list[tuple[int, int]]:
     return seeds
 
 
-def _arguments(options: SubsetOptions, grid: PixelGrid, seed: tuple[int, int]) -> dict[str, Any]:
+def _arguments(
+    options: SubsetOptions, grid: PixelGrid, seed: tuple[int, int], largest: int
+) -> dict[str, Any]:
     """Arguments of pyvale's ``calculate_2d``."""
-    largest = options.largest_px or min(grid.shape) // 4
     return {
         "seed": list(seed),
         "subset_size": options.subset_px,
@@ -251,7 +281,7 @@ def _arguments(options: SubsetOptions, grid: PixelGrid, seed: tuple[int, int]) -
         "shape_function": options.shape.upper(),
         "threshold": options.threshold,
         "partial_subset": options.filling,
-        "max_displacement": min(largest, (min(grid.shape) - 1) // 2),
+        "max_displacement": min(max(largest, options.subset_px), (min(grid.shape) - 1) // 2),
         "num_threads": options.threads,
         "image_filter_kernel": 1,  # no blur: the images are taken as they are
     }

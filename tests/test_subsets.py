@@ -155,7 +155,7 @@ def test_pyvale_measures_a_known_field() -> None:
     f, g = pair()
     inner = MASK.copy()
     inner[:, -12:] = False  # leaves the image there
-    field = subset_field(f, g, GRID, inner, SubsetOptions(step_px=8, largest_px=30, threads=1))
+    field = subset_field(f, g, GRID, inner, options=SubsetOptions(step_px=8, threads=1))
     assert field.valid_share > 0.95
     expected = np.column_stack([0.11 + 0.02 * field.x, np.zeros_like(field.x)])
     error = (field.u - expected)[field.good] / GRID.pixel_size
