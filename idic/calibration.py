@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 _COARSE_PX = 512
 """Size to which photographs are binned to find their shifts within some px."""
 _COARSE_DEGREE = 3
+_BORDER_PX = 4.0
 _MATCH = 0.5
 """Photographs that correlate less with the others show something else."""
 _LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
@@ -65,7 +66,7 @@ class CalibrationOptions:
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
     rotations: bool = True
-    blurs_px: tuple[float, ...] = (12.0, 6.0, 3.0, 1.0)
+    blurs_px: tuple[float, ...] = (12.0, 6.0, 3.0, 0.7)
     points: int = 100_000
     order: int = 5
 
@@ -206,11 +207,13 @@ def _views(
     blur: float,
     order: int,
 ) -> list[View]:
-    """Photographs as splines in units of the first one's contrast; that one stays where it is."""
+    """Photographs as splines; the first one stays where it is."""
     views = []
     for n, (image, pose) in enumerate(zip(photographs, poses, strict=True)):
         blurred = ndimage.gaussian_filter(image, blur) if blur > 0.0 else image
-        views.append(View(SplineImage.of(blurred, order), pose, free if n else (False,) * 5))
+        own = free if n else (False,) * 5
+        spline = SplineImage.of(blurred, order)
+        views.append(View(spline, pose, own, border_px=max(_BORDER_PX, blur)))
     return views
 
 

@@ -25,7 +25,7 @@ from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]
 
-_BLURS_PX = (12.0, 6.0, 3.0, 1.0)
+_BLURS_PX = (12.0, 6.0, 3.0, 0.7)
 _COARSE_POINTS, _COARSE_DEGREE = 30_000, 3
 _MARGIN_PX = 8.0
 """Nearer to the edge of the image blur and spline see beyond the edge of the scene."""
@@ -186,7 +186,8 @@ def _recovered(model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> 
     if fit.matches.min() < 0.5 or not fit.converged:
         raise InputError(
             "expected two images of one scene, without and with distortion, got a pair whose grey "
-            f"levels correlate by {fit.matches.min():.2f} only; check the files, or start nearer"
+            f"levels correlate by {fit.matches.min():.2f} only; check the files, or try another "
+            "model"
         )
     one, many = noise
     k = len(fit.coefficients)

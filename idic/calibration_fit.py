@@ -24,8 +24,6 @@ FloatArray = NDArray[np.float64]
 
 _CHUNK = 4096
 """Points that are looked at a time."""
-_BORDER_PX = 4.0
-"""Nearer to the edge of a photograph the spline knows only its mirror image."""
 _OWN = 5
 """Unknowns of a photograph: shift along rows and columns, rotation, contrast, brightness."""
 
@@ -75,12 +73,15 @@ class View:
         (5,) whether shift (2), rotation, contrast and brightness are unknown.
     distorted
         False if the photograph has no distortion, as one of a known pair.
+    border_px
+        Width of the margin that is left out: spline and blur know only its mirror image [px].
     """
 
     spline: SplineImage
     pose: Pose = field(default_factory=Pose)
     free: tuple[bool, ...] = (False,) * _OWN
     distorted: bool = True
+    border_px: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +263,9 @@ def _sample(
     at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]
     at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + pose.shift[1]
     seen_row, seen_col = distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
-    inside = (seen_row >= _BORDER_PX) & (seen_row <= rows - 1 - _BORDER_PX)
-    inside &= (seen_col >= _BORDER_PX) & (seen_col <= cols - 1 - _BORDER_PX)
+    border = view.border_px
+    inside = (seen_row >= border) & (seen_row <= rows - 1 - border)
+    inside &= (seen_col >= border) & (seen_col <= cols - 1 - border)
     value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
     value[inside], d_row[inside], d_col[inside] = view.spline.sample(
         seen_row[inside], seen_col[inside]
