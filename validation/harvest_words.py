@@ -83,7 +83,7 @@ def _mode_keys(frame: Frame) -> list[dict[str, str]]:
     count = len(mode["waves"])
     sd = "held fixed" if mode["held"] else f"± {_digits(max(_numbers(wave)), 1)}"
     return [
-        _key("pattern", f"{mode['largest_px']:.3g}", "px", f"largest v₁φ₁ {at}"),
+        _key("pattern", _digits(mode["largest_px"], 3), "px", f"largest v₁φ₁ {at}"),
         _key("largest v₁", _micro(mode["v_max_mm"], 4), "µm", ", ".join(errors)),
         _key("wave vector ξ", f"({xi})", "1/l", f"{sd}; the first of {count}"),
     ]
@@ -98,9 +98,9 @@ def _left(frame: Frame) -> dict[str, str]:
     local = frame["local"]
     if local is not None and local["w_beyond_noise_px"] is not None:
         remark = f"rms of local DIC − IDIC beyond the local DIC’s {local['sd_px']:.2g} px"
-        return _key("left over, w", f"{local['w_beyond_noise_px']:.2g}", "px", remark)
+        return _key("left over, w", _digits(local["w_beyond_noise_px"], 2), "px", remark)
     remark = "rms, estimated from the residual"
-    return _key("left over, w", f"{frame['leftover_px']:.2g}", "px", remark)
+    return _key("left over, w", _digits(frame["leftover_px"], 2), "px", remark)
 
 
 def fact(key: str, frame: Frame) -> str:
