@@ -222,11 +222,11 @@ def judge_unknowns(truth: Truth, noise: Noise, pairs: list[Pair]) -> dict[str, A
 
 
 def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
-    """All rows whose names hold a text."""
+    """All rows whose names begin with a text."""
     truth = Truth.default()
     parts = fields(truth)
     found: dict[str, Any] = {}
-    for noise in (noise for noise in NOISES if only in noise.name):
+    for noise in (noise for noise in NOISES if noise.name.startswith(only)):
         print(f"{noise.name} ...", file=sys.stderr, flush=True)
         measured = list(measure(truth, noise, pairs, standard_start))
         found[noise.name] = {
@@ -274,7 +274,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--pairs", type=int, default=100, help="realisations n, each with its -n")
     parser.add_argument("--standard-start", action="store_true", help="not from the truth: slower")
-    parser.add_argument("--only", default="", help="rows whose names hold this text")
+    parser.add_argument("--only", default="", help="rows whose names begin with this text")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")
     options = parser.parse_args()
     found = study(options.pairs, options.standard_start, options.only)
