@@ -13,6 +13,7 @@ H. White, Econometrica 48 (1980), doi 10.2307/1912934 (sandwich).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,28 +122,81 @@ def leftover_covariance(
     InputError
         If there are fewer than eight blocks.
     """
+    blocks = _blocks(result, mask, block)
+    return _sandwich(result, _pushes(blocks, result, reference, deformed, order))
+
+
+def noise_covariance(
+    result: Result,
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    noises: Iterable[tuple[ArrayLike, ArrayLike]],
+    mask: NDArray[np.bool_],
+    block: float,
+    order: int = 5,
+) -> FloatArray:
+    """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
+
+    For images that were filtered before they were correlated: their noise is not white any more,
+    and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every example pushes the
+    unknowns in every block independently; the covariance is the pushes' mean square. What the
+    noise does to the gradient that w is seen with is in it.
+
+    Parameters
+    ----------
+    result, reference, deformed, mask, block, order
+        As for :func:`leftover_covariance`.
+    noises
+        Examples of the noise in f and in g, (rows, cols) each, filtered as they were.
+    """
+    blocks = _blocks(result, mask, block)
+    f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
+    quiet = _pushes(blocks, result, f, g, order)
+    examples = []
+    for in_f, in_g in noises:
+        small_f, small_g = (_SMALL * np.asarray(n, dtype=np.float32) for n in (in_f, in_g))
+        pushed = _pushes(blocks, result, f + small_f, g + small_g, order)
+        examples.append((pushed - quiet) / _SMALL)
+    return _sandwich(result, np.vstack(examples)) / len(examples)
+
+
+_SMALL = np.float32(0.05)
+"""Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
+
+
+def _blocks(result: Result, mask: NDArray[np.bool_], block: float) -> list[Assembly]:
+    """The pixels of each block; InputError if there are fewer than eight."""
     grid = result.grid
     side = max(1, round(block / grid.pixel_size))
-    f = np.ascontiguousarray(reference, dtype=np.float32)
-    g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
-    pushes = []
+    found = []
     for top in range(0, grid.rows, side):
         for left in range(0, grid.cols, side):
-            inside = np.zeros_like(mask)
             here = (slice(top, top + side), slice(left, left + side))
-            inside[here] = mask[here]
-            if inside[here].any():
-                assembly = Assembly(result.ansatz, grid, inside)
-                pushes.append(assembly.images(result.unknowns, f, g, False).gradient)
-    if len(pushes) < _FEWEST_BLOCKS:
+            if mask[here].any():
+                inside = np.zeros_like(mask)
+                inside[here] = mask[here]
+                found.append(Assembly(result.ansatz, grid, inside))
+    if len(found) < _FEWEST_BLOCKS:
         raise InputError(
             f"expected at least {_FEWEST_BLOCKS} blocks of {block} mm with material, got "
-            f"{len(pushes)}"
+            f"{len(found)}"
         )
-    scatter = np.array(pushes)
+    return found
+
+
+def _pushes(
+    blocks: list[Assembly], result: Result, reference: ArrayLike, deformed: ArrayLike, order: int
+) -> FloatArray:
+    """(blocks, n): the derivative of each block's share of the cost."""
+    f = np.ascontiguousarray(reference, dtype=np.float32)
+    g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
+    return np.array([b.images(result.unknowns, f, g, False).gradient for b in blocks])
+
+
+def _sandwich(result: Result, pushes: FloatArray) -> FloatArray:
+    """M⁻¹ (Σ g gᵀ) M⁻¹; infinite for unknowns that the images say nothing about."""
     lost = np.isinf(np.diag(result.inverse))
-    inverse = np.where(lost[:, None] | lost[None, :], 0.0, result.inverse)
-    half = scatter @ inverse
+    half = pushes @ np.where(lost[:, None] | lost[None, :], 0.0, result.inverse)
     covariance = half.T @ half
     covariance[lost, lost] = np.inf
     return np.asarray(covariance)

@@ -174,9 +174,31 @@ def _continued(mean: Image, share: Image, blur: float) -> Image:
     return mean
 
 
-def _levelled(image: Image, blur: float) -> Image:
+def _levelled(image: Image, blur: float, around: float = _AROUND) -> Image:
     """The image less its local mean, over its local standard deviation."""
-    around = _AROUND * blur
+    around *= blur
     image = image - blurred(image, around)
     contrast = np.sqrt(blurred(image**2, around))
     return np.asarray(image / (contrast + 1e-3 * contrast.max()))
+
+
+def levelled(
+    image: Image, mask: BoolArray | None, blur: float, around: float = _AROUND
+) -> NDArray[np.float32]:
+    """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
+
+    Where all speckles count alike, what an ansatz leaves over weighs alike everywhere.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material; what is elsewhere has no part in it.
+    blur
+        Standard deviation [px].
+    around
+        How far the local mean and contrast reach [blurs].
+    """
+    smooth = _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
+    return np.asarray(_levelled(smooth, blur, around), dtype=np.float32)

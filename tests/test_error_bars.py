@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.error_bars import field_errors, leftover_covariance
+from modeharvest.idic.error_bars import field_errors, leftover_covariance, noise_covariance
 from modeharvest.idic.result import Result
 
 FloatArray = NDArray[np.float64]
@@ -93,3 +93,15 @@ def test_too_few_blocks_are_refused() -> None:
     result, f, g = noisy()
     with pytest.raises(InputError, match="expected at least 8 blocks"):
         leftover_covariance(result, f, g, MASK, block=2.0)
+
+
+def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
+    result, f, g = noisy()
+    rng = np.random.default_rng(8)
+    examples = [NOISE * rng.normal(size=(2, *f.shape)) for _ in range(12)]
+    covariance = noise_covariance(result, f, g, ((n[0], n[1]) for n in examples), MASK, 0.25)
+    predicted = result.covariance(NOISE)
+    # A mean over all n directions of chi squared with some thousand degrees of freedom each;
+    # the noise of g weighs 1/det F, some 5 %, more, and less where a spline is between pixels.
+    ratio = np.trace(np.linalg.solve(predicted, covariance)) / len(predicted)
+    assert 0.9 < ratio < 1.12
