@@ -30,6 +30,11 @@ _SIGMAS = 4.0
 """A pixel within 4 standard deviations of the background's level may be background."""
 _FAINTEST = 0.002
 """A difference of grey levels that counts as none, as a share of their range."""
+_LENS_PX = 3.0
+"""Beyond this a lens doesn't mix material with background."""
+_WIDE = 2.0
+"""Patches of the background's grey level that hold more than two disks of the reach are holes,
+however little of them was wide enough to lack contrast."""
 _SPECK_PX2 = 6
 """Area of what can be a few pixels' noise in the background."""
 _WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
@@ -169,17 +174,25 @@ def _refined(
     """(material, share of it that looks like background), from the background's own level."""
     level, spread = _background_level(grey, sure, 4 * options.window_px)
     away = np.abs(grey - level)
-    inside = ~grown(sure, options.window_px)
-    inside = inside if inside.any() else ~sure
+    least = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
+    first = _background(away < least, sure, options)
+    some = (slice(None, None, 2),) * 2  # every fourth pixel will do for statistics
+    inside = shrunk(~first[some], 0.5 * _LENS_PX)
+    if not inside.any():
+        return ~first, 1.0
     # Half-way to the material's nearest levels where they leave a gap, else as near as the
     # noise allows.
-    nearest = float(np.quantile(away[inside][::7], 0.01))
-    least = max(0.5 * nearest, _FAINTEST * float(np.ptp(grey)))
-    alike = away < np.maximum(_SIGMAS * spread, least)
-    share = float(alike[inside].mean())
-    alike = ~without_small(~alike, _SPECK_PX2)  # single pixels of noise
-    background = connected_to(sure, opened(alike, options.reach_px))
+    half = 0.5 * float(np.quantile(away[some][inside], 0.01))
+    background = _background(away < np.maximum(least, half), sure, options)
+    share = float((away < least)[some][inside].mean())
     return without_small(~background, options.window_px**2), share
+
+
+def _background(alike: BoolArray, sure: BoolArray, options: MaterialOptions) -> BoolArray:
+    """What has the background's grey level far and wide, or is connected to what surely is it."""
+    reach = options.reach_px
+    wide = opened(~without_small(~alike, _SPECK_PX2), reach)
+    return connected_to(sure, wide) | without_small(wide, int(_WIDE * np.pi * reach**2))
 
 
 def _without_walls(
@@ -193,10 +206,11 @@ def _without_walls(
     fine = gaussian_filter(grey, 0.7) - gaussian_filter(grey, 2.7)
     power = uniform_filter(fine.astype(np.float64) ** 2, window)
     sharpness = np.sqrt(np.maximum(power, 0.0))
-    core = shrunk(material, window)
+    some = (slice(None, None, 4),) * 2
+    core = shrunk(material[some], 0.25 * window)
     if not core.any():
         return material, 0.0
-    dull = material & (sharpness < _WALL_SHARPNESS * float(np.median(sharpness[core])))
+    dull = material & (sharpness < _WALL_SHARPNESS * float(np.median(sharpness[some][core])))
     background = ~material
     wall = opened(dull, 0.25 * window) & connected_to(background, dull | background)
     # Near the edge the window holds some sharp material: a wall ends a little further on.

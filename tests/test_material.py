@@ -96,6 +96,14 @@ def test_walls_of_holes_out_of_focus_are_background() -> None:
     assert (truth & ~material.mask).mean() < 0.01
 
 
+def test_holes_that_a_window_hardly_fits_into_are_found() -> None:
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    truth = (abs(row - 209.3) < 185.0) & (abs(col - 230.7) < 200.0)
+    truth &= np.hypot((row + 20.0) % 60.0 - 30.0, (col + 10.0) % 60.0 - 30.0) > 16.0
+    found = find_material(image(0.0, 0.02, truth)).mask
+    assert (found != truth).mean() < 0.004  # one px along all edges would be 0.03
+
+
 def test_without_a_background_all_is_material_and_that_is_said() -> None:
     material = find_material(image(0.0, 0.01, np.ones(SHAPE, dtype=bool)))
     assert material.mask.all()
