@@ -33,7 +33,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def local(images: ImageSet, strain: float, subset: int) -> LocalField | None:
+def local(images: ImageSet, strain: float, subsets: SubsetOptions) -> LocalField | None:
     """pyvale's field; None without pyvale."""
     try:
         pyvale_python()
@@ -43,7 +43,7 @@ def local(images: ImageSet, strain: float, subset: int) -> LocalField | None:
     begin = time.perf_counter()
     field = subset_field(
         images.reference(camera=True), images.deformed(strain, camera=True), images.grid,
-        images.mask(), images.deformed_mask(strain), SubsetOptions(subset_px=subset, threads=1),
+        images.mask(), images.deformed_mask(strain), subsets,
     )  # fmt: skip
     print(f"{field.source}: {time.perf_counter() - begin:.0f} s")
     return field
@@ -81,7 +81,9 @@ def main() -> None:
     parser.add_argument("--pixel-size", type=float, default=0.02, help="[mm/px]")
     parser.add_argument("--strains", type=float, nargs="+", default=[0.078, 0.128])
     parser.add_argument("--subset", type=int, default=21, help="edge of a subset [px]")
+    parser.add_argument("--filling", type=float, default=1.0, help="least share of material [-]")
     options = parser.parse_args()
+    subsets = SubsetOptions(subset_px=options.subset, filling=options.filling, threads=1)
     solution = Solution.read(shipped_solution("paper-virtual"))
     with tempfile.TemporaryDirectory() as folder:
         spec = ImagingSpec(pixel_size=options.pixel_size)
@@ -89,7 +91,7 @@ def main() -> None:
         for strain in images.strains:
             f, g = images.reference(camera=True), images.deformed(strain, camera=True)
             masks = images.mask(), images.deformed_mask(strain)
-            measured = local(images, strain, options.subset)
+            measured = local(images, strain, subsets)
             for field in (None,) if measured is None else (None, measured):
                 start = automatic_start(f, g, images.grid, CELL, CELLULAR, *masks, local=field)
                 found = correlate(f, g, images.grid, start.ansatz, start.unknowns, *masks)
