@@ -17,9 +17,15 @@ from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.aperture import EDGE_POINTS, Aperture
-from modeharvest.imaging.elements import monomial_gradients, polynomials, reference_element
+from modeharvest.imaging.elements import (
+    bezier_matrix,
+    monomial_gradients,
+    polynomials,
+    reference_element,
+)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.jacobian import require_positive_jacobian
+from modeharvest.imaging.paint import paint_average
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +33,6 @@ BoolArray = NDArray[np.bool_]
 
 TOLERANCE = 1e-7  # of full scale, rms: its largest among millions of pixels stays below 1e-6
 _MOST_POINTS = 16  # a side
-_POINTS_AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,32 +73,34 @@ class Scene:
         stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
         return float(1.0 / stretches.min())
 
-    def shown(self, offset: FloatArray, wanted: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Image positions (row, col), (k,) each [px], where the reference shows what k pixels do.
-
-        The pixels are the wanted ones, all moved by ``offset`` (row, col) [px]; NaN where that
-        is background.
-        """
-        mesh, h = self.mesh, self.grid.pixel_size
-        x0, y0 = self.grid.x0 + h * offset[1], self.grid.y0 - h * offset[0]
-        moved = PixelGrid(self.grid.rows, self.grid.cols, h, float(x0), float(y0))
-        u = 0.0 if self.displacement is None else self.displacement
-        located = locate(mesh.nodes + u, mesh.cells, mesh.element, moved, self.where, wanted)
-        x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, wanted]
-        return self.grid.to_px(x, y)
-
     def average(self, offsets: FloatArray, weights: FloatArray, wanted: BoolArray) -> FloatArray:
-        """(k,) weighted sum of the intensities at the k wanted pixels moved by each offset."""
-        total = np.zeros(np.count_nonzero(wanted))
-        # One Fourier transform for many points, as long as there are not too many to hold.
-        batch = max(1, _POINTS_AT_ONCE // max(1, total.size))
-        for k in range(0, len(offsets), batch):
-            row, col = np.stack([self.shown(o, wanted) for o in offsets[k : k + batch]], axis=1)
-            shown = ~np.isnan(row)
-            intensity = np.full(row.shape, self.background)
-            intensity[shown] = self.speckle(row[shown], col[shown])
-            total += weights[k : k + batch] @ intensity
-        return total
+        """(k,) weighted sum of the intensities at the k wanted pixels moved by each offset.
+
+        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
+        """
+        mesh = self.mesh
+        nodes = mesh.nodes + (0.0 if self.displacement is None else self.displacement)
+        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
+        reach = float(np.abs(offsets).max(initial=0.0))
+        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, wanted, reach)], mesh.element)
+        total = paint_average(
+            near, nodes, self.grid, self.speckle.spline, self.background, wanted, offsets, weights
+        )
+        return total[wanted]
+
+    def _reaching(self, nodes: FloatArray, wanted: BoolArray, reach: float) -> BoolArray:
+        """(m,) True for elements that may hold a point within ``reach`` px of a wanted pixel."""
+        element, shape = reference_element(self.mesh.element), self.grid.shape
+        control = bezier_matrix(element.triangular) @ element.coefficients
+        position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
+        hull = np.einsum("pk,mki->mpi", control, position)
+        low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
+        past = np.clip(np.ceil(hull.max(axis=1) + reach) + 1, 0, shape).astype(np.int64)
+        count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=np.int64)
+        count[1:, 1:] = wanted.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+        (top, left), (bottom, right) = low.T, past.T
+        inside = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
+        return np.asarray(inside > 0)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,8 @@ class Pixels(NamedTuple):
 
     element : (n,) int32 element, -1 where none is.
     values : (c, n) fields at the pixels, NaN where no element is.
-    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted.
+    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted, and then
+        ``values`` are left as they were where no element is.
     first_row : of these pixels in the image.
     cols : pixels a row.
     x0, y0, pixel_size : of the image's grid [mm].

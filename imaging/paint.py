@@ -105,26 +105,124 @@ def _paint_band(
 ) -> int:
     rows, cols = image.shape
     top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
-    size = (bottom - top) * cols
-    pixels = Pixels(
-        np.empty(size, dtype=np.int32), np.empty((2, size)), np.empty(0, dtype=np.float32),
-        top, cols, 0.0, 0.0, 1.0,
-    )  # fmt: skip
     everywhere = np.empty(0, dtype=np.bool_)
-    twice = fill(elements, home, pixels, everywhere, visited, top, bottom)
-    grey, covered = image[top:bottom].ravel(), mask[top:bottom].ravel()
-    where, at = np.empty(BLOCK, dtype=np.int64), np.empty((2, BLOCK))
+    element, grey, twice = _shade(
+        elements, home, pattern, background, everywhere, visited, top, bottom, cols
+    )
+    shown, covered = image[top:bottom].ravel(), mask[top:bottom].ravel()
+    for k in range(grey.size):
+        shown[k], covered[k] = grey[k], element[k] >= 0
+    return twice
+
+
+@compiled()
+def _shade(
+    elements: Elements,
+    home: FloatArray,
+    pattern: Table,
+    background: float,
+    wanted: BoolArray,
+    visited: IntArray,
+    top: int,
+    bottom: int,
+    cols: int,
+) -> tuple[NDArray[np.int32], FloatArray, int]:
+    """(element, grey level) of the pixels of some rows, and how many are covered twice."""
+    size = (bottom - top) * cols
+    element, at, grey = np.empty(size, dtype=np.int32), np.empty((2, size)), np.empty(size)
+    pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
+    twice = fill(elements, home, pixels, wanted, visited, top, bottom)
+    where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
     shown, room = np.empty(BLOCK), desk()
     count = 0
     for k in range(size):
-        covered[k] = pixels.element[k] >= 0
         grey[k] = background
-        if covered[k]:
-            where[count], at[0, count], at[1, count] = k, pixels.values[0, k], pixels.values[1, k]
+        if element[k] >= 0:
+            where[count], row[count], col[count] = k, at[0, k], at[1, k]
             count += 1
         if count == BLOCK or (k == size - 1 and count > 0):
-            sample(pattern, at[0, :count], at[1, :count], shown[:count], room)
+            sample(pattern, row[:count], col[:count], shown[:count], room)
             for n in range(count):
                 grey[where[n]] = shown[n]
             count = 0
-    return twice
+    return element, grey, twice
+
+
+def paint_average(
+    mesh: Mesh,
+    nodes: FloatArray,
+    grid: PixelGrid,
+    pattern: PeriodicSpline,
+    background: float,
+    wanted: BoolArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """(rows, cols) weighted sum of grey levels at the wanted pixels moved by offsets; else 0.
+
+    Parameters
+    ----------
+    mesh, nodes
+        The undeformed mesh, whose Jacobians are proved positive in the state with the node
+        positions ``nodes`` (n, 2) [mm].
+    grid, pattern, background
+        As for :func:`paint`.
+    wanted
+        (rows, cols) True where to sum.
+    offsets, weights
+        (k, 2) (row, col) [px] and (k,).
+    """
+    total = np.zeros(grid.shape)
+    home = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
+    fields, h = polynomials(mesh.element, mesh.cells, home), grid.pixel_size
+    for (down, right), weight in zip(offsets, weights, strict=True):
+        moved = PixelGrid(*grid.shape, h, float(grid.x0 + h * right), float(grid.y0 - h * down))
+        elements = lay(nodes, mesh.cells, mesh.element, moved)
+        start, visits = bands(elements.row_from, elements.row_to, grid.rows, _BAND)
+        order = in_turn(start.size - 1)
+        _add(elements, fields, pattern.table, background, start, visits, order,
+             float(weight), np.ascontiguousarray(wanted), total)  # fmt: skip
+    return total
+
+
+@compiled(parallel=True)
+def _add(
+    elements: Elements,
+    home: FloatArray,
+    pattern: Table,
+    background: float,
+    start: IntArray,
+    visits: IntArray,
+    order: IntArray,
+    weight: float,
+    wanted: BoolArray,
+    total: FloatArray,
+) -> None:
+    for i in prange(order.size):
+        visited = visits[start[order[i]] : start[order[i] + 1]]
+        _add_band(elements, home, pattern, background, visited, order[i], weight, wanted, total)
+
+
+@compiled()
+def _add_band(
+    elements: Elements,
+    home: FloatArray,
+    pattern: Table,
+    background: float,
+    visited: IntArray,
+    band: int,
+    weight: float,
+    wanted: BoolArray,
+    total: FloatArray,
+) -> None:
+    rows, cols = total.shape
+    top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
+    asked, sums = wanted[top:bottom].ravel(), total[top:bottom].ravel()
+    if not asked.any():
+        return
+    grey = _shade(elements, home, pattern, background, wanted.ravel(), visited, top, bottom, cols)[
+        1
+    ]
+    for k in range(grey.size):
+        if asked[k]:
+            sums[k] += weight * grey[k]

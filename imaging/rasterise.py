@@ -136,10 +136,10 @@ def _leave(
     for k in range(state.size):
         if state[k] == NOBODYS or state[k] == NOT_WANTED:
             element[begin + k] = -1
-            for field in range(values.shape[0]):
-                values[field, begin + k] = np.nan
-            if residual.size:
+            if residual.size:  # else these pixels are on their way elsewhere
                 residual[begin + k] = np.nan
+                for field in range(values.shape[0]):
+                    values[field, begin + k] = np.nan
         elif state[k] == TWICE:
             twice += 1
     return twice
@@ -171,6 +171,10 @@ def _fill_element(
         col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
         past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
         at = (image_row - first_row) * cols
+        while col < past and state[at + col - begin] == NOT_WANTED:
+            col += 1
+        while col < past and state[at + past - 1 - begin] == NOT_WANTED:
+            past -= 1
         while col < past:
             if count == _BATCH:
                 _claim(elements, fields, pixels, e, state, begin, batch, count)
