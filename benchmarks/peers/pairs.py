@@ -17,7 +17,7 @@ from modeharvest.case import Case, shipped_solution
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fourier import PER_WAVE, FourierMode, ModeFamily, square_family
+from modeharvest.idic.fourier import FourierMode, square_family
 from modeharvest.idic.pyramid import eroded
 from modeharvest.idic.support import Taper
 from modeharvest.imaging.grid import PixelGrid
@@ -83,17 +83,10 @@ class ImagePair:
         return inside
 
     def held(self) -> tuple[Ansatz, FloatArray]:
-        """Ansatz and start with the mode's parameters held at the start.
-
-        A family needs a parameter; this one's changes nothing, and is given no step.
-        """
+        """Ansatz and start with the mode's parameters held at the start."""
         (mode,), n = self.ansatz.modes, self.ansatz.phi_offset(0)
-        waves = mode.family.waves(self.start[self.ansatz.phi_slice(0)])
-        family = ModeFamily(
-            "held", np.zeros((PER_WAVE * len(waves), 1)), waves.ravel(), np.zeros(1)
-        )
-        held = replace(self.ansatz, modes=(replace(mode, family=family),))
-        return held, np.append(self.start[:n], 0.0)
+        family = replace(mode.family, start=self.start[self.ansatz.phi_slice(0)]).held()
+        return replace(self.ansatz, modes=(replace(mode, family=family),)), self.start[:n]
 
 
 def inside_the_ansatz(shape: tuple[int, int], seed: int) -> ImagePair:
