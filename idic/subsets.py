@@ -111,7 +111,7 @@ def pyvale_python() -> str:
         path = Path(given).expanduser()
         if not path.is_file():
             raise MissingDependencyError(f"expected a Python in {WHERE}, found no file {path}")
-        return str(path)
+        return str(path.absolute())  # not resolved: a venv is known by its link
     if importlib.util.find_spec("pyvale") is None:
         raise MissingDependencyError(HOW_TO_GET)
     return sys.executable
@@ -301,7 +301,12 @@ def _run(
     np.savez(folder / "request.npz", f=f, g=g, mask=mask, arguments=json.dumps(arguments))
     quiet = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
     done = subprocess.run(
-        [python, str(_SIDE), str(folder)], capture_output=True, text=True, env=quiet, check=False
+        [python, str(_SIDE), str(folder)],
+        cwd=folder,  # pyvale leaves a log where it is run
+        capture_output=True,
+        text=True,
+        env=quiet,
+        check=False,
     )
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     named = [line for line in lines if "Error" in line]
