@@ -73,9 +73,9 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         if not self.degrees or self.degrees[0] < 2 or list(self.degrees) != sorted(self.degrees):
             raise InputError(f"expected ascending degrees from 2 on, got {self.degrees}")
-        if not self.blurs_px or min(self.blurs_px) < 0.0 or self.points < 1000:
+        if len(self.blurs_px) < 2 or min(self.blurs_px) < 0.0 or self.points < 1000:
             raise InputError(
-                "expected blurs of 0 px or more and at least 1000 points, got "
+                "expected two or more blurs of 0 px or more and at least 1000 points, got "
                 f"{self.blurs_px} and {self.points}"
             )
 
@@ -109,29 +109,55 @@ def calibrate(
     """
     options = options or CalibrationOptions()
     photographs = _checked(images)
-    rows, cols = photographs[0].shape
-    shape = (rows, cols)
     known = shifts is not None
     start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
-    poses = lit_alike(photographs, start)
-    moving = (not known, not known, not known and options.rotations)
-    model = PolynomialModel(
-        shape, min(_COARSE_DEGREE, options.degrees[-1]), fixed=1 if known else 3
-    )
-    c = model.start
+    free = (not known, not known, not known and options.rotations)
     report = _reporter(progress, len(options.blurs_px) + len(options.degrees))
+    coarse, fit = _coarse_fit(photographs, lit_alike(photographs, start), free, options, report)
+    _require_shifts(fit.poses)
+    _require_matches(fit)
+    trials, stride = _trials(photographs, coarse, fit, free, options, report)
+    _require_matches(min(trials, key=lambda trial: trial[1].bic)[1])
+    progress(1, 1, "calibrate")
+    return calibration_of(trials, known, sampled_noise(options.blurs_px[-1], options.order, stride))
+
+
+def _coarse_fit(
+    photographs: Sequence[NDArray[np.float32]],
+    poses: Sequence[Pose],
+    moving: tuple[bool, bool, bool],
+    options: CalibrationOptions,
+    report: Callable[[], None],
+) -> tuple[PolynomialModel, Fit]:
+    """Shifts and a cubic S from blurred photographs."""
+    rows, cols = photographs[0].shape
+    degree = min(_COARSE_DEGREE, options.degrees[-1])
+    model = PolynomialModel((rows, cols), degree, fixed=3 if moving[0] else 1)
+    c = model.start
     for blur in options.blurs_px[:-1]:
         # Where they don't match yet, a fit of the light would sooner wipe out the contrast.
         views = _views(photographs, poses, (*moving, False, False), blur, options.order)
-        points, _ = _points(shape, poses, options.points // 4)
+        points, _ = _points((rows, cols), poses, options.points // 4)
         fit = fit_views(model, c, views, points, tolerance_px=0.02, max_iterations=10)
-        c, poses = fit.coefficients, list(fit.poses)
+        c, poses = fit.coefficients, fit.poses
         report()
-    _require_shifts(poses)
-    _require_matches(fit)
-    views = _views(photographs, poses, (*moving, True, True), options.blurs_px[-1], options.order)
-    points, stride = _points(shape, poses, options.points)
+    return model, fit
+
+
+def _trials(
+    photographs: Sequence[NDArray[np.float32]],
+    model: PolynomialModel,
+    fit: Fit,
+    moving: tuple[bool, bool, bool],
+    options: CalibrationOptions,
+    report: Callable[[], None],
+) -> tuple[list[tuple[PolynomialModel, Fit]], float]:
+    """One fit a degree, the best one to the end; and the stride of the points [px]."""
+    free = (*moving, True, True)
+    views = _views(photographs, fit.poses, free, options.blurs_px[-1], options.order)
+    points, stride = _points(model.shape, fit.poses, options.points)
     trials: list[tuple[PolynomialModel, Fit]] = []
+    c = fit.coefficients
     for degree in options.degrees:
         # Coefficients that a degree lacks keep the others from settling soon, and don't matter.
         model, c = model.of_degree(c, degree)
@@ -143,11 +169,9 @@ def calibrate(
             break
     best = int(np.argmin([fit.bic for _, fit in trials]))
     model, fit = trials[best]
-    fit = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
-    _require_matches(fit)
-    trials[best] = model, fit
-    progress(1, 1, "calibrate")
-    return calibration_of(trials, known, sampled_noise(options.blurs_px[-1], options.order, stride))
+    settled = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
+    trials[best] = model, settled
+    return trials, stride
 
 
 def _checked(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
