@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.normal_equations import BANDS, Assembly
 from modeharvest.idic.pixel_blocks import (
     AT_COL,
     AT_ROW,
@@ -57,9 +57,7 @@ def landed(
         A pixel off the image stays in: the iteration counts those and says so.
     """
     kept = assembly.mask.copy()
-    target = Target.images(reference, deformed, assembly.grid)
-    kernel: Callable[..., None] = _land
-    kernel(target, assembly.runs, _tables(assembly, a), _degree(assembly), allowed, kept)
+    _run(assembly, a, reference, deformed, allowed, kept, np.zeros((0, 0), dtype=np.float32))
     return kept
 
 
@@ -68,48 +66,56 @@ def residual(
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
     left = np.full(assembly.grid.shape, np.nan, dtype=np.float32)
-    target = Target.images(reference, deformed, assembly.grid)
-    kernel: Callable[..., None] = _subtract
-    kernel(target, assembly.runs, _tables(assembly, a), _degree(assembly), left)
+    nothing = np.zeros((0, 0), dtype=np.bool_)
+    _run(assembly, a, reference, deformed, nothing, nothing, left)
     return left
 
 
-def _tables(assembly: Assembly, a: FloatArray) -> Any:
-    return tables_of(assembly.ansatz, assembly.grid, assembly.ansatz.checked(a))
-
-
-def _degree(assembly: Assembly) -> int:
+def _run(
+    assembly: Assembly,
+    a: FloatArray,
+    reference: NDArray[Any],
+    deformed: SplineImage,
+    allowed: BoolArray,
+    kept: BoolArray,
+    left: NDArray[np.float32],
+) -> None:
     ansatz = assembly.ansatz
-    return max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
+    tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
+    target = Target.images(reference, deformed, assembly.grid)
+    degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
+    kernel: Callable[..., None] = _pass
+    kernel(target, assembly.runs, tables, degree, BANDS, allowed, kept, left)
 
 
 @compiled(parallel=True, relaxed=True)
-def _land(target: Any, runs: Any, tables: Any, degree: int, allowed: Any, kept: Any) -> None:
-    rows, cols = kept.shape
-    per_px = 1.0 / target.pixel_size
-    for row in prange(rows):
+def _pass(
+    target: Any, runs: Any, tables: Any, degree: int, bands: int, allowed: Any, kept: Any, left: Any
+) -> None:
+    """Fill ``kept`` from ``allowed``, or else ``left``: one pass, so that it is compiled once."""
+    rows, per_px = runs.row_start.size - 1, 1.0 / target.pixel_size
+    for band in prange(bands):
         block = new_block(tables, degree, 3)
-        own = block.own
-        run, begin = start_row(runs, tables, row, block)
-        while run < runs.row_start[row + 1]:
-            n, run, begin = take_block(target, runs, tables, row, run, begin, block)
-            displace_block(row, n, tables, block)
-            map_block(row, n, per_px, own)
-            for m in range(n):
-                i, j = int(np.rint(own[AT_ROW, m])), int(np.rint(own[AT_COL, m]))
-                if 0 <= i < rows and 0 <= j < cols:
-                    kept[row, int(own[COLUMN, m])] = allowed[i, j]
+        own, remains = block.own, block.E[2]
+        # Rows of an inner range are signed, as in the other pass: prange's own are not.
+        for row in range(band * rows // bands, (band + 1) * rows // bands):
+            run, begin = start_row(runs, tables, row, block)
+            while run < runs.row_start[row + 1]:
+                n, run, begin = take_block(target, runs, tables, row, run, begin, block)
+                displace_block(row, n, tables, block)
+                if kept.size:
+                    map_block(row, n, per_px, own)
+                    _land(n, own, allowed, kept[row])
+                else:
+                    sample_block(target, row, n, block)
+                    for m in range(n):
+                        if own[WEIGHT, m] > 0.0:
+                            left[row, int(own[COLUMN, m])] = remains[m]
 
 
-@compiled(parallel=True, relaxed=True)
-def _subtract(target: Any, runs: Any, tables: Any, degree: int, left: Any) -> None:
-    for row in prange(left.shape[0]):
-        block = new_block(tables, degree, 3)
-        run, begin = start_row(runs, tables, row, block)
-        while run < runs.row_start[row + 1]:
-            n, run, begin = take_block(target, runs, tables, row, run, begin, block)
-            displace_block(row, n, tables, block)
-            sample_block(target, row, n, block)
-            for m in range(n):
-                if block.own[WEIGHT, m] > 0.0:
-                    left[row, int(block.own[COLUMN, m])] = block.E[2, m]
+@compiled(relaxed=True)
+def _land(n: int, own: Any, allowed: Any, kept: Any) -> None:
+    for m in range(n):
+        i, j = int(np.rint(own[AT_ROW, m])), int(np.rint(own[AT_COL, m]))
+        if 0 <= i < allowed.shape[0] and 0 <= j < allowed.shape[1]:
+            kept[int(own[COLUMN, m])] = allowed[i, j]
