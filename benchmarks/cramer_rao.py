@@ -248,13 +248,15 @@ def tell(found: dict[str, Any]) -> None:
     print(f"{found['pairs']} pairs of realisations, {found['pixels']} px, "
           f"{found['unknowns']} unknowns; det F from {found['det_F'][0]:.2f} to "
           f"{found['det_F'][2]:.2f}, median {found['det_F'][1]:.2f}\n")  # fmt: skip
-    print("| noise | field | bound, rms [px] | rms error / bound | bias / bound |")
-    print("|---|---|---|---|---|")
-    for noise, row in found["noises"].items():
-        for name, f in row["fields"].items():
-            print(f"| {noise} | {name} | {f['bound_px']:.2e} | {f['ratio']:.3f} ± "
-                  f"{f['ratio_se']:.3f} | {f['bias']:.4f} ± {f['bias_se']:.4f} |")  # fmt: skip
-    print("\n| noise | chi squared of the unknowns | each unknown's rms error / bound | told "
+    for heading, key in (("rms error / bound", "ratio"), ("bias / bound", "bias")):
+        print(f"| {heading} | bound of u, rms [px] | u | v0 | v1 | v1 phi1 |")
+        print("|---|---|---|---|---|---|")
+        for noise, row in found["noises"].items():
+            cells = [f"{f[key]:.3f} ± {f[key + '_se']:.3f}"
+                     for f in row["fields"].values()]  # fmt: skip
+            print(f"| {noise} | {row['fields']['u']['bound_px']:.2e} | {' | '.join(cells)} |")
+        print()
+    print("| noise | chi squared of the unknowns | each unknown's rms error / bound | told "
           "standard error / rms error | share in 95 % intervals | chi squared of the residual |\n"
           "|---|---|---|---|---|---|")  # fmt: skip
     for noise, row in found["noises"].items():
