@@ -134,9 +134,9 @@ def _shade(
     twice = fill(elements, home, pixels, wanted, visited, top, bottom)
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
     shown, room = np.empty(BLOCK), desk()
+    grey[:] = background
     count = 0
     for k in range(size):
-        grey[k] = background
         if element[k] >= 0:
             where[count], row[count], col[count] = k, at[0, k], at[1, k]
             count += 1
@@ -158,7 +158,7 @@ def paint_average(
     offsets: FloatArray,
     weights: FloatArray,
 ) -> FloatArray:
-    """(rows, cols) weighted sum of grey levels at the wanted pixels moved by offsets; else 0.
+    """(rows, cols) weighted sum of grey levels at pixels moved by offsets; wrong if not wanted.
 
     Parameters
     ----------
@@ -217,12 +217,11 @@ def _add_band(
 ) -> None:
     rows, cols = total.shape
     top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
-    asked, sums = wanted[top:bottom].ravel(), total[top:bottom].ravel()
-    if not asked.any():
+    sums = total[top:bottom].ravel()
+    if not wanted[top:bottom].any():
         return
     grey = _shade(elements, home, pattern, background, wanted.ravel(), visited, top, bottom, cols)[
         1
     ]
-    for k in range(grey.size):
-        if asked[k]:
-            sums[k] += weight * grey[k]
+    for k in range(grey.size):  # of others, too: what they get is not looked at
+        sums[k] += weight * grey[k]

@@ -107,10 +107,11 @@ def fill(
     """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many are covered twice."""
     begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
     state = np.zeros(end - begin, dtype=np.uint8)
+    pixels.element[begin:end] = -1
     if wanted.size:
-        for k in range(end - begin):
-            if not wanted[top * pixels.cols + k]:
-                state[k] = NOT_WANTED
+        asked = wanted[top * pixels.cols : bottom * pixels.cols]
+        for k in range(asked.size):
+            state[k] = NOBODYS if asked[k] else NOT_WANTED
     real = np.empty((6, _BATCH))
     batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
@@ -134,14 +135,13 @@ def _leave(
     """Mark what nobody claimed as background; count what two did."""
     twice = 0
     for k in range(state.size):
-        if state[k] == NOBODYS or state[k] == NOT_WANTED:
-            element[begin + k] = -1
-            if residual.size:  # else these pixels are on their way elsewhere
+        twice += state[k] == TWICE
+    if residual.size:  # else these pixels are on their way elsewhere
+        for k in range(state.size):
+            if element[begin + k] < 0:
                 residual[begin + k] = np.nan
                 for field in range(values.shape[0]):
                     values[field, begin + k] = np.nan
-        elif state[k] == TWICE:
-            twice += 1
     return twice
 
 
