@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from modeharvest import __version__
-from modeharvest.case import case_text, read_case, shipped_cases
+from modeharvest.case import TwinCase, case_text, read_case, shipped_cases
 from modeharvest.case_file import lattice_cases
 from modeharvest.console import ProgressBars, compilation_announced
 from modeharvest.errors import InputError, MissingDependencyError
@@ -75,8 +75,13 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     """Run a whole case: simulate, image, correlate, validate.
 
     Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
-    same command again after an interruption: finished stages are not repeated.
+    same command again after an interruption: finished stages are not repeated. The twin of a real
+    experiment is photographed, harvested from its photographs alone, and set against its truth.
     """
+    checked = read_case(case)
+    if isinstance(checked, TwinCase):
+        _run_twin(checked, out, solution)
+        return
     summary = _with_bars(case, out, solution, lambda stages: stages.all())
     _print_summary(summary, out)
 
@@ -199,6 +204,16 @@ def _of_lattice(case: str, out: Path, work: Callable[[Any], Any]) -> Any:
 
     with _bars() as bars:
         return work(LatticeAnalysis(checked, out, bars, case))
+
+
+def _run_twin(case: TwinCase, out: Path, solution: Path | None) -> None:
+    """Make a twin's photographs, harvest them, and compare with the truth."""
+    from modeharvest.harvest.terminal import print_harvest
+    from modeharvest.harvest.twin_run import TwinRun
+
+    with _bars() as bars:
+        summary = TwinRun(case, out, bars, solution).all()
+    print_harvest(summary, out / "harvest")
 
 
 @contextmanager

@@ -183,15 +183,15 @@ class LocalTable:
     y_axis
         "down" or "up", of the files.
     subset, step
-        Edge of the subsets and their distance [px], with code = "pyvale".
+        Edge of the subsets, odd, and their distance [px], with code = "pyvale".
     """
 
     code: str = "none"
     files: tuple[str, ...] = ()
     unit: str = "px"
     y_axis: str = "down"
-    subset: int = 31
-    step: int = 10
+    subset: int = 21
+    step: int = 5
 
     def __post_init__(self) -> None:
         if self.code not in LOCAL:
@@ -206,9 +206,10 @@ class LocalTable:
                 f"local: expected unit 'px' or 'mm' and y_axis 'down' or 'up', got {self.unit!r} "
                 f"and {self.y_axis!r}"
             )
-        if self.subset < 5 or self.step < 1:
+        if self.subset < 5 or self.subset % 2 == 0 or self.step < 1:
             raise InputError(
-                f"local: expected subset >= 5 px and step >= 1 px, got {self.subset}, {self.step}"
+                "local: expected an odd subset >= 5 px and step >= 1 px, got "
+                f"{self.subset} and {self.step}"
             )
 
 

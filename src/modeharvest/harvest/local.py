@@ -12,6 +12,7 @@ from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.field_files import read_field
 from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.subsets import SubsetOptions, subset_field
 from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.grid import PixelGrid
 
@@ -47,12 +48,11 @@ def local_field(
     if table.code == "none":
         return None
     if table.code == "pyvale":
-        from modeharvest.idic.subsets import subset_field
-
         name = prepared.names[number]
+        options = SubsetOptions(subset_px=table.subset, step_px=table.step)
         return subset_field(
-            prepared.image(), prepared.image(name), grid, prepared.mask(),
-            subset_px=table.subset, step_px=table.step,
+            prepared.image(), prepared.image(name), grid, prepared.mask(), prepared.mask(name),
+            options,
         )  # fmt: skip
     if number >= len(table.files):
         raise InputError(

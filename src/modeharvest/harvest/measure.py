@@ -13,9 +13,12 @@ from modeharvest.harvest.experiment import Measurement
 from modeharvest.harvest.geometry import Geometry
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.automatic_start import Start, StartOptions, automatic_start
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finish import Finish, blurred_pair, finish_for
 from modeharvest.idic.fourier import FourierMode, square_family
 from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.region import junction
 from modeharvest.idic.result import Result
@@ -58,13 +61,16 @@ class Measured:
         The displacement field that the start was read from, a local DIC's if there is one.
     held
         Whether the mode was held.
+    blur_px
+        Of the images that the correlation ended on [px]; 0 for the images as they are.
     sentences
-        Where the correlation started from, in words.
+        Where the correlation started from and ended, in words.
     """
 
     result: Result
     local: LocalField
     held: bool
+    blur_px: float
     sentences: tuple[str, ...]
 
 
@@ -119,13 +125,65 @@ def measure(
     ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
     sentences = (said, *start.sentences)
     if before is not None and _goes_on(before, held):
-        there = before.result
-        found = _correlated(pair, geometry, there.ansatz, there.unknowns, how, progress)
+        found, finish = correlated(pair, geometry, *_lit(before.result, how), how, progress)
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
-            return Measured(found, start.local, before.held, (*sentences, words))
-    found = _correlated(pair, geometry, ansatz, unknowns, how, progress)
-    return Measured(found, start.local, held, sentences)
+            said_all = (*sentences, words, finish.sentence)
+            return Measured(found, start.local, before.held, finish.blur_px, said_all)
+    found, finish = correlated(pair, geometry, ansatz, unknowns, how, progress)
+    return Measured(found, start.local, held, finish.blur_px, (*sentences, finish.sentence))
+
+
+def correlated(
+    pair: Pair,
+    geometry: Geometry,
+    ansatz: Ansatz,
+    unknowns: FloatArray,
+    how: Measurement,
+    progress: Progress = silent,
+) -> tuple[Result, Finish]:
+    """Correlate from coarse to fine, and finish as the leftover on the last coarse level asks for.
+
+    Parameters
+    ----------
+    pair, geometry
+        Images and specimen.
+    ansatz, unknowns
+        The start.
+    how
+        How to correlate.
+    progress
+        Listener.
+
+    Returns
+    -------
+    result, finish
+        A result on blurred images has no unknowns for gain and offset: levelling did that.
+    """
+    options, grid = how.options(), geometry.grid
+    masks = pair.mask, pair.deformed_mask
+    coarse = replace(options, levels=options.levels[:-1])
+    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
+    rough = correlate(*images, grid, ansatz, unknowns, *masks, coarse, progress)
+    binned = rough.grid.pixel_size / grid.pixel_size
+    leftover_px = binned * identifiability(rough, None).leftover_px
+    finish = finish_for(pair.reference, pair.mask, leftover_px)
+    if finish.blur_px > 0.0:
+        images = blurred_pair(*images, *masks, finish.blur_px)
+        ansatz = replace(ansatz, brightness=Brightness())
+    fine = replace(options, levels=options.levels[-1:])
+    start = rough.unknowns[: ansatz.size]
+    result = correlate(*images, grid, ansatz, start, *masks, fine, progress)
+    return replace(result, history=(*rough.history, *result.history)), finish
+
+
+def _lit(result: Result, how: Measurement) -> tuple[Ansatz, FloatArray]:
+    """Ansatz and unknowns of a result with the brightness that was asked for, to start from."""
+    ansatz = replace(result.ansatz, brightness=how.brightness())
+    first = result.ansatz.phi_offset(len(result.ansatz.modes))
+    start = np.zeros(ansatz.size)
+    start[:first] = result.unknowns[:first]
+    return ansatz, start
 
 
 def _same_surface(pair: Pair, expected: Expected) -> str:
@@ -197,18 +255,3 @@ def _moved_to(result: Result, points: FloatArray) -> FloatArray:
         result.unknowns, np.column_stack([x, y])
     )
     return np.column_stack(grid.to_px(moved[:, 0], moved[:, 1]))
-
-
-def _correlated(
-    pair: Pair,
-    geometry: Geometry,
-    ansatz: Ansatz,
-    unknowns: FloatArray,
-    how: Measurement,
-    progress: Progress,
-) -> Result:
-    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
-    return correlate(
-        *images, geometry.grid, ansatz, unknowns, pair.mask, pair.deformed_mask, how.options(),
-        progress,
-    )  # fmt: skip

@@ -175,7 +175,8 @@ class Harvesting:
                 return
             write_field(field, found.local)
             found.result.write(result)
-            write_json(start, {"failed": "", "held": found.held, "said": found.sentences})
+            told = {"held": found.held, "blur_px": found.blur_px, "said": found.sentences}
+            write_json(start, {"failed": "", **told})
 
         self.stages.do(f"correlate {name}", key, work, start)
 
@@ -197,7 +198,11 @@ class Harvesting:
         result, field, _ = self._paths(name)
         told = self._told(name)
         return Measured(
-            Result.read(result), read_field(field), bool(told["held"]), tuple(told["said"])
+            Result.read(result),
+            read_field(field),
+            bool(told["held"]),
+            float(told["blur_px"]),
+            tuple(told["said"]),
         )
 
     def _told(self, name: str) -> dict[str, Any]:

@@ -25,6 +25,14 @@ def print_harvest(summary: dict[str, Any], out: Path) -> None:
     console.print("± noise of the images / ± what the ansatz leaves over; standard deviations")
     buckling = summary.get("buckling") or {}
     console.print(escape(buckling.get("sentence", "")))
+    for row in summary.get("truth") or []:
+        mark = "[green]✓[/green]" if row["ok"] else "[red]✗[/red]"
+        obtained = row["obtained"]
+        value = f"{obtained:.3g}" if isinstance(obtained, float) else str(obtained)
+        console.print(
+            f"{mark} {escape(row['quantity'])}: {value} {row['unit']} ({escape(row['expected'])})",
+            soft_wrap=True,
+        )
     for name, reason in _skipped(summary):
         console.print(f"[yellow]skipped:[/yellow] {escape(name)}: {escape(reason)}")
     for frame in frames:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +12,30 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.geometry import Geometry
-from modeharvest.harvest.measure import Measured
+from modeharvest.harvest.measure import Measured, Pair
 from modeharvest.harvest.optics import Optics
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.harvest.timeline import Moment, find_buckling, mean_strain
+from modeharvest.idic.agreement import Agreement, autocorrelation
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.error_bars import FieldErrors, field_errors, leftover_covariance
+from modeharvest.idic.error_bars import (
+    FieldErrors,
+    field_errors,
+    leftover_covariance,
+    noise_covariance,
+)
+from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.measured_spectrum import measured_spectrum
 from modeharvest.idic.pattern import read_pattern
+from modeharvest.idic.pull_back import pulled_back
+from modeharvest.idic.pyramid import eroded
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.harvest_run import Harvest, HarvestedFrame, HarvestTruth
 
 FloatArray = NDArray[np.float64]
 
-_ALONG = 48
+_ALONG = 120
 """Points of the error bars along the longer side: they are as smooth as the ansatz."""
 
 
@@ -100,15 +110,11 @@ def _frame(
 ) -> HarvestedFrame:
     result, image = measured.result, prepared.image(name)
     how, box = experiment.correlation, geometry.region.cellular
-    cell, noise_sd = experiment.specimen.cell_size, prepared.noise.sd
+    cell = experiment.specimen.cell_size
     x, y = _axes(geometry.region.domain)
-    leftover, warnings = None, []
-    try:
-        leftover = leftover_covariance(
-            result, prepared.image(), image, prepared.mask(), cell, how.order
-        )
-    except InputError as error:
-        warnings.append(f"No error bars for what the ansatz leaves over: {error}.")
+    by_noise, by_leftover, warnings = covariances(
+        measured, _seen(prepared, name), prepared.noise.sd, cell, how.order
+    )
     seen = identifiability(result, prepared.mask())
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
@@ -121,18 +127,104 @@ def _frame(
         mask=prepared.mask(name),
         result=result,
         identifiability=seen,
-        agreement=result.agreement(noise_sd, order=how.order),
+        agreement=_agreement(measured, prepared.image(), image, prepared, how.order),
         error_x=x,
         error_y=y,
-        by_noise=field_errors(result, x, y, result.covariance(noise_sd)),
-        by_leftover=None if leftover is None else field_errors(result, x, y, leftover),
-        leftover_covariance=leftover,
+        by_noise=field_errors(result, x, y, by_noise),
+        by_leftover=None if by_leftover is None else field_errors(result, x, y, by_leftover),
+        leftover_covariance=by_leftover,
         spectrum=spectrum,
         pattern=pattern,
         local=measured.local if experiment.local.code != "none" else None,
         start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
+
+
+def covariances(
+    measured: Measured, pair: Pair, noise_sd: float, cell: float, order: int
+) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
+    """Covariances of the unknowns by the images' noise and by what the ansatz leaves over.
+
+    Parameters
+    ----------
+    measured
+        What came out of a photograph.
+    pair
+        That was correlated.
+    noise_sd
+        Of each photograph [grey levels].
+    cell
+        Edge of the blocks that are taken for independent [mm].
+    order
+        Of the spline.
+
+    Returns
+    -------
+    by_noise, by_leftover, warnings
+        (n, n) each; the second None where there are too few cells, which the warnings say.
+    """
+    result, blur = measured.result, measured.blur_px
+    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
+    masks = pair.mask, pair.deformed_mask
+    if blur > 0.0:
+        images = blurred_pair(*images, *masks, blur)
+    try:
+        by_leftover = leftover_covariance(result, *images, pair.mask, cell, order)
+        if blur == 0.0:
+            return result.covariance(noise_sd), by_leftover, ()
+        examples = _noises(pair, blur, noise_sd)
+        by_noise = noise_covariance(result, *images, examples, pair.mask, cell, order)
+    except InputError as error:
+        return (
+            result.covariance(noise_sd),
+            None,
+            (f"No error bars for what the ansatz leaves over: {error}.",),
+        )
+    return by_noise, by_leftover, ()
+
+
+def _noises(
+    pair: Pair, blur: float, noise_sd: float
+) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """What a blur makes of examples of white noise in both images."""
+    rng = np.random.default_rng(0)
+    quiet = blurred_pair(pair.reference, pair.deformed, pair.mask, pair.deformed_mask, blur)
+    for _ in range(_EXAMPLES):
+        f, g = (
+            image + np.float32(noise_sd) * rng.standard_normal(image.shape, dtype=np.float32)
+            for image in (pair.reference, pair.deformed)
+        )
+        loud = blurred_pair(f, g, pair.mask, pair.deformed_mask, blur)
+        yield loud[0] - quiet[0], loud[1] - quiet[1]
+
+
+_EXAMPLES = 4
+"""Examples of noise: with 100 cells a standard deviation is good to 4 %."""
+
+
+def _seen(prepared: Prepared, name: str) -> Pair:
+    return Pair(prepared.image(), prepared.image(name), prepared.mask(), prepared.mask(name))
+
+
+def _agreement(
+    measured: Measured, reference: NDArray[Any], image: NDArray[Any], prepared: Prepared, order: int
+) -> Agreement:
+    """The residual of the photographs as they are against their noise, lit alike."""
+    result = measured.result
+    if measured.blur_px == 0.0:
+        return result.agreement(prepared.noise.sd, order=order)
+    back, seen = pulled_back(image, result, order)
+    used = eroded(prepared.mask(), 3) & seen
+    f, g = reference[used], back[used]
+    gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
+    offset = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
+    residual = np.where(used, reference - np.float32(gain) * back - np.float32(offset), np.nan)
+    rms = float(np.sqrt(np.nanmean(np.square(residual, dtype=np.float64))))
+    return Agreement.of(
+        rms, autocorrelation(residual), int(used.sum()), result.ansatz.size, prepared.noise.sd,
+        order=order,
+    )  # fmt: skip
 
 
 def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
