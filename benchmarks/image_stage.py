@@ -6,12 +6,17 @@ speckle there, and what is often done instead, a spline through the reference im
 included). All run in turn, so that a busy machine hits all alike; times are medians. The truth
 of the errors is the trigonometric polynomial itself, summed term by term at some points.
 
-Run: scripts/env python benchmarks/image_stage.py
+Then whole images from 1 to 50 Mpx on all threads: what a pixel costs, in time and in memory. The
+pattern's period is 2048 px there, so that the memory is that of making images alone.
+
+Run: scripts/env python benchmarks/image_stage.py [--growth]
 """
 
 from __future__ import annotations
 
+import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,16 +26,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.case import shipped_solution
-from modeharvest.fem.field import Solution
+from modeharvest.fem.field import Mesh, Solution
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
-from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.isoparametric import interpolate, locate, map_back
 from modeharvest.imaging.render import render_image
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 STRAIN = 0.128
 ROUNDS = 7
 POINTS = 400
+SIZES_MPX = (1, 3, 6, 12, 25, 50)
 FloatArray = NDArray[np.float64]
 Work = Callable[[], Any]
 
@@ -58,12 +64,49 @@ def term_by_term(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
     return np.asarray(((along_row @ coefficients) * along_col).sum(axis=1).real)
 
 
+def growth(mesh: Mesh, u: FloatArray) -> None:
+    """Print seconds and peak memory of images of growing size.
+
+    Memory shows where it exceeds what making the pattern took.
+    """
+    speckle = Speckle(SpeckleSpec(), (2048, 2048))
+    render_image(mesh, u, PixelGrid.centred(300, 250, 0.08), speckle, 0.0)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print("| Mpx, image | Mpx, material | seconds | ns a pixel | peak memory ÷ float32 image |")
+    print("|---|---|---|---|---|")
+    for size in SIZES_MPX:
+        rows = round((size * 1e6 * 2751 / 2207) ** 0.5)
+        grid = PixelGrid.centred(rows, round(rows * 2207 / 2751), 21.8 / rows)
+        seconds = []
+        shown = None
+        for _ in range(3):
+            del shown  # two images at a time would count twice
+            begin = time.perf_counter()
+            shown = render_image(mesh, u, grid, speckle, 0.0)
+            seconds.append(time.perf_counter() - begin)
+        peak = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+        pixels, least = shown.mask.size, min(seconds)
+        print(f"| {pixels / 1e6:.1f} | {shown.mask.sum() / 1e6:.1f} | {least:.2f} ", end="")
+        print(
+            f"| {1e9 * least / pixels:.1f} | {f'{peak / shown.image.nbytes:.2f}' if peak else '-'} |",
+            flush=True,
+        )
+
+
 def main() -> None:
-    numba.set_num_threads(1)
     path = shipped_solution("paper-virtual")
     assert path is not None, "the case ships its solution"
     solution = Solution.read(path)
     mesh, u = solution.mesh, solution.at(STRAIN).displacement
+    if "--growth" not in sys.argv:
+        stages(mesh, u)
+    growth(mesh, u)
+
+
+def stages(mesh: Mesh, u: FloatArray) -> None:
+    """Print what the stages of an image cost, beside interpolating the reference image."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
     grid = PixelGrid.centred(2207, 1651, 0.01)
     speckle = Speckle(SpeckleSpec(), grid.shape)
     image = speckle.image()
@@ -75,6 +118,9 @@ def main() -> None:
     mapping: dict[str, Work] = {
         "inverse mapping": lambda: locate(mesh.nodes + u, mesh.cells, mesh.element, grid),
         "two nodal fields": lambda: interpolate(located, mesh.cells, mesh.element, mesh.nodes),
+        "both at once": lambda: map_back(
+            mesh.nodes + u, mesh.cells, mesh.element, grid, mesh.nodes
+        ),
     }
     speckles: dict[str, Work] = {
         "speckle, spline of its waves (default)": lambda: speckle(row, col),
@@ -89,7 +135,11 @@ def main() -> None:
     found = in_turn(mapping | speckles | whole)
     some = np.random.default_rng(0).choice(row.size, POINTS, replace=False)
     truth = term_by_term(speckle, row[some], col[some])
-    errors = {"inverse mapping": f"{located.max_residual_px:.1e} px", "two nodal fields": "-"}
+    errors = {
+        "inverse mapping": f"{located.max_residual_px:.1e} px",
+        "two nodal fields": "-",
+        "both at once": "-",
+    }
     for name in speckles:
         errors[name] = f"{abs(found[name][0][some] - truth).max():.1e} of full scale"
     (name,) = whole
@@ -103,6 +153,8 @@ def main() -> None:
     for name, (_, seconds) in found.items():
         print(f"| {name} | {row.size / seconds / 1e6:.1f} ", end="")
         print(f"| {cubic / seconds:.2f} | {errors[name]} |")
+    print()
+    numba.set_num_threads(threads)
 
 
 if __name__ == "__main__":
