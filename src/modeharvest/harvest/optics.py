@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from modeharvest.harvest.experiment import Experiment
+import numpy as np
+
+from modeharvest.files import read_json, write_json
+from modeharvest.harvest.experiment import DistortionTable
 from modeharvest.harvest.prepare import named_files
 from modeharvest.idic.calibration import calibrate
-from modeharvest.idic.calibration_result import Calibration
+from modeharvest.idic.calibration_result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion import PolynomialDistortion
 from modeharvest.imaging.distortion_files import read_distortion, write_distortion
 from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.photographs import read_photograph
 from modeharvest.progress import Progress, silent
+
+_ARRAYS = ("shifts", "shifts_sd", "angles", "angles_sd", "matches", "covariance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +38,37 @@ class Optics:
     calibration: Calibration | None = None
 
 
-def find_optics(
-    experiment: Experiment, base: Path, path: Path, progress: Progress = silent
-) -> Optics:
-    """Read or calibrate the distortion; what was calibrated is left in ``path`` (JSON).
+def calibrate_lens(
+    table: DistortionTable, base: Path, folder: Path, progress: Progress = silent
+) -> None:
+    """Calibrate from the images of a target; leaves ``distortion.json``, ``calibration.json``.
 
     Raises
     ------
     InputError
-        If a file can't be used, or the calibration images don't determine the distortion.
+        If a file can't be used, or the images don't determine the distortion.
     """
-    table = experiment.distortion
-    if table.file:
-        return Optics(read_distortion(base / table.file))
-    if not table.calibration:
-        return Optics()
     images = [read_photograph(file).image for file in named_files(base, table.calibration)]
     shifts = [(row, col) for col, row in table.shifts] or None
-    calibration = calibrate(images, shifts, progress=progress)
-    write_distortion(path, calibration.distortion)
-    return Optics(calibration.distortion, calibration)
+    found = calibrate(images, shifts, progress=progress)
+    write_distortion(folder / "distortion.json", found.distortion)
+    content: dict[str, Any] = {name: getattr(found, name).tolist() for name in _ARRAYS}
+    content["trials"] = [asdict(trial) for trial in found.trials]
+    content |= {"noise_sd": found.noise_sd, "fixed": found.fixed, "sentences": found.sentences}
+    write_json(folder / "calibration.json", content)
+
+
+def calibrated_lens(folder: Path) -> Optics:
+    """What :func:`calibrate_lens` left."""
+    distortion = read_distortion(folder / "distortion.json")
+    assert isinstance(distortion, PolynomialDistortion)  # that is what is calibrated
+    content = read_json(folder / "calibration.json")
+    calibration = Calibration(
+        distortion=distortion,
+        trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
+        noise_sd=float(content["noise_sd"]),
+        fixed=int(content["fixed"]),
+        sentences=tuple(content["sentences"]),
+        **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
+    )
+    return Optics(distortion, calibration)

@@ -2,7 +2,7 @@
 
 ::
 
-    distortion.json                     optics      S, if it is calibrated
+    distortion.json  calibration.json   optics      S, if it is calibrated, and how
     prepared/                           prepare     photographs without distortion, masks
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
@@ -20,19 +20,21 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest import __version__
+from modeharvest.case_file import plain
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, require_writable, write_json
 from modeharvest.harvest.experiment import Experiment, read_experiment
 from modeharvest.harvest.geometry import Geometry, find_geometry
 from modeharvest.harvest.local import local_field
 from modeharvest.harvest.measure import Measured, Pair, measure
-from modeharvest.harvest.optics import Optics, find_optics
+from modeharvest.harvest.optics import Optics, calibrate_lens, calibrated_lens
 from modeharvest.harvest.prepare import RECORD, Prepared, named_files, prepare
 from modeharvest.harvest.told import harvest_of
 from modeharvest.idic.field_files import read_field, write_field
 from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.result import Result
+from modeharvest.imaging.distortion_files import read_distortion
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
 from modeharvest.validation.harvest_report import write_harvest_report
@@ -71,10 +73,22 @@ class Harvesting:
 
     @cached_property
     def optics(self) -> Optics:
-        """The lens's distortion, calibrated if need be; leaves ``distortion.json``."""
-        return find_optics(
-            self.experiment, self.base, self.folder / "distortion.json", self.progress
+        """The lens; a calibration leaves ``distortion.json`` and ``calibration.json``."""
+        table = self.experiment.distortion
+        if table.file:
+            return Optics(read_distortion(self.base / table.file))
+        if not table.calibration:
+            return Optics()
+        files = named_files(self.base, table.calibration, unique=False)
+        key = digest([plain(table), [file_digest(path) for path in files], __version__])
+        self.stages.do(
+            "optics",
+            key,
+            lambda: calibrate_lens(table, self.base, self.folder, self.progress),
+            self.folder / "distortion.json",
+            self.folder / "calibration.json",
         )
+        return calibrated_lens(self.folder)
 
     def prepared(self) -> Prepared:
         """Make the photographs ready; leaves ``prepared/``."""

@@ -93,7 +93,9 @@ def compare(
         progress(k, len(results), "compare with the truth")
         strain = _strain_of(name, images.strains)
         true = images.truth(strain).displacement
-        inside = np.isfinite(true).all(axis=-1)  # the images' own masks are as the lens shows them
+        inside = np.asarray(
+            np.isfinite(true).all(axis=-1)
+        )  # the images' own masks are as the lens shows them
         result = measured.result
         best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
         frames[name] = FrameTruth(true, best)
