@@ -87,10 +87,8 @@ def growth(mesh: Mesh, u: FloatArray) -> None:
         peak = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
         pixels, least = shown.mask.size, min(seconds)
         print(f"| {pixels / 1e6:.1f} | {shown.mask.sum() / 1e6:.1f} | {least:.2f} ", end="")
-        print(
-            f"| {1e9 * least / pixels:.1f} | {f'{peak / shown.image.nbytes:.2f}' if peak else '-'} |",
-            flush=True,
-        )
+        memory = f"{peak / shown.image.nbytes:.2f}" if peak else "-"
+        print(f"| {1e9 * least / pixels:.1f} | {memory} |", flush=True)
 
 
 def main() -> None:
