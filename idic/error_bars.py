@@ -4,8 +4,11 @@ Linear propagation of the unknowns' covariance, at any positions. Two causes are
 
 * the images' noise, from :meth:`modeharvest.idic.result.Result.covariance`;
 * what the ansatz leaves over (w): its residual pushes the unknowns about, cell by cell. Taking
-  the cells' pushes for independent gives the covariance M⁻¹ (Σ_b g_b g_bᵀ) M⁻¹ with
+  the cells' pushes for independent gives the covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ with
   g_b = Σ_{x in b} Jᵀr, the "sandwich" of robust statistics with one block for a unit cell.
+
+How far a push moves the unknowns is a matter of the cost's curvature H. Gauss and Newton's JᵀJ is
+that without residual; with a large w the cost is softer, and the same noise does more.
 
 Sources: G. Besnard, F. Hild, S. Roux, Exp. Mech. 46 (2006), doi 10.1007/s11340-006-9824-8 (noise);
 H. White, Econometrica 48 (1980), doi 10.2307/1912934 (sandwich).
@@ -123,7 +126,8 @@ def leftover_covariance(
         If there are fewer than eight blocks.
     """
     blocks = _blocks(result, mask, block)
-    return _sandwich(result, _pushes(blocks, result, reference, deformed, order))
+    pushes = _pushes(blocks, result, reference, deformed, order)
+    return _sandwich(softness(result, reference, deformed, mask, order), pushes)
 
 
 def noise_covariance(
@@ -157,7 +161,51 @@ def noise_covariance(
         small_f, small_g = (_SMALL * np.asarray(n, dtype=np.float32) for n in (in_f, in_g))
         pushed = _pushes(blocks, result, f + small_f, g + small_g, order)
         examples.append((pushed - quiet) / _SMALL)
-    return _sandwich(result, np.vstack(examples)) / len(examples)
+    soft = softness(result, f, g, mask, order)
+    return _sandwich(soft, np.vstack(examples)) / len(examples)
+
+
+def softness(
+    result: Result,
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    mask: NDArray[np.bool_],
+    order: int = 5,
+) -> FloatArray:
+    """(n, n) inverse of the cost's own curvature H at a result; infinite where M⁻¹ is.
+
+    H by central differences of the gradient, from every fourth row of pixels.
+
+    Parameters
+    ----------
+    result, reference, deformed, mask, order
+        As for :func:`leftover_covariance`.
+    """
+    some = np.zeros_like(mask)
+    some[::_EVERY] = mask[::_EVERY]
+    assembly = Assembly(result.ansatz, result.grid, some)
+    f = np.ascontiguousarray(reference, dtype=np.float32)
+    g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
+    kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
+    matrix = np.linalg.inv(result.inverse[np.ix_(kept, kept)])
+    # Steps that move the image by about _STEP_PX: rms grey levels over the rms gradient.
+    gradient = np.sqrt(np.trace(matrix[:2, :2]) / max(1, result.pixels)) * result.grid.pixel_size
+    steps = _STEP_PX * gradient / np.sqrt(np.diag(matrix) / max(1, result.pixels))
+
+    def at(number: int, step: float) -> FloatArray:
+        a = result.unknowns.copy()
+        a[kept[number]] += step
+        return np.asarray(assembly.images(a, f, g, False).gradient[kept])
+
+    columns = [(at(k, h) - at(k, -h)) / (2.0 * h) for k, h in enumerate(steps)]
+    share = some.sum() / max(1, mask.sum())
+    curvature = 0.5 * (np.array(columns) + np.array(columns).T) / share
+    found = result.inverse.copy()
+    found[np.ix_(kept, kept)] = np.linalg.inv(curvature)
+    return found
+
+
+_EVERY, _STEP_PX = 4, 0.02
 
 
 _SMALL = np.float32(0.05)
@@ -193,10 +241,10 @@ def _pushes(
     return np.array([b.images(result.unknowns, f, g, False).gradient for b in blocks])
 
 
-def _sandwich(result: Result, pushes: FloatArray) -> FloatArray:
-    """M⁻¹ (Σ g gᵀ) M⁻¹; infinite for unknowns that the images say nothing about."""
-    lost = np.isinf(np.diag(result.inverse))
-    half = pushes @ np.where(lost[:, None] | lost[None, :], 0.0, result.inverse)
+def _sandwich(soft: FloatArray, pushes: FloatArray) -> FloatArray:
+    """H⁻¹ (Σ g gᵀ) H⁻¹; infinite for unknowns that the images say nothing about."""
+    lost = np.isinf(np.diag(soft))
+    half = pushes @ np.where(lost[:, None] | lost[None, :], 0.0, soft)
     covariance = half.T @ half
     covariance[lost, lost] = np.inf
     return np.asarray(covariance)
