@@ -12,7 +12,7 @@ Workers are processes of dask.distributed: of this machine, or of any scheduler 
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import itertools
 import time
 import traceback
@@ -61,6 +61,14 @@ class Workers:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise InputError(f"expected at least 1 worker, got {self.count}")
+        from dask.utils import parse_bytes
+
+        try:
+            parse_bytes(self.memory)
+        except (ValueError, TypeError) as error:
+            raise InputError(
+                f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}"
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -108,6 +116,8 @@ class Campaign:
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``.
 
+        And, where pyarrow is there, as ``table.parquet``. Lists are left in the cases' files.
+
         Parameters
         ----------
         workers
@@ -130,8 +140,7 @@ class Campaign:
                     done += 1
                     progress(done, len(self.cases), "campaign")
         table = self.table()
-        with atomic(self.folder / "table.csv") as temporary:
-            table.to_csv(temporary, index=False)
+        _write(table, self.folder)
         return table
 
     def table(self) -> pd.DataFrame:
@@ -222,6 +231,17 @@ def _store(
 ) -> None:
     content = {"version": __version__, "case": dict(case), "seconds": seconds, "error": error}
     write_json(path, {**content, "result": result})
+
+
+def _write(table: pd.DataFrame, folder: Path) -> None:
+    """Leave the table for others to read."""
+    lists = [name for name in table if table[name].map(lambda v: isinstance(v, list)).any()]
+    plain = table.drop(columns=lists)
+    with atomic(folder / "table.csv") as temporary:
+        plain.to_csv(temporary, index=False)
+    if importlib.util.find_spec("pyarrow"):
+        with atomic(folder / "table.parquet") as temporary:
+            plain.to_parquet(temporary, index=False)
 
 
 def _record(path: Path) -> dict[str, Any]:

@@ -36,6 +36,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+benchmark_app = typer.Typer(
+    help="Image sets for any DIC code, whose truth is kept apart.", no_args_is_help=True
+)
+app.add_typer(benchmark_app, name="benchmark")
 _errors = Console(stderr=True)
 
 CaseName = Annotated[
@@ -127,6 +131,44 @@ def harvest(
 
 
 @app.command()
+def study(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY", help="robustness, noise or systematic; or a TOML file of your own."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for everything the study leaves.", metavar="DIR")
+    ],
+    workers: Annotated[
+        int | None, typer.Option(help="Processes on this machine; 2 by default.", metavar="N")
+    ] = None,
+    memory: Annotated[
+        str, typer.Option(help="Most that each of them may take.", metavar="BYTES")
+    ] = "4GiB",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="A dask scheduler instead, e.g. tcp://host:8786.", metavar="ADDRESS"),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer cases, larger pixels: a first look.")
+    ] = False,
+    solution: SolutionFile = None,
+) -> None:
+    """Study how good the measurement is: many cases, run by several processes.
+
+    Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
+    interruption: finished cases are not repeated.
+    """
+    from modeharvest.studies import terminal
+
+    with _bars() as bars:
+        summary = terminal.run(name, out, workers, memory, scheduler, quick, solution, bars)
+    terminal.print_study(summary, out)
+
+
+@app.command()
 def fem(case: CaseName, out: OutFolder) -> None:
     """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
 
@@ -167,6 +209,71 @@ def correlate(case: CaseName, out: OutFolder) -> None:
 def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
     _print_summary(_with_bars(case, out, solution, lambda stages: stages.validate()), out)
+
+
+@benchmark_app.command("make")
+def benchmark_make(
+    case: CaseName,
+    out: Annotated[Path, typer.Option("--out", help="The public folder.", metavar="DIR")],
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="Folder for the truth [DIR-truth].", metavar="DIR"),
+    ] = None,
+    solution: SolutionFile = None,
+) -> None:
+    """Make a public set of images, and apart from it the truth to score fields with.
+
+    The public folder holds reference.tif, deformed_*.tif, mask.tif, benchmark.json and README.md,
+    and nothing that gives the displacements away.
+    """
+    checked = read_case(case)
+    from modeharvest.scoring import make_benchmark, truth_folder
+
+    with _bars() as bars:
+        info = make_benchmark(checked, out, truth, solution, bars)
+    print(f"benchmark {info['id']}: {len(info['deformed'])} deformed images in {out}")
+    print(f"truth, not to be given away: {truth or truth_folder(out)}")
+
+
+@app.command("score")
+def score_fields(
+    fields: Annotated[
+        list[Path],
+        typer.Argument(metavar="FIELD...", help="CSV, NPZ, HDF5, MAT or VTK files of any code."),
+    ],
+    truth: Annotated[Path, typer.Option("--truth", help="The truth's folder.", metavar="DIR")],
+    strain: Annotated[float, typer.Option("--strain", help="Of the image that was measured.")],
+    out: OutFolder,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option("--unit", help="px or mm; 'file': as its columns' names say.", metavar="UNIT"),
+    ] = None,
+    y_axis: Annotated[
+        list[str] | None,
+        typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
+    ] = None,
+    first_pixel: Annotated[
+        list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
+    ] = None,
+) -> None:
+    """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
+
+    --unit, --y-axis and --first-pixel count for all fields, or are given once for each, in order.
+    Leaves report.html, scores.json and scores.csv in DIR.
+    """
+    from modeharvest import scoring
+
+    declared = scoring.declarations(fields, name, unit, y_axis, first_pixel, column)
+    with _bars() as bars:
+        done = scoring.grade(declared, truth, strain, out, progress=bars)
+    scoring.print_grading(done, out)
 
 
 @app.command()

@@ -3,36 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from modeharvest.errors import InputError
-from modeharvest.progress import Progress
+from modeharvest.idic.setup import Identification
+from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
-from modeharvest.validation.studies.study import Findings, Plot
+from modeharvest.validation.studies import robustness_findings as told
+from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Scene, Subject
-from modeharvest.validation.style import BLUE, GOLD, GREEN, RED, figure, style
 
 FloatArray = NDArray[np.float64]
 
 EVERY = 4
 """Displacements are compared at every fourth pixel: they are smooth."""
-SAME_PX = 0.01
-"""Ends nearer than this, rms, are the same minimum [px]."""
-PAPER = {
-    "success": 0.98,
-    "mean_epsilon_percent": 0.86,
-    "mean_epsilon_without_outliers_percent": 0.45,
-}
-OUTLIER_PERCENT = 1.5
-"""Above this epsilon the paper calls a result erroneous."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +33,7 @@ class Robustness:
     Parameters
     ----------
     strain
-        Of the images [-].
+        Of the deformed image [-].
     starts, radius
         Number of starts whose mode parameters are perturbed by up to ``radius``: a share of 1 for
         a1 ... a5, of the unit cell for the two phases. The paper: 100 and 0.1.
@@ -52,6 +43,11 @@ class Robustness:
         And starts whose v0 has the applied strain times 1 plus these, with the mode as it is.
     seed
         Of the perturbations.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range, or one comes twice.
     """
 
     strain: float = 0.128
@@ -63,23 +59,49 @@ class Robustness:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.starts < 1 or self.per_radius < 0:
+        if self.starts < 1 or self.per_radius < 0 or self.seed < 0:
             raise InputError(
-                f"study: expected starts >= 1 and per_radius >= 0, got {self.starts} and "
-                f"{self.per_radius}"
+                "study: expected starts of 1 or more, per_radius and seed of 0 or more, got "
+                f"{self.starts}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
-            raise InputError(f"study: expected radii in (0, 1], got {self.radius}, {self.radii}")
+            raise InputError(
+                f"study: expected radii above 0 and at most 1, got {self.radius} and "
+                f"{list(self.radii)}"
+            )
+        if self.radius in self.radii:
+            raise InputError(
+                f"study: expected radii other than radius = {self.radius}, which has its own "
+                f"starts, got {list(self.radii)}"
+            )
+        require_different("radii", self.radii)
+        require_different("strain_errors", self.strain_errors)
 
     @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
         return f"{__name__}:one_start"
 
-    def prepare(self, subject: Subject, folder: Path, progress: Progress) -> tuple[Case, ...]:
+    @property
+    def seeds(self) -> str:
+        """Of the perturbations."""
+        return f"seed {self.seed} of the perturbations"
+
+    def require(self, correlation: Identification) -> None:
+        """A mode that is held has no start."""
+        require_mode(correlation)
+
+    def quick(self) -> Self:
+        """A fifth of the starts."""
+        return replace(self, starts=-(-self.starts // 5), per_radius=-(-self.per_radius // 5))
+
+    def prepare(
+        self, subject: Subject, folder: Path, progress: Progress = silent
+    ) -> tuple[Case, ...]:
         """Make the images; the cases are radius, number of the start and seed."""
-        name = subject.images(self.strain, folder, progress=progress)
-        base = {"images": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
+        name = subject.describe(folder, self.strain)
+        Scene.open(folder, name, progress)
+        base = {"subject": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
                 "seed": self.seed}  # fmt: skip
         cases = [{**base, "start": k} for k in range(self.starts)]
         for radius in self.radii:
@@ -87,36 +109,48 @@ class Robustness:
         cases += [{**base, "radius": 0.0, "strain_error": e} for e in self.strain_errors]
         return tuple(cases)
 
-    def findings(self, table: pd.DataFrame) -> Findings:
-        """Success, epsilon and the honest distance, with the basin's picture."""
-        ran = table[table["error"] == ""]
-        asked = ran[(ran["radius"] == self.radius) & (ran["strain_error"] == 0.0)]
-        numbers = _numbers(asked, self)
-        return Findings(
-            numbers=numbers,
-            sentences=_sentences(numbers, asked, self),
-            plots=(_histogram(asked, self), _basin(ran, self)),
-            tables={"Basin of convergence": _by_radius(ran), "Start of v0": _by_strain(ran)},
-        )
+    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
+        """Success, epsilon and the honest distance, and the basin's picture."""
+        return told.findings(table, self.radius, self.seeds)
 
 
 def one_start(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Correlate from one perturbed start, and compare with the standard one's end."""
-    scene = Scene.open(folder, case["images"])
-    result = scene.correlate(_perturbed(scene, case))
-    home, size = _home(folder, case["images"])
+    """Correlate from one perturbed start, and compare with the standard one's end.
+
+    Parameters
+    ----------
+    case
+        One of :meth:`Robustness.prepare`.
+    folder
+        Of the study.
+
+    Returns
+    -------
+    dict
+        ``distance_px``: rms length of the difference of the two displacements, the standard
+        start's and this one's; ``start_distance_px``: the same of the start itself;
+        ``epsilon_percent``: the paper's, the difference of their norms; outcome, iterations and
+        residual.
+    """
+    scene = Scene.open(folder, case["subject"])
+    home = _home(folder, case["subject"])
+    start = _perturbed(scene, case)
+    result = scene.correlate(start)
     found = _field(scene, result.unknowns)
-    norm = float(np.sqrt((found**2).sum(axis=-1).mean()))
+    size = _rms(home)
     return {
-        "distance_px": float(np.sqrt(((found - home) ** 2).sum(axis=-1).mean())),
-        "epsilon_percent": 100.0 * abs(size - norm) / size,
+        "distance_px": _rms(found - home),
+        "start_distance_px": _rms(_field(scene, start) - home),
+        "epsilon_percent": 100.0 * abs(size - _rms(found)) / size,
         "outcome": result.outcome.value,
-        "iterations": len(result.history),
+        "iterations": result.iterations,
+        "all_iterations": len(result.history),
         "residual": result.residual_rms,
     }
 
 
 def _perturbed(scene: Scene, case: Mapping[str, Any]) -> FloatArray:
+    """The start of a case; the same directions for every radius."""
     ansatz = scene.ansatz
     start = scene.how.start(ansatz, scene.strain * (1.0 + case["strain_error"]))
     rng = np.random.default_rng([case["seed"], case["start"]])
@@ -133,113 +167,13 @@ def _field(scene: Scene, unknowns: FloatArray) -> FloatArray:
     return np.asarray(u[scene.mask()[::EVERY, ::EVERY]] / grid.pixel_size)
 
 
+def _rms(field: FloatArray) -> float:
+    """Rms length of (points, 2) vectors."""
+    return float(np.sqrt((field**2).sum(axis=-1).mean()))
+
+
 @lru_cache(maxsize=1)
-def _home(folder: Path, name: str) -> tuple[FloatArray, float]:
-    """Where the standard start ends, and the rms length of that displacement [px]."""
+def _home(folder: Path, name: str) -> FloatArray:
+    """(points, 2) displacement that the standard start ends with [px]; once in each worker."""
     scene = Scene.open(folder, name)
-    field = _field(scene, scene.correlate().unknowns)
-    return field, float(np.sqrt((field**2).sum(axis=-1).mean()))
-
-
-def _same(table: pd.DataFrame) -> pd.Series:
-    return table["distance_px"] < SAME_PX
-
-
-def _numbers(asked: pd.DataFrame, study: Robustness) -> dict[str, Any]:
-    good, n = int(_same(asked).sum()), len(asked)
-    interval = binomtest(good, n).proportion_ci(0.95, method="wilson") if n else (np.nan, np.nan)
-    epsilon = asked["epsilon_percent"]
-    outliers = epsilon > OUTLIER_PERCENT
-    trapped = asked[~_same(asked)]
-    return {
-        "starts": n,
-        "radius": study.radius,
-        "same_minimum": good,
-        "success": good / n if n else float("nan"),
-        "success_interval_95": [float(v) for v in interval],
-        "mean_epsilon_percent": float(epsilon.mean()),
-        "mean_epsilon_without_outliers_percent": float(epsilon[~outliers].mean()),
-        "outliers": int(outliers.sum()),
-        "largest_distance_px": float(asked["distance_px"].max()),
-        "not_arrived_but_called_converged": int((trapped["outcome"] == "converged").sum()),
-        "paper": PAPER,
-    }
-
-
-def _sentences(
-    numbers: Mapping[str, Any], asked: pd.DataFrame, study: Robustness
-) -> tuple[str, ...]:
-    low, high = numbers["success_interval_95"]
-    return (
-        f"{numbers['same_minimum']} of {numbers['starts']} starts with mode parameters up to "
-        f"{100 * study.radius:g} % off end in the standard start's minimum (within {SAME_PX} px "
-        f"rms): {100 * numbers['success']:.1f} %, 95 % interval {100 * low:.1f} to "
-        f"{100 * high:.1f} %. The paper: {100 * PAPER['success']:.0f} of 100.",
-        f"The paper's epsilon, the relative difference of the displacement's norms, is "
-        f"{numbers['mean_epsilon_percent']:.2g} % on average (the paper: "
-        f"{PAPER['mean_epsilon_percent']} %); without outliers above {OUTLIER_PERCENT} % "
-        f"{numbers['mean_epsilon_without_outliers_percent']:.2g} % "
-        f"({PAPER['mean_epsilon_without_outliers_percent']} %).",
-        "A difference of norms can vanish for fields that differ; the norm of the difference is "
-        f"{numbers['largest_distance_px']:.2g} px rms at most.",
-    )
-
-
-def _by_radius(ran: pd.DataFrame) -> pd.DataFrame:
-    moved = ran[ran["radius"] > 0]
-    rows = []
-    for radius, part in moved.groupby("radius"):
-        good, n = int(_same(part).sum()), len(part)
-        low, high = binomtest(good, n).proportion_ci(0.95, method="wilson")
-        told = part.loc[~_same(part), "outcome"] != "converged"
-        rows.append({
-            "perturbed by up to [%]": 100 * radius, "starts": n, "same minimum": good,
-            "success [%]": 100 * good / n, "95 % from": 100 * low, "to": 100 * high,
-            "others recognised": f"{int(told.sum())} of {n - good}",
-            "mean iterations": part["iterations"].mean(),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def _by_strain(ran: pd.DataFrame) -> pd.DataFrame:
-    part = ran[ran["radius"] == 0]
-    return pd.DataFrame({
-        "strain of the start, off by [%]": 100 * part["strain_error"],
-        "distance from the standard end [px rms]": part["distance_px"],
-        "outcome": part["outcome"],
-        "iterations": part["iterations"],
-    })  # fmt: skip
-
-
-def _histogram(asked: pd.DataFrame, study: Robustness) -> Plot:
-    with style():
-        drawn = figure(4.6, 2.6)
-        axes = drawn.add_subplot()
-        values = np.maximum(asked["distance_px"].to_numpy(), 1e-12)
-        low, high = np.floor(np.log10(values.min())), np.ceil(np.log10(max(values.max(), 1.0)))
-        axes.hist(values, bins=np.logspace(low, high, 40).tolist(), color=BLUE)
-        axes.axvline(SAME_PX, color=GOLD, linestyle="--", linewidth=1)
-        axes.set_xscale("log")
-        axes.set_xlabel("distance from the standard start's displacement [px rms]")
-        axes.set_ylabel("starts")
-    caption = (
-        f"{len(asked)} starts, up to {100 * study.radius:g} % off, seed {study.seed}. Dashed: "
-        "nearer ends count as the same minimum."
-    )
-    return Plot("distances", "Where the starts end", drawn, caption)
-
-
-def _basin(ran: pd.DataFrame, study: Robustness) -> Plot:
-    rows = _by_radius(ran)
-    with style():
-        drawn = figure(4.6, 2.6)
-        axes = drawn.add_subplot()
-        x, y = rows["perturbed by up to [%]"], rows["success [%]"]
-        spread = np.clip([y - rows["95 % from"], rows["to"] - y], 0.0, None)
-        axes.errorbar(x, y, yerr=spread, color=GREEN, marker="o", markersize=3, capsize=2)
-        axes.axhline(100 * PAPER["success"], color=RED, linestyle=":", linewidth=1)
-        axes.set_ylim(0, 104)
-        axes.set_xlabel("mode parameters off by up to [%]")
-        axes.set_ylabel("same minimum [%]")
-    caption = f"95 % intervals; seed {study.seed}. Dotted: the paper's 98 % at 10 %."
-    return Plot("basin", "Basin of convergence", drawn, caption)
+    return _field(scene, scene.correlate().unknowns)

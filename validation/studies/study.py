@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import pandas as pd
 from matplotlib.figure import Figure
 
+from modeharvest.errors import InputError
+from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies.subject import Subject
@@ -27,12 +29,33 @@ class Plot:
         The figure, in the style of :mod:`modeharvest.validation.style`.
     caption
         What is to be seen.
+    wide
+        Whether it needs the whole width of the page.
     """
 
     name: str
     title: str
     drawn: Figure
     caption: str = ""
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class KeyNumber:
+    """One of the few numbers that a study is about.
+
+    Parameters
+    ----------
+    name, value, unit
+        What it is, its value as a reader wants it, and its unit (may be empty).
+    remark
+        What to compare it with.
+    """
+
+    name: str
+    value: str
+    unit: str
+    remark: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +68,8 @@ class Findings:
         The study's results as plain values, with their units in the names.
     sentences
         The same in words, the most important first.
+    keys
+        Up to six numbers to begin with.
     plots
         Pictures.
     tables
@@ -53,16 +78,33 @@ class Findings:
 
     numbers: Mapping[str, Any]
     sentences: tuple[str, ...]
+    keys: tuple[KeyNumber, ...] = ()
     plots: tuple[Plot, ...] = ()
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
 
 class Study(Protocol):
-    """A question, as options in a frozen dataclass."""
+    """A question, as options in a frozen dataclass.
+
+    One's own needs these five and a module-level function for one case: see docs/studies.md.
+    """
+
+    strain: float
+    """Of the deformed image [-]."""
 
     @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
+
+    @property
+    def seeds(self) -> str:
+        """The seeds of all that is random, in words, for the report."""
+
+    def require(self, correlation: Identification) -> None:
+        """Raise InputError if the correlation contradicts the study."""
+
+    def quick(self) -> Self:
+        """The same question with fewer cases: a first look."""
 
     def prepare(self, subject: Subject, folder: Path, progress: Progress) -> tuple[Case, ...]:
         """Make what the cases share (images) in ``folder``; returns the cases.
@@ -70,5 +112,20 @@ class Study(Protocol):
         The random choices of a case follow from a seed that it holds.
         """
 
-    def findings(self, table: pd.DataFrame) -> Findings:
-        """Read the table of all cases; those that failed have an ``error``."""
+    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
+        """Read the table of all cases; those that failed have an ``error``, and no result."""
+
+
+def require_mode(correlation: Identification) -> None:
+    """Raise InputError where the mode is held: nothing of it would be measured."""
+    if correlation.hold_mode:
+        raise InputError(
+            "study: expected correlation.hold_mode = false, got true: nothing of the mode would "
+            "be found"
+        )
+
+
+def require_different(name: str, values: tuple[Any, ...]) -> None:
+    """Raise InputError if a value comes twice."""
+    if len(set(values)) < len(values):
+        raise InputError(f"study: expected {name} that differ, got {list(values)}")

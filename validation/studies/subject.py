@@ -1,8 +1,16 @@
-"""What a study is about: a specimen's exact displacements, how it is imaged and correlated."""
+"""What studies measure: pairs of virtual images, described once, made once, opened by workers.
+
+In a study's folder::
+
+    solution.h5            the exact displacements
+    subjects/NAME.json     a pair, how it is imaged and how it is correlated; NAME is its digest
+    images/KEY/            the images, under the digest of all that they depend on
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shutil
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,17 +28,22 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
-from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import digest
 
 FloatArray = NDArray[np.float64]
+Images = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+_SPEC = TypeAdapter(ImagingSpec)
+PAPERS_TAPER = 0.5
+"""Width over which a mode fades out beside the cellular part [unit cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A simulated experiment, an imaging spec and an identification.
+    """A simulated experiment, and how it is imaged and correlated unless a study says otherwise.
 
     Parameters
     ----------
@@ -49,49 +62,56 @@ class Subject:
     correlation: Identification
     solution: Solution
 
-    def images(
-        self, strain: float, folder: Path, spec: ImagingSpec | None = None,
-        progress: Progress = silent,
-    ) -> str:  # fmt: skip
-        """Make (or find) a pair of images with its truth; returns the name to find it again by.
+    def describe(
+        self,
+        folder: Path,
+        strain: float,
+        imaging: ImagingSpec | None = None,
+        correlation: Identification | None = None,
+        taper: float = PAPERS_TAPER,
+    ) -> str:
+        """Leave in ``folder`` what a worker needs to open a pair; returns the pair's name.
 
-        Beside the images it leaves all that a worker needs to correlate them.
+        Parameters
+        ----------
+        folder
+            Of the study.
+        strain
+            Nominal strain of the deformed image [-].
+        imaging, correlation
+            Instead of the subject's own.
+        taper
+            Width over which the mode fades out [unit cells].
 
         Raises
         ------
         InputError
             If the solution has no snapshot at that strain.
         """
-        spec = spec or self.imaging
-        have = [s.nominal_strain for s in self.solution.snapshots]
+        have = sorted({s.nominal_strain for s in self.solution.snapshots})
         if not any(abs(strain - e) < 1e-9 for e in have):
             raise InputError(
-                f"study: expected a strain among {sorted(set(have))}, which were simulated, got "
-                f"{strain}"
+                f"study: expected a strain among {have}, which the solution has, got {strain}"
             )
-        how = {
-            "specimen": vars(self.experiment.specimen),
-            "correlation": vars(self.correlation),
+        spec = imaging or self.imaging
+        description = {
+            "images": image_key(self.solution, (strain,), spec)[:16],
             "strain": strain,
+            "imaging": _SPEC.dump_python(spec, mode="json"),
+            "specimen": vars(self.experiment.specimen),
+            "correlation": vars(correlation or self.correlation),
+            "taper": taper,
         }
-        adapter = TypeAdapter(ImagingSpec)
-        name = digest([how, adapter.dump_python(spec, mode="json"), _key(self.solution, strain)])[
-            :16
-        ]
-        make_images(self.solution, (strain,), spec, folder / "images" / name, progress)
-        write_json(folder / "images" / name / "subject.json", how)
+        name = digest(description)[:16]
+        if not (folder / "solution.h5").is_file():
+            self.solution.write(folder / "solution.h5")
+        write_json(folder / "subjects" / f"{name}.json", description)
         return name
-
-
-def _key(solution: Solution, strain: float) -> list[Any]:
-    """Numbers that tell one solution from another."""
-    u = solution.at(strain).displacement
-    return [len(u), float(np.abs(u).sum()), float((u * u).sum())]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A pair of images in memory, and how to correlate it: what a worker keeps between cases.
+    """A pair of images and how to correlate it: what a worker keeps between cases.
 
     Parameters
     ----------
@@ -103,34 +123,59 @@ class Scene:
         Of the images.
     how
         The correlation.
+    taper
+        Width over which the mode fades out [unit cells].
     """
 
     images: ImageSet
     strain: float
     specimen: Specimen
     how: Identification
+    taper: float = PAPERS_TAPER
 
     @classmethod
-    def open(cls, folder: Path, name: str) -> Scene:
-        """The pair that :meth:`Subject.images` made; read once in each process."""
-        return _opened(folder / "images" / name)
+    def open(cls, folder: Path, name: str, progress: Progress = silent) -> Scene:
+        """The pair that :meth:`Subject.describe` described; its images are made if need be.
+
+        Where several workers open the same pair, it is to be opened once before.
+
+        Raises
+        ------
+        InputError
+            If there is no such pair, or the folder's solution is not the one it is of.
+        """
+        described = read_json(folder / "subjects" / f"{name}.json")
+        return cls(
+            _image_set(folder, described, progress),
+            float(described["strain"]),
+            Specimen(**described["specimen"]),
+            Identification(**described["correlation"]),
+            float(described["taper"]),
+        )
+
+    def discard(self) -> None:
+        """Remove the images from the disk: there are many where a study varies them."""
+        shutil.rmtree(self.images.folder, ignore_errors=True)
 
     @property
     def ansatz(self) -> Ansatz:
         """The paper's, on this specimen."""
-        return self.how.ansatz(self.specimen)
+        usual = self.how.ansatz(self.specimen)
+        (mode,) = usual.modes
+        taper = replace(mode.taper, width=self.taper * self.specimen.pitch)
+        return replace(usual, modes=(replace(mode, taper=taper),))
 
     def start(self) -> FloatArray:
         """The standard start."""
         return self.how.start(self.ansatz, self.strain)
 
-    def pair(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def pair(self) -> Images:
         """(rows, cols) f and g, as the identification wants them: exact, or a camera's."""
         return _pair(self.images.folder, self.strain, self.how.camera)
 
-    def correlate(self, start: FloatArray | None = None) -> Result:
-        """Correlate the pair; from the standard start by default."""
-        f, g = self.pair()
+    def correlate(self, start: FloatArray | None = None, pair: Images | None = None) -> Result:
+        """Correlate the pair, or a noisy one, from the standard start or another."""
+        f, g = self.pair() if pair is None else pair
         mask, deformed_mask = _masks(self.images.folder, self.strain)
         begin = self.start() if start is None else start
         grid, options = self.images.grid, self.how.options()
@@ -141,21 +186,25 @@ class Scene:
         return _masks(self.images.folder, self.strain)[0]
 
 
-@lru_cache(maxsize=2)
-def _opened(folder: Path) -> Scene:
-    how = read_json(folder / "subject.json")
-    return Scene(
-        ImageSet.read(folder),
-        float(how["strain"]),
-        Specimen(**how["specimen"]),
-        Identification(**how["correlation"]),
-    )
+def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> ImageSet:
+    """The images of a pair, made if they are not there."""
+    own = folder / "images" / described["images"]
+    try:
+        return ImageSet.read(own)
+    except InputError:
+        pass
+    solution, strain = Solution.read(folder / "solution.h5"), float(described["strain"])
+    spec = _SPEC.validate_python(described["imaging"])
+    if image_key(solution, (strain,), spec)[:16] != described["images"]:
+        raise InputError(
+            f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
+            "take another folder for another experiment"
+        )
+    return make_images(solution, (strain,), spec, own, progress)
 
 
 @lru_cache(maxsize=1)
-def _pair(
-    folder: Path, strain: float, camera: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _pair(folder: Path, strain: float, camera: bool) -> Images:
     images = ImageSet.read(folder)
     return images.reference(camera=camera), images.deformed(strain, camera=camera)
 

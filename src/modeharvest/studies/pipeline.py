@@ -1,0 +1,227 @@
+"""A study from its case to its report, in one folder that a killed run can go on in.
+
+::
+
+    solution.h5              the exact displacements of the subject
+    subjects/ images/        pairs of images, and how they are correlated
+    cases/KEY.json           one file for each case, written when it is done
+    table.csv                one row for each case (table.parquet, too, where pyarrow is there)
+    *.csv                    the report's tables
+    summary.json report.html what it tells
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from modeharvest import __version__
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.files import atomic, require_writable, write_json
+from modeharvest.pipeline import Run
+from modeharvest.progress import Progress, named, silent
+from modeharvest.studies.case import StudyCase, read_study
+from modeharvest.validation.campaign import Campaign, Workers
+from modeharvest.validation.studies.report import StudyRun, slug, write_study_report
+from modeharvest.validation.studies.study import Findings, Study
+from modeharvest.validation.studies.subject import Subject
+
+_QUESTIONS = {
+    "robustness": "A correlation searches from a start. Does it matter which? The same pair of "
+    "virtual images is correlated from starts whose mode parameters are off, and their ends are "
+    "compared with that of the standard start.",
+}
+
+
+@dataclass(frozen=True)
+class StudyPipeline:
+    """A study, the folder it leaves its files in, who works and who listens.
+
+    Parameters
+    ----------
+    case
+        What to ask of which specimen.
+    folder
+        Where; made if it does not exist.
+    workers
+        Who runs the cases.
+    progress
+        Listener.
+    solution
+        A solution file to use instead of simulating.
+    command
+        What makes it again, for the report.
+    """
+
+    case: StudyCase
+    folder: Path
+    workers: Workers = field(default_factory=Workers)
+    progress: Progress = silent
+    solution: Path | None = None
+    command: str = "modeharvest study STUDY --out DIR"
+
+    def subject(self) -> Subject:
+        """What is measured: simulated, or read from a file; leaves ``solution.h5``."""
+        case, path = self.case, self.folder / "solution.h5"
+        if self.solution is None:
+            solution = Run(case, self.folder, self.progress).fem()
+        else:
+            solution = Solution.read(self.solution)
+            solution.write(path)
+        return Subject(case.experiment, case.imaging, case.correlation, solution)
+
+    def all(self) -> dict[str, Any]:
+        """Run what is missing of the study; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If no case succeeded, the folder can't be written to, or a scheduler is not there.
+        """
+        folder, study = self.folder.resolve(), self.case.study
+        require_writable(folder)
+        clock = _Clock()
+        subject = self.subject()
+        clock.lap("solution")
+        cases = study.prepare(subject, folder, self.progress)
+        clock.lap("images")
+        campaign = Campaign(study.function, cases, folder)
+        table = campaign.run(self.workers, named(self.progress, f"study: {len(cases)} cases"))
+        clock.lap("cases")
+        if (table["error"] != "").all():
+            raise InputError(f"all {len(table)} cases failed; the first: {table['error'].iloc[0]}")
+        findings = study.findings(table, folder)
+        clock.lap("findings")
+        return self._tell(campaign, table, findings, clock.laps)
+
+    def _tell(
+        self, campaign: Campaign, table: pd.DataFrame, findings: Findings, laps: dict[str, float]
+    ) -> dict[str, Any]:
+        """Leave tables, ``summary.json`` and ``report.html``."""
+        study: Study = self.case.study
+        files = {"table.csv": "every case: its values, seconds, error, result"}
+        for title, part in findings.tables.items():
+            files[f"{slug(title)}.csv"] = title
+            with atomic(self.folder / f"{slug(title)}.csv") as temporary:
+                part.to_csv(temporary, index=False)
+        files["summary.json"] = "the findings' numbers and sentences, and the failures"
+        failed = table[table["error"] != ""]
+        others = campaign.of_other_versions()
+        summary = {
+            "title": self.case.title,
+            "kind": self.case.kind,
+            "command": self.command,
+            "seeds": study.seeds,
+            "sentences": list(findings.sentences),
+            "numbers": _plain(dict(findings.numbers)),
+            "cases": len(table),
+            "seconds_of_all_cases": float(table["seconds"].sum()),
+            "failed": [
+                {"file": campaign.path(campaign.cases[k]).name, "error": failed["error"][k]}
+                for k in failed.index
+            ],
+            "other_results_by_version": others,
+            "timings_s": laps,
+            "versions": _versions(),
+            "case": self.case.plain(),
+        }
+        notes = _notes(summary)
+        write_json(self.folder / "summary.json", summary)
+        run = StudyRun(
+            title=self.case.title or self.case.kind.capitalize(),
+            question=_QUESTIONS[self.case.kind],
+            findings=findings,
+            command=self.command,
+            seeds=study.seeds,
+            case=self.case.plain(),
+            notes=notes,
+            files=files,
+            timings=laps,
+            versions=_versions(),
+        )
+        write_study_report(self.folder / "report.html", run)
+        return summary
+
+
+def study(
+    name: str | Path | StudyCase,
+    folder: Path | str,
+    workers: Workers | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Run a study; what ``modeharvest study`` does.
+
+    Parameters
+    ----------
+    name
+        A shipped study's name, the path of a TOML file, or a StudyCase.
+    folder
+        Where to leave the files.
+    workers
+        Who runs the cases; two processes of this machine by default.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    case = name if isinstance(name, StudyCase) else read_study(name)
+    return StudyPipeline(case, Path(folder), workers or Workers(), progress).all()
+
+
+def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
+    """What to keep in mind of how the study went."""
+    said = []
+    if summary["failed"]:
+        first = summary["failed"][0]
+        said.append(
+            f"{len(summary['failed'])} of {summary['cases']} cases failed; their tracebacks are "
+            f"in cases/. The first, {first['file']}: {first['error']}"
+        )
+    for other, count in summary["other_results_by_version"].items():
+        said.append(
+            f"{count} stored results of version {other} are of other options"
+            f"{'' if other == __version__ else ' or of that other version'}: left alone, not mixed."
+        )
+    said.append(
+        "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
+        "not plane) is not in it."
+    )
+    return tuple(said)
+
+
+def _plain(value: Any) -> Any:
+    """Values as JSON knows them: NaN as null, numpy's numbers as numbers."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and value != value else value
+
+
+def _versions() -> dict[str, str]:
+    libraries = ("numpy", "scipy", "numba", "distributed")
+    return {"modeharvest": __version__} | {name: version(name) for name in libraries}
+
+
+class _Clock:
+    """Wall-clock seconds of one stage after another."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.laps[stage] = now - self._last
+        self._last = now

@@ -1,0 +1,65 @@
+"""The command ``modeharvest study``: its options, and what is printed at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from modeharvest.errors import InputError
+from modeharvest.progress import Progress
+from modeharvest.studies.case import read_study
+from modeharvest.studies.pipeline import StudyPipeline
+from modeharvest.validation.campaign import Workers
+
+
+def run(
+    name: str,
+    out: Path,
+    workers: int | None,
+    memory: str,
+    scheduler: str | None,
+    quick: bool,
+    solution: Path | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Run a study as the command line says; returns the content of ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        If options contradict each other, or the study can't be read or run.
+    """
+    if scheduler is not None and workers is not None:
+        raise InputError(
+            "expected --workers or --scheduler, got both: a scheduler has workers of its own"
+        )
+    case = read_study(name)
+    crew = Workers(2 if workers is None else workers, memory, scheduler)
+    words = ["modeharvest study", name, "--out DIR"]
+    words += ["--quick"] if quick else []
+    words += ["--solution FILE"] if solution else []
+    return StudyPipeline(
+        case.quick() if quick else case, out, crew, progress, solution, " ".join(words)
+    ).all()
+
+
+def print_study(summary: dict[str, Any], out: Path) -> None:
+    """Print a study's sentences, its failures, and the file of the report last."""
+    console = Console(highlight=False)
+    console.print(f"[bold]{escape(summary['title'])}[/bold]", soft_wrap=True)
+    for sentence in summary["sentences"]:
+        console.print(f"- {escape(sentence)}", soft_wrap=True)
+    for failure in summary["failed"]:
+        console.print(
+            f"[yellow]failed:[/yellow] cases/{failure['file']}: {escape(failure['error'])}",
+            soft_wrap=True,
+        )
+    seconds = summary["timings_s"]
+    console.print(
+        f"{summary['cases']} cases, {summary['seconds_of_all_cases']:.0f} s of work; this run "
+        f"took {sum(seconds.values()):.0f} s"
+    )
+    console.print(f"report: {out / 'report.html'}")

@@ -1,0 +1,255 @@
+"""What the table of a robustness study tells: success, epsilon, the basin of convergence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from modeharvest.validation.page import short
+from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
+from modeharvest.validation.style import BLUE, GOLD, GREEN, RED, figure, style
+
+SAME_PX = 0.01
+"""Ends nearer than this, rms, are the same minimum [px]."""
+OUTLIER_PERCENT = 1.5
+"""Above this epsilon the paper calls a result erroneous."""
+PAPER = {
+    "success": 0.98,
+    "mean_epsilon_percent": 0.86,
+    "mean_epsilon_without_outliers_percent": 0.45,
+}
+"""Section "Virtual Experiments" of the paper: 100 starts, parameters up to 10 % off."""
+
+
+def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
+    """Read the table of all starts.
+
+    Parameters
+    ----------
+    table
+        A row for each case of :func:`modeharvest.validation.studies.robustness.one_start`. One
+        that failed counts as one that did not arrive.
+    radius
+        That of the paper's question [-].
+    seeds
+        In words.
+    """
+    table = table.assign(same=table["distance_px"] < SAME_PX)
+    moved = table[table["strain_error"] == 0.0]
+    asked = moved[moved["radius"] == radius]
+    found = numbers(asked, radius)
+    basin, strains = by_radius(moved[moved["radius"] > 0.0]), by_strain(table)
+    tables = {"Basin of convergence": basin}
+    if len(strains):
+        tables["Start of v0"] = strains
+    return Findings(
+        numbers={**found, "basin": basin.to_dict("records")},
+        sentences=(*_sentences(found), *_basin_sentences(basin), *_strain_sentences(strains)),
+        keys=_keys(found),
+        plots=(_distances(asked, radius, seeds), _epsilons(asked, seeds), _basin(basin, seeds)),
+        tables=tables,
+    )
+
+
+def numbers(asked: pd.DataFrame, radius: float) -> dict[str, Any]:
+    """The paper's numbers and the honest ones, of the starts within one radius."""
+    good, n = int(asked["same"].sum()), len(asked)
+    epsilon, arrived = asked["epsilon_percent"].dropna(), asked["same"]
+    outliers = epsilon > OUTLIER_PERCENT
+    others = asked[~arrived & (asked["error"] == "")]
+    return {
+        "starts": n,
+        "radius": radius,
+        "same_minimum": good,
+        "success": good / n,
+        "success_interval_95": list(wilson(good, n)),
+        "mean_epsilon_percent": float(epsilon.mean()),
+        "largest_epsilon_percent": float(epsilon.max()),
+        "mean_epsilon_without_outliers_percent": float(epsilon[~outliers].mean()),
+        "outliers": int(outliers.sum()),
+        "largest_distance_px": float(asked["distance_px"].max()),
+        "largest_distance_of_arrived_px": float(asked.loc[arrived, "distance_px"].max()),
+        "largest_start_distance_px": float(asked["start_distance_px"].max()),
+        "elsewhere_but_called_converged": int((others["outcome"] == "converged").sum()),
+        "failed": int((asked["error"] != "").sum()),
+        "mean_seconds": float(asked["seconds"].mean()),
+        "paper": PAPER,
+    }
+
+
+def wilson(good: int, n: int) -> tuple[float, float]:
+    """95 % confidence interval of a share, by Wilson's score.
+
+    References
+    ----------
+    E. B. Wilson, J. Am. Stat. Assoc. 22 (1927), doi 10.1080/01621459.1927.10502953.
+    """
+    low, high = binomtest(good, n).proportion_ci(0.95, method="wilson")
+    return float(low), float(high)
+
+
+def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
+    """Success against the radius of the perturbations."""
+    rows = []
+    for radius, part in moved.groupby("radius"):
+        good, n = int(part["same"].sum()), len(part)
+        low, high = wilson(good, n)
+        others = part[~part["same"]]
+        told = int((others["outcome"] != "converged").sum())
+        rows.append({
+            "off by up to [%]": 100.0 * radius,
+            "starts": n,
+            "same minimum": good,
+            "success [%]": 100.0 * good / n,
+            "95 % from": 100.0 * low,
+            "to [%]": 100.0 * high,
+            "others recognised": f"{told} of {n - good}",
+            "largest distance among the same [px]": part.loc[part["same"], "distance_px"].max(),
+            "mean iterations": part["all_iterations"].mean(),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def by_strain(table: pd.DataFrame) -> pd.DataFrame:
+    """Where starts with a wrong strain end; empty if there was none."""
+    part = table[table["strain_error"] != 0.0]
+    return pd.DataFrame({
+        "strain of the start, off by [%]": 100.0 * part["strain_error"],
+        "distance of the start [px]": part["start_distance_px"],
+        "distance of the end [px]": part["distance_px"],
+        "outcome": part["outcome"],
+        "iterations": part["all_iterations"],
+    })  # fmt: skip
+
+
+def _keys(found: Mapping[str, Any]) -> tuple[KeyNumber, ...]:
+    low, high = found["success_interval_95"]
+    return (
+        KeyNumber(
+            "starts that arrive", f"{found['same_minimum']} of {found['starts']}", "",
+            f"95 % interval {100 * low:.1f} to {100 * high:.1f} %; the paper: 98 of 100",
+        ),
+        KeyNumber(
+            "mean ε, as the paper defines it", short(found["mean_epsilon_percent"]), "%",
+            f"the paper: {PAPER['mean_epsilon_percent']} %, without two outliers "
+            f"{PAPER['mean_epsilon_without_outliers_percent']} %",
+        ),
+        KeyNumber(
+            "largest distance between ends", short(found["largest_distance_px"]), "px",
+            f"rms; starts up to {found['largest_start_distance_px']:.3g} px away",
+        ),
+    )  # fmt: skip
+
+
+def _sentences(found: Mapping[str, Any]) -> tuple[str, ...]:
+    low, high = found["success_interval_95"]
+    said = [
+        f"{found['same_minimum']} of {found['starts']} starts with mode parameters up to "
+        f"{100 * found['radius']:g} % off end in the standard start's minimum (within {SAME_PX} "
+        f"px rms): {100 * found['success']:.1f} %, 95 % interval {100 * low:.1f} to "
+        f"{100 * high:.1f} %. The paper has {100 * PAPER['success']:.0f} of 100.",
+        f"The paper's ε, the relative difference of the displacements' norms, is "
+        f"{short(found['mean_epsilon_percent'])} % on average and "
+        f"{short(found['largest_epsilon_percent'])} % at most; {found['outliers']} are outliers "
+        f"above {OUTLIER_PERCENT} %. The paper has {PAPER['mean_epsilon_percent']} % on average, "
+        f"{PAPER['mean_epsilon_without_outliers_percent']} % without two outliers.",
+        "A difference of norms can vanish for fields that differ. The norm of the difference is "
+        f"{short(found['largest_distance_px'])} px rms at most, "
+        f"{short(found['largest_distance_of_arrived_px'])} px among those that arrive.",
+        "Unlike the paper's, whose perturbation is a share of parameters that are zero there, "
+        "these starts have wrong phases too.",
+    ]
+    elsewhere = found["starts"] - found["same_minimum"] - found["failed"]
+    if elsewhere:
+        said.append(
+            f"Of the {elsewhere} that end elsewhere, "
+            f"{found['elsewhere_but_called_converged']} pass for converged; the others are "
+            "recognised."
+        )
+    if found["failed"]:
+        said.append(f"{found['failed']} failed, and count as not arrived.")
+    return tuple(said)
+
+
+def _basin_sentences(basin: pd.DataFrame) -> tuple[str, ...]:
+    """Up to where all arrive, and whether the others are recognised."""
+    full = basin["same minimum"] == basin["starts"]
+    sure = basin.loc[full.cummin(), "off by up to [%]"]
+    said = (
+        f"All starts arrive up to {sure.iloc[-1]:g} % off."
+        if len(sure)
+        else "At no radius do all starts arrive."
+    )
+    if full.all():
+        return (said,)
+    lowest = basin.loc[basin["success [%]"].idxmin()]
+    return (
+        f"{said} The fewest do at {lowest['off by up to [%]']:g} %: "
+        f"{lowest['same minimum']:.0f} of {lowest['starts']:.0f}.",
+    )
+
+
+def _strain_sentences(strains: pd.DataFrame) -> tuple[str, ...]:
+    if not len(strains):
+        return ()
+    same = strains["distance of the end [px]"] < SAME_PX
+    off = strains["strain of the start, off by [%]"]
+    told = ", ".join(f"{v:+g}" for v in off[same])
+    return (
+        f"With the strain of v0's start off by {', '.join(f'{v:+g}' for v in off)} %, "
+        f"{int(same.sum())} of {len(strains)} arrive{f' ({told} %)' if told else ''}.",
+    )
+
+
+def _distances(asked: pd.DataFrame, radius: float, seeds: str) -> Plot:
+    values = np.maximum(asked["distance_px"].dropna().to_numpy(), 1e-12)
+    with style():
+        drawn = figure(4.6, 2.6)
+        axes = drawn.add_subplot()
+        low, high = np.floor(np.log10(values.min())), np.ceil(np.log10(max(values.max(), 1.0)))
+        axes.hist(values, bins=np.logspace(low, high, 40).tolist(), color=BLUE)
+        axes.axvline(SAME_PX, color=GOLD, linestyle="--", linewidth=1)
+        axes.set(xscale="log", ylabel="starts")
+        axes.set_xlabel("distance from the standard start's displacement [px rms]")
+        drawn.tight_layout()
+    caption = (
+        f"{len(asked)} starts, up to {100 * radius:g} % off; {seeds}. Dashed: nearer ends count "
+        "as the same minimum."
+    )
+    return Plot("distances", "Where the starts end", drawn, caption)
+
+
+def _epsilons(asked: pd.DataFrame, seeds: str) -> Plot:
+    with style():
+        drawn = figure(4.6, 2.6)
+        axes = drawn.add_subplot()
+        off = np.maximum(asked["start_distance_px"], 1e-12)
+        axes.plot(off, np.maximum(asked["epsilon_percent"], 1e-14), ".", color=BLUE)
+        for level, colour in ((OUTLIER_PERCENT, RED), (PAPER["mean_epsilon_percent"], GOLD)):
+            axes.axhline(level, color=colour, linestyle=":", linewidth=1)
+        axes.set(yscale="log", xlabel="distance of the start [px rms]", ylabel="ε [%]")
+        drawn.tight_layout()
+    caption = (
+        f"The paper's ε of every start; {seeds}. Dotted: {OUTLIER_PERCENT} %, above which the "
+        f"paper calls a result erroneous, and its mean of {PAPER['mean_epsilon_percent']} %."
+    )
+    return Plot("epsilon", "The paper's error", drawn, caption)
+
+
+def _basin(rows: pd.DataFrame, seeds: str) -> Plot:
+    with style():
+        drawn = figure(4.6, 2.6)
+        axes = drawn.add_subplot()
+        x, y = rows["off by up to [%]"], rows["success [%]"]
+        spread = np.clip([y - rows["95 % from"], rows["to [%]"] - y], 0.0, None)
+        axes.errorbar(x, y, yerr=spread, color=GREEN, marker="o", markersize=3, capsize=2)
+        axes.plot(10.0, 100.0 * PAPER["success"], "x", color=RED)
+        axes.set(xlim=(0.0, None), ylim=(0.0, 104.0), ylabel="same minimum [%]")
+        axes.set_xlabel("mode parameters off by up to [%]")
+        drawn.tight_layout()
+    caption = f"Bars: 95 % intervals; {seeds}. Cross: the paper's 98 of 100 at 10 %."
+    return Plot("basin", "Basin of convergence", drawn, caption)
