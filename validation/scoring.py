@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ BoolArray = NDArray[np.bool_]
 _OTHER_UNIT = 0.05
 """A ratio of measured to true displacement this near to the pixel size is one of units."""
 PERCENTILES = (50, 90, 95, 99)
+ENOUGH_COVERED = 0.5
+"""Share of the material that a field has to cover to be ranked by its error alone [-]."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,12 @@ class Score:
         For each of :data:`modeharvest.validation.regions.REGIONS`.
     off_material
         Points that lie in holes or outside the specimen: not graded.
+    spacing_px
+        Of its points [px].
+    near
+        (rows, cols) True on material within one spacing of a valid point.
     covered
-        Share of the material within one spacing of a valid point [-].
+        Share of the material that is near [-].
     x, y, error_px
         (m,), (m,) [mm] and (m, 2) [px] of the valid points on material.
     """
@@ -93,10 +99,26 @@ class Score:
     everywhere: RegionScore
     by_region: Mapping[str, RegionScore]
     off_material: int
+    spacing_px: float
+    near: BoolArray
     covered: float
     x: FloatArray
     y: FloatArray
     error_px: FloatArray
+
+    def over(self, where: BoolArray, grid: PixelGrid) -> RegionScore:
+        """The error of the measured points in a part of the image (rows, cols)."""
+        row, col = (np.rint(i).astype(int) for i in grid.to_px(self.x, self.y))
+        inside = where[row, col]
+        return RegionScore.of(self.error_px[inside], np.ones(inside.sum(), dtype=np.bool_))
+
+
+def ranked(scores: Sequence[Score]) -> list[Score]:
+    """The best first: by rms; after all others those that cover too little of the material."""
+    return sorted(
+        scores,
+        key=lambda s: (s.covered < ENOUGH_COVERED, np.nan_to_num(s.everywhere.rms_px, nan=np.inf)),
+    )
 
 
 def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: PixelGrid) -> Score:
@@ -119,15 +141,13 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
         If no point lies on the material, or the displacements are in another unit than declared.
     """
     here = _labels_at(field, labels, grid)
+    _require_on_specimen(field, labels, grid)
     on_material = (here >= 0) & np.isfinite(truth).all(axis=1)
-    if not on_material.any():
-        raise InputError(
-            f"{field.source}: expected points on the specimen, got none of {field.x.size} there; "
-            "check the field's units, its origin and the direction of its y axis"
-        )
-    _require_unit(field, truth, on_material & field.good, grid)
-    error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
     used = on_material & field.good
+    _require_unit(field, truth, used, grid)
+    error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
+    spacing_px = max(1.0, field.spacing / grid.pixel_size)
+    near = _near(field, used, spacing_px, grid) & (labels >= 0)
     return Score(
         source=field.source,
         everywhere=RegionScore.of(error[on_material], field.good[on_material]),
@@ -137,8 +157,10 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
             )
             for k, name in enumerate(REGIONS)
         },
-        off_material=int((here < 0).sum()),
-        covered=_covered(field, used, labels >= 0, grid),
+        off_material=int((~on_material).sum()),
+        spacing_px=spacing_px,
+        near=near,
+        covered=float(near.sum() / (labels >= 0).sum()),
         x=field.x[used],
         y=field.y[used],
         error_px=error[used],
@@ -154,6 +176,29 @@ def _labels_at(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> 
     found = np.full(field.x.size, -1, dtype=np.int8)
     found[inside] = labels[np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)]
     return found
+
+
+def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> None:
+    """Recognise positions in another unit, or beside the specimen."""
+    there = float((_labels_at(field, labels, grid) >= 0).mean())
+    x, y = grid.to_mm(-field.y, field.x)  # as if pixels, rows down, had been called mm
+    row, col = grid.to_px(field.x, field.y)
+    for other, words in (
+        (LocalField(x, y, field.u, field.good), "pixels declared as mm"),
+        (LocalField(col, -row, field.u, field.good), "mm declared as pixels"),
+    ):
+        share = float((_labels_at(other, labels, grid) >= 0).mean())
+        if share > 0.1 and there < 0.2 * share:
+            raise InputError(
+                f"{field.source}: expected positions in the declared unit, got {100 * there:.0f} % "
+                f"of them on the specimen, but {100 * share:.0f} % if they are {words} (a pixel is "
+                f"{grid.pixel_size} mm); declare the unit that the file is in"
+            )
+    if there == 0.0:
+        raise InputError(
+            f"{field.source}: expected points on the specimen, got none of {field.x.size} there; "
+            "check the field's units, its origin and the direction of its y axis"
+        )
 
 
 def _require_unit(field: LocalField, truth: FloatArray, used: BoolArray, grid: PixelGrid) -> None:
@@ -174,11 +219,11 @@ def _require_unit(field: LocalField, truth: FloatArray, used: BoolArray, grid: P
             )
 
 
-def _covered(field: LocalField, used: BoolArray, mask: BoolArray, grid: PixelGrid) -> float:
-    """Share of the material's pixels within one spacing of a used point [-]."""
-    spacing_px = max(1.0, field.spacing / grid.pixel_size)
+def _near(field: LocalField, used: BoolArray, spacing_px: float, grid: PixelGrid) -> BoolArray:
+    """(rows, cols) True within one spacing of a used point."""
     row, col = grid.to_px(field.x[used], field.y[used])
-    hit = np.zeros(grid.shape, dtype=np.bool_)
-    hit[np.rint(row).astype(int), np.rint(col).astype(int)] = True
-    near = ndimage.distance_transform_edt(~hit) <= spacing_px
-    return float(near[mask].mean())
+    missed = np.ones(grid.shape, dtype=np.bool_)
+    missed[np.rint(row).astype(int), np.rint(col).astype(int)] = False
+    if missed.all():
+        return ~missed
+    return np.asarray(ndimage.distance_transform_edt(missed) <= spacing_px)

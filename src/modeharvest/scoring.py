@@ -1,0 +1,267 @@
+"""Benchmarks for DIC codes: a public set of images, and grades for the fields measured on it.
+
+::
+
+    DIR/         reference.tif … benchmark.json README.md      benchmark make
+    DIR-truth/   solution.h5 images/ benchmark.json
+    graded/      report.html scores.json scores.csv            score
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from modeharvest.case import Case, TwinCase, read_case
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.files import atomic, require_writable
+from modeharvest.pipeline import Run
+from modeharvest.progress import Progress, silent
+from modeharvest.validation.benchmark_set import (
+    SOLUTION,
+    BenchmarkTruth,
+    publish,
+    require_apart,
+)
+from modeharvest.validation.regions import EDGE_PX, REGIONS, regions
+from modeharvest.validation.score_fields import Declared, read_measured
+from modeharvest.validation.score_mistakes import mistakes
+from modeharvest.validation.score_report import Grading, write_grading
+from modeharvest.validation.score_spectrum import error_spectrum
+from modeharvest.validation.scoring import PERCENTILES, Score, ranked, score
+
+__all__ = ["Declared", "declarations", "grade", "make_benchmark", "print_grading"]
+
+T = TypeVar("T")
+
+
+def make_benchmark(
+    case: str | Path | Case,
+    public: Path | str,
+    truth: Path | str | None = None,
+    solution: Path | str | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Simulate a case, image it, and part the images from their truth.
+
+    What is finished is not done again, as in every run.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a Case.
+    public
+        Folder for what anybody may have.
+    truth
+        Folder for the truth; by default beside the public one, with "-truth" after its name.
+    solution
+        Use this solution (HDF5) instead of simulating.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of the public ``benchmark.json``.
+
+    Raises
+    ------
+    InputError
+        If the case's images are distorted, or the truth would be in the public folder.
+    """
+    case, public = case if isinstance(case, Case) else read_case(case), Path(public)
+    if isinstance(case, TwinCase):
+        raise InputError(
+            "expected a case without a lens for a benchmark, got the twin of a real experiment"
+        )
+    truth = truth_folder(public) if truth is None else Path(truth)
+    require_apart(public, truth)
+    require_writable(public)
+    if solution is not None:
+        Solution.read(solution)  # says what is wrong with it
+        with atomic(truth / SOLUTION) as part:
+            shutil.copyfile(solution, part)
+    run = Run(case, truth, progress)
+    if solution is None:
+        run.fem()
+    return publish(run.image(), case.experiment.specimen, public, truth)
+
+
+def truth_folder(public: Path) -> Path:
+    """Where the truth of a public folder is by default."""
+    return public.with_name(f"{public.resolve().name}-truth")
+
+
+def grade(
+    fields: Mapping[Path, Declared] | Sequence[Path | str],
+    truth: Path | str,
+    strain: float,
+    out: Path | str,
+    edge_px: int = EDGE_PX,
+    progress: Progress = silent,
+) -> Grading:
+    """Grade displacement fields and write ``report.html``, ``scores.json`` and ``scores.csv``.
+
+    Parameters
+    ----------
+    fields
+        Their files, with what the files don't say themselves.
+    truth
+        The truth's folder.
+    strain
+        Nominal strain of the image that they were measured on [-].
+    out
+        Folder for the report.
+    edge_px
+        Material closer than this to a hole or to the outside counts as edge [px].
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If a field can't be read, is of another benchmark or in another unit than declared.
+    """
+    every = fields if isinstance(fields, Mapping) else {Path(f): Declared() for f in fields}
+    known = BenchmarkTruth.read(truth)
+    require_writable(out)
+    grid = known.grid
+    labels = regions(known.mask, grid, known.specimen, edge_px)
+    true = partial(known.displacement, strain)
+    scores: list[Score] = []
+    remarks: list[str] = []
+    for n, (path, declared) in enumerate(every.items()):
+        progress(n, len(every) + 1, f"score: {path.name}")
+        field = read_measured(path, grid, known.id, declared)
+        scores.append(score(_named_apart(field, scores), true(field.x, field.y), labels, grid))
+        remarks += mistakes(field, true, grid)
+    best_first = ranked(scores)
+    progress(len(every), len(every) + 1, "score: report")
+    spectra = {graded.source: error_spectrum(graded, grid) for graded in best_first}
+    done = Grading(known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks))
+    write_grading(out, done)
+    progress(1, 1, "score")
+    return done
+
+
+def _named_apart(field: Any, scores: Sequence[Score]) -> Any:
+    """The field; InputError if another one has its name."""
+    if any(field.source == graded.source for graded in scores):
+        raise InputError(
+            f"expected fields of different names, got {field.source} twice; give each a --name"
+        )
+    return field
+
+
+def declarations(
+    paths: Sequence[Path],
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    y_axes: Sequence[str] | None = None,
+    first_pixels: Sequence[int] | None = None,
+    columns: Sequence[str] | None = None,
+) -> dict[Path, Declared]:
+    """What a command line declares of each file.
+
+    Parameters
+    ----------
+    paths
+        The files.
+    names
+        One for each, or none.
+    units, y_axes, first_pixels
+        One for all, or one for each; "file" where the columns' names say it.
+    columns
+        "u=NAME" or "u=7", for all files.
+
+    Raises
+    ------
+    InputError
+        If there are neither one nor as many as files.
+    """
+    if len(set(paths)) < len(paths):
+        raise InputError(f"expected different files to score, got {', '.join(map(str, paths))}")
+    if names and len(names) != len(paths):
+        raise InputError(f"expected a --name for each of {len(paths)} files, got {len(names)}")
+    named = _each(names, paths, "--name")
+    in_units = _each(units, paths, "--unit")
+    axes = _each(y_axes, paths, "--y-axis")
+    first = _each(first_pixels, paths, "--first-pixel")
+    if not set(first) <= {None, 0, 1}:
+        raise InputError(f"expected --first-pixel 0 or 1, got {', '.join(map(str, first))}")
+    roles = dict(map(_column, columns or ()))
+    return {
+        path: Declared(
+            name=named[k],
+            units=None if in_units[k] == "file" else in_units[k],
+            y_axis=None if axes[k] == "file" else axes[k],
+            first_pixel=first[k] or 0,
+            columns=roles,
+        )
+        for k, path in enumerate(paths)
+    }
+
+
+def _each(given: Sequence[T] | None, paths: Sequence[Path], option: str) -> Sequence[T | None]:
+    """One value for each file."""
+    if not given:
+        return [None] * len(paths)
+    if len(given) == 1:
+        return [given[0]] * len(paths)
+    if len(given) != len(paths):
+        raise InputError(
+            f"expected {option} once, or once for each of {len(paths)} files, got {len(given)}"
+        )
+    return list(given)
+
+
+def _column(text: str) -> tuple[str, str | int]:
+    role, sign, name = text.partition("=")
+    if not sign or not name:
+        raise InputError(f"expected --column ROLE=NAME, as u=disp_x or u=3, got {text!r}")
+    return role, int(name) if name.isdigit() else name
+
+
+def print_grading(grading: Grading, out: Path | str) -> None:
+    """Print the ranked table, what is to be kept in mind, and where the report is."""
+    console = Console(highlight=False)
+    title = f"benchmark {grading.truth.id} at {100 * grading.strain:g} %; errors in px"
+    table = Table(title=title, title_justify="left")
+    for heading in ("", "field"):
+        table.add_column(heading)
+    headings = ("points", "returned", "covered", "bias x, y", "rms", "50 %", "95 %", "max",
+                *REGIONS)  # fmt: skip
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for rank, graded in enumerate(grading.scores, start=1):
+        table.add_row(str(rank), escape(graded.source), *_cells(graded))
+    console.print(table)
+    console.print("rms: per component; after 'max': rms by region; 50 and 95 %: of the lengths")
+    if len(grading.scores) > 1:
+        common = ", ".join(f"{n} {part.rms_px:.3g}" for n, part in grading.common.items())
+        share = f"{100 * grading.common_share:.0f} %"
+        console.print(f"rms on the {share} of the material that all cover: {escape(common)}")
+    for note in grading.notes:
+        console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
+    console.print(f"report: {Path(out) / 'report.html'}")
+
+
+def _cells(graded: Score) -> list[str]:
+    every = graded.everywhere
+    percentiles = dict(zip(PERCENTILES, every.percentiles_px, strict=True))
+    return [
+        str(every.points),
+        f"{100 * every.returned:.1f} %",
+        f"{100 * graded.covered:.1f} %",
+        ", ".join(f"{b:.2g}" for b in every.bias_px),
+        *(f"{v:.3g}" for v in (every.rms_px, percentiles[50], percentiles[95], every.max_px)),
+        *(f"{graded.by_region[name].rms_px:.3g}" for name in REGIONS),
+    ]

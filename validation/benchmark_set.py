@@ -1,0 +1,284 @@
+"""Images to measure, for anybody, and apart from them the truth that measurements are graded by.
+
+::
+
+    PUBLIC/reference.tif reference_8bit.tif mask.tif deformed_1280.tif deformed_1280_8bit.tif
+           benchmark.json README.md
+    TRUTH/ solution.h5 benchmark.json
+
+Nothing in the public folder tells the displacements: neither the solution nor the material, loading
+or imperfection that it could be computed from. The set's id is a digest of its files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest import __version__
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Specimen
+from modeharvest.files import atomic, read_json, write_json
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.pointwise import locate_points
+from modeharvest.validation.benchmark_words import RETURNED, readme
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+FORMAT, TRUTH_FORMAT = "modeharvest-benchmark-1", "modeharvest-benchmark-truth-1"
+SIDECAR, README, SOLUTION = "benchmark.json", "README.md", "solution.h5"
+SECRETS = ("solution*", "truth*", "images*", "stages.json", "*.h5", "*.vtu", "*.toml")
+"""What gives the truth away, or what the truth can be computed from."""
+
+
+@dataclass(frozen=True, eq=False)
+class BenchmarkTruth:
+    """The truth behind a set of images.
+
+    Parameters
+    ----------
+    folder
+        Where it is.
+    info
+        The content of its ``benchmark.json``.
+    """
+
+    folder: Path
+    info: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path | str) -> BenchmarkTruth:
+        """Open a truth folder.
+
+        Raises
+        ------
+        InputError
+            If it is none, or its solution is not the one that the images were made of.
+        """
+        folder = Path(folder)
+        if not (folder / SIDECAR).is_file():
+            raise InputError(
+                f"expected the truth of a benchmark in {folder}, found no {SIDECAR}; "
+                "'modeharvest benchmark make' leaves it beside the public folder"
+            )
+        info = read_json(folder / SIDECAR)
+        got = info.get("format") if isinstance(info, dict) else None
+        if got != TRUTH_FORMAT:
+            hint = "it is the public folder, without truth" if got == FORMAT else "make it again"
+            raise InputError(f"expected {TRUTH_FORMAT} in {folder / SIDECAR}, got {got}; {hint}")
+        if _digest(folder / SOLUTION) != info["solution_sha256"]:
+            raise InputError(
+                f"expected in {folder / SOLUTION} the solution that benchmark {info['id']} was "
+                "made of, got another one or none; make the benchmark again"
+            )
+        return cls(folder, info)
+
+    @property
+    def id(self) -> str:
+        """Of the set."""
+        return str(self.info["id"])
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The images' pixels."""
+        return PixelGrid(**self.info["grid"])
+
+    @property
+    def specimen(self) -> Specimen:
+        """The undeformed geometry."""
+        return Specimen(**self.info["specimen"])
+
+    @property
+    def strains(self) -> tuple[float, ...]:
+        """Nominal strains of the deformed images [-]."""
+        return tuple(self.info["strains"])
+
+    @cached_property
+    def solution(self) -> Solution:
+        """Mesh and displacements."""
+        return Solution.read(self.folder / SOLUTION)
+
+    @cached_property
+    def mask(self) -> BoolArray:
+        """(rows, cols) True where the reference image shows material."""
+        mesh = self.solution.mesh
+        return locate(mesh.nodes, mesh.cells, mesh.element, self.grid).mask
+
+    def displacement(self, strain: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Displacement at any points of the reference, by the element that each lies in.
+
+        Parameters
+        ----------
+        strain
+            Nominal strain of the deformed image [-].
+        x, y
+            (n,) positions [mm].
+
+        Returns
+        -------
+        (n, 2) [mm]; NaN beside the material, and where a position is.
+
+        Raises
+        ------
+        InputError
+            If there is no image at that strain.
+        """
+        if not any(abs(strain - known) < 1e-9 for known in self.strains):
+            have = ", ".join(f"{known:g}" for known in self.strains)
+            raise InputError(
+                f"expected a strain of benchmark {self.id}, got {strain:g}; it has {have}"
+            )
+        return displacement_at(self.solution, strain, self.grid, x, y)
+
+
+def displacement_at(
+    solution: Solution, strain: float, grid: PixelGrid, x: ArrayLike, y: ArrayLike
+) -> FloatArray:
+    """(n, 2) displacement of a snapshot at points (n,) of the reference [mm]; NaN beside it."""
+    mesh = solution.mesh
+    row, col = (position[None, :] for position in grid.to_px(x, y))
+    found = locate_points(mesh.nodes, mesh.cells, mesh.element, grid, row, col)
+    u = interpolate(found, mesh.cells, mesh.element, solution.at(strain).displacement)
+    return np.ascontiguousarray(u[:, 0].T)
+
+
+def publish(
+    images: ImageSet, specimen: Specimen, public: Path | str, truth: Path | str
+) -> dict[str, Any]:
+    """Write the public folder, and into the truth's folder what belongs to it.
+
+    Parameters
+    ----------
+    images
+        A finished set, seen by a perfect lens.
+    specimen
+        The undeformed geometry.
+    public
+        Made if it does not exist; a finished set of the same images is left as it is.
+    truth
+        Holds ``solution.h5``, of which the images were made.
+
+    Returns
+    -------
+    dict
+        The content of the public ``benchmark.json``.
+
+    Raises
+    ------
+    InputError
+        If the images were seen through a lens that distorts, or the truth would be public.
+    """
+    public, truth = Path(public), Path(truth)
+    require_apart(public, truth)
+    if images.spec.distortion is not None:
+        raise InputError(
+            "expected images without a lens for a benchmark, got distorted ones, in which a "
+            "displacement isn't that of the specimen; leave out [imaging.distortion]"
+        )
+    if not _is_whole(public, truth, images):
+        for part in (public / SIDECAR, truth / SIDECAR):
+            part.unlink(missing_ok=True)
+        info = _write_public(images, specimen, public)
+        hidden = {
+            "format": TRUTH_FORMAT,
+            "id": info["id"],
+            "key": images.info["key"],
+            "strains": list(images.strains),
+            "grid": asdict(images.grid),
+            "specimen": asdict(specimen),
+            "solution_sha256": _digest(truth / SOLUTION),
+        }
+        write_json(truth / SIDECAR, hidden)
+        write_json(public / SIDECAR, info)  # last: it says that all is there
+    content: dict[str, Any] = read_json(public / SIDECAR)
+    return content
+
+
+def require_apart(public: Path, truth: Path) -> None:
+    """Raise InputError if the truth is, or would be, in the public folder."""
+    inside = truth.resolve()
+    if inside == public.resolve() or public.resolve() in inside.parents:
+        raise InputError(
+            f"expected the truth apart from the public folder {public}, got {truth}; give --truth"
+        )
+    secrets = [path.name for pattern in SECRETS for path in sorted(public.glob(pattern))]
+    if secrets:
+        raise InputError(
+            f"expected a public folder without truth, got {secrets[0]} in {public}; "
+            "give another --out"
+        )
+
+
+def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[str, Any]:
+    """Copy the images and write the README; returns what ``benchmark.json`` is to hold."""
+    reference = {key: images.info["reference"][key] for key in ("image", "camera_image", "mask")}
+    deformed = [
+        {"nominal_strain": s["nominal_strain"], "image": s["image"],
+         "camera_image": s["camera_image"]}
+        for s in images.info["snapshots"]
+    ]  # fmt: skip
+    kept = [*reference.values(), *(d[k] for d in deformed for k in ("image", "camera_image"))]
+    for name in kept:
+        with atomic(public / name) as part:
+            shutil.copyfile(images.folder / name, part)
+    files = {
+        name: {"bytes": (public / name).stat().st_size, "sha256": _digest(public / name)}
+        for name in kept
+    }
+    grid = images.grid
+    info = {
+        "format": FORMAT,
+        "id": hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:12],
+        "licence": "CC-BY-4.0",
+        "made_with": f"modeharvest {__version__}",
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "pixel_size_mm": grid.pixel_size,
+        "first_pixel_mm": {"x": grid.x0, "y_up": grid.y0},
+        "unit_cell_mm": specimen.pitch,
+        "bits": images.spec.bits,
+        "background": images.spec.background,
+        "reference": reference,
+        "deformed": deformed,
+        "returned": RETURNED,
+        "files": files,
+    }
+    with atomic(public / README) as part:
+        part.write_text(readme(info), "utf-8")
+    return info
+
+
+def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
+    """Whether both folders hold these images and their truth, nothing missing or changed."""
+    try:
+        info, hidden = read_json(public / SIDECAR), read_json(truth / SIDECAR)
+        return bool(
+            info["id"] == hidden["id"]
+            and hidden["key"] == images.info["key"]
+            and hidden["solution_sha256"] == _digest(truth / SOLUTION)
+            and (public / README).is_file()
+            and all(_digest(public / n) == f["sha256"] for n, f in info["files"].items())
+        )
+    except (InputError, KeyError, TypeError):
+        return False
+
+
+def _digest(path: Path) -> str:
+    """SHA-256, hexadecimal; empty if there is no such file."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

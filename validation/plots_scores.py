@@ -1,0 +1,156 @@
+"""Pictures of graded fields: error maps, distributions, regions and spectra, several codes in one.
+
+A code keeps its colour in all pictures; all lengths of errors share one logarithmic scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.field import Mesh
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.plots_fields import Scale, draw_field
+from modeharvest.validation.plots_path import curve
+from modeharvest.validation.regions import REGIONS
+from modeharvest.validation.score_spectrum import ErrorSpectrum
+from modeharvest.validation.scoring import Score
+from modeharvest.validation.sheet import Sheet
+from modeharvest.validation.style import BLUE, GOLD, GREEN, RED, SIZE, style
+
+FloatArray = NDArray[np.float64]
+
+_COLOURS = (BLUE, RED, GREEN, GOLD, *mpl.colormaps["tab10"].colors[4:])  # type: ignore[attr-defined]
+_CELLS = 300
+_SHARES = np.logspace(-4, 0, 200)
+
+
+@dataclass(frozen=True)
+class LogScale(Scale):
+    """Colours for values of many orders of magnitude."""
+
+    @property
+    def normalise(self) -> Normalize:
+        """Values to 0 ... 1, by their logarithm."""
+        return LogNorm(self.low, self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMaps:
+    """What the maps of several codes share.
+
+    Parameters
+    ----------
+    sheet
+        Frame, outline and cells.
+    lengths
+        The scale of the error's length.
+    """
+
+    sheet: Sheet
+    lengths: LogScale
+
+    @classmethod
+    def of(cls, mesh: Mesh, grid: PixelGrid, scores: Sequence[Score]) -> ErrorMaps:
+        """Make a sheet, and a scale on which 98 % of every code's errors are told apart."""
+        lengths = [_length(graded) for graded in scores if len(graded.error_px)]
+        ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
+        low = min((end[0] for end in ends), default=1e-3)
+        high = max((end[1] for end in ends), default=1.0)
+        low = max(low, 1e-4 * high)
+        high = max(high, 2.0 * low)
+        return cls(Sheet.of(mesh, grid, _CELLS), LogScale(SIZE, low, high, "px", "both"))
+
+    def spread(self, graded: Score, values: FloatArray) -> FloatArray:
+        """(rows, cols) of the sheet: of the nearest point, NaN farther off than a spacing."""
+        grid = self.sheet.grid
+        reach = max(graded.spacing_px * grid.pixel_size / self.sheet.factor, grid.pixel_size)
+        X, Y = np.meshgrid(grid.x, grid.y)
+        tree = cKDTree(np.column_stack([graded.x, graded.y]))
+        _, nearest = tree.query(np.column_stack([X.ravel(), Y.ravel()]), distance_upper_bound=reach)
+        return np.asarray(np.append(values, np.nan)[nearest].reshape(grid.shape))
+
+
+def draw_length(maps: ErrorMaps, graded: Score) -> Figure:
+    """Draw a map of the error's length; blank where nothing was measured."""
+    if not len(graded.error_px):
+        return draw_field(maps.sheet, np.full(maps.sheet.grid.shape, np.nan), maps.lengths)
+    length = np.maximum(_length(graded), 1e-3 * maps.lengths.low)  # zero has no logarithm
+    return draw_field(maps.sheet, maps.spread(graded, length), maps.lengths)
+
+
+def draw_component(maps: ErrorMaps, graded: Score, component: int) -> Figure:
+    """Draw a map of the error along x (0) or y (1), on a scale of its own."""
+    values = graded.error_px[:, component]
+    scale = Scale.signed(graded.error_px, "px", 0.98)
+    if not len(values):
+        return draw_field(maps.sheet, np.full(maps.sheet.grid.shape, np.nan), scale)
+    return draw_field(maps.sheet, maps.spread(graded, values), scale)
+
+
+def draw_distribution(scores: Sequence[Score]) -> Figure:
+    """Draw which share of a field's points, lost ones counted as wrong, errs by more."""
+    with style():
+        drawn, axes = curve("length of the error [px]", "share of points that err by more [%]")
+        for n, graded in enumerate(scores):
+            length = np.sort(_length(graded))[::-1]
+            if not len(length):
+                continue
+            points = graded.everywhere.points
+            lost = points - len(length)
+            share = (lost + np.arange(1, len(length) + 1)) / points
+            some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
+            axes.loglog(np.maximum(length[some], 1e-9), 100 * share[some], **_look(n, graded))
+        axes.set(ylim=(0.01, 120))
+        _legend(axes)
+    return drawn
+
+
+def draw_regions(scores: Sequence[Score]) -> Figure:
+    """Draw bars of the rms error by region."""
+    with style():
+        drawn, axes = curve("", "rms per component [px]")
+        width = 0.8 / max(len(scores), 1)
+        for n, graded in enumerate(scores):
+            at = np.arange(len(REGIONS)) + (n - 0.5 * (len(scores) - 1)) * width
+            rms = [graded.by_region[name].rms_px for name in REGIONS]
+            axes.bar(at, np.nan_to_num(rms), 0.92 * width, **_look(n, graded))
+        axes.set_xticks(range(len(REGIONS)), REGIONS)
+        if any(graded.everywhere.rms_px > 0 for graded in scores):
+            axes.set_yscale("log")
+        _legend(axes)
+    return drawn
+
+
+def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
+    """Draw the rms error by wavelength, in thirds of an octave."""
+    with style():
+        drawn, axes = curve("wavelength [px]", "rms per component in a third of an octave [px]")
+        for n, (name, spectrum) in enumerate(spectra.items()):
+            if spectrum is not None and (spectrum.rms_px > 0).any():
+                axes.loglog(spectrum.wavelength_px, spectrum.rms_px, marker="o", ms=2.5,
+                            color=_COLOURS[n % len(_COLOURS)], label=name)  # fmt: skip
+        _legend(axes)
+    return drawn
+
+
+def _length(graded: Score) -> FloatArray:
+    return np.hypot(graded.error_px[:, 0], graded.error_px[:, 1])
+
+
+def _look(n: int, graded: Score) -> dict[str, Any]:
+    return {"color": _COLOURS[n % len(_COLOURS)], "label": graded.source}
+
+
+def _legend(axes: Axes) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, fontsize=7.5)

@@ -1,0 +1,149 @@
+"""Fields that come to be graded: read from any file, with the id of the set they claim to be of."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+from scipy.io import loadmat
+
+from modeharvest.errors import InputError
+from modeharvest.idic.field_files import read_field
+from modeharvest.idic.local_field import LocalField
+from modeharvest.imaging.grid import PixelGrid
+
+_VTK = {".vtk", ".vtu", ".vtp"}
+_VECTORS = ("u", "displacement", "disp", "displacements")
+_ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What is said of a field's file that it doesn't say itself.
+
+    Parameters
+    ----------
+    name
+        Of the code, for tables; the file's by default.
+    units, displacement_units, y_axis, first_pixel, columns
+        As for :func:`modeharvest.idic.field_files.read_field`.
+    """
+
+    name: str | None = None
+    units: str | None = None
+    displacement_units: str | None = None
+    y_axis: str | None = None
+    first_pixel: int = 0
+    columns: Mapping[str, str | int] | None = None
+
+
+def read_measured(
+    path: Path | str, grid: PixelGrid, benchmark: str, declared: Declared | None = None
+) -> LocalField:
+    """Read a field to be graded.
+
+    Parameters
+    ----------
+    path
+        CSV, NPZ, HDF5, MAT; VTK or VTU with a vector named u or displacement at its points.
+    grid
+        The benchmark's pixels.
+    benchmark
+        Its id.
+    declared
+        What the file doesn't say.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or says that it is of another benchmark.
+    """
+    path, declared = Path(path), declared or Declared()
+    claimed = claimed_benchmark(path)
+    if claimed not in (None, benchmark):
+        raise InputError(
+            f"{path}: expected a field of benchmark {benchmark}, but it says that it is of "
+            f"{claimed}; take the truth of that one"
+        )
+    how: dict[str, Any] = {
+        "units": declared.units,
+        "displacement_units": declared.displacement_units,
+        "y_axis": declared.y_axis,
+        "first_pixel": declared.first_pixel,
+        "columns": declared.columns,
+    }
+    read = _read_vtk if path.suffix.lower() in _VTK else read_field
+    return replace(read(path, grid, **how), source=declared.name or path.stem)
+
+
+def claimed_benchmark(path: Path) -> str | None:
+    """The id that a file itself says it belongs to; None if it says none or can't be read."""
+    try:
+        return _claim(path)
+    except (OSError, ValueError, KeyError, NotImplementedError):
+        return None  # whoever reads the field itself says what is wrong
+
+
+def _claim(path: Path) -> str | None:
+    suffix, said = path.suffix.lower(), ""
+    if suffix in (".csv", ".txt", ".dat", ".tsv"):
+        with path.open(encoding="utf-8", errors="replace") as file:
+            said = "".join(
+                line for _, line in zip(range(50), file, strict=False) if line[0] in "#%"
+            )
+    elif suffix == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            said = f"benchmark {file['benchmark']}"
+    elif h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            said = f"benchmark {file.attrs['benchmark']}"
+    elif suffix == ".mat":
+        said = f"benchmark {loadmat(path, variable_names=['benchmark'])['benchmark'].ravel()[0]}"
+    found = _ID.search(said)
+    return found.group(1).lower() if found else None
+
+
+def _read_vtk(path: Path, grid: PixelGrid, **how: Any) -> LocalField:
+    """By way of a table of columns, so that units and axes are declared as for any file."""
+    x, y, u, v = _points_of_vtk(path)
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / f"{path.stem}.npz"
+        np.savez(table, x=x, y=y, u=u, v=v)
+        try:
+            return read_field(table, grid, **how)
+        except InputError as error:
+            raise InputError(str(error).replace(str(table), str(path))) from error
+
+
+def _points_of_vtk(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(4, n) x, y, u, v."""
+    if not path.is_file():
+        raise InputError(f"expected a displacement field in {path}, found no such file")
+    said = StringIO()
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            mesh = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
+        reason = " ".join((said.getvalue() or str(error)).split())
+        raise InputError(f"{path}: can't be read as {path.suffix}: {reason}") from error
+    vectors = {
+        name: np.asarray(values, dtype=np.float64)
+        for name, values in mesh.point_data.items()
+        if np.ndim(values) == 2 and np.shape(values)[1] in (2, 3)
+    }
+    named = [name for name in vectors if name.lower() in _VECTORS] or list(vectors)
+    if len(named) != 1:
+        raise InputError(
+            f"{path}: expected one vector at the points, named u or displacement, got "
+            f"{', '.join(map(repr, mesh.point_data)) or 'none'}"
+        )
+    return np.column_stack([mesh.points[:, :2], vectors[named[0]][:, :2]]).T

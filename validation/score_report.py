@@ -1,0 +1,201 @@
+"""Grades of displacement fields: a table, files, and one page with pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from modeharvest.files import atomic, write_json
+from modeharvest.validation.benchmark_set import BenchmarkTruth
+from modeharvest.validation.page import render
+from modeharvest.validation.plots_scores import (
+    ErrorMaps,
+    draw_component,
+    draw_distribution,
+    draw_length,
+    draw_regions,
+    draw_spectra,
+)
+from modeharvest.validation.report import Picture
+from modeharvest.validation.score_spectrum import ErrorSpectrum
+from modeharvest.validation.scoring import ENOUGH_COVERED, PERCENTILES, RegionScore, Score
+from modeharvest.validation.style import to_svg
+
+BoolArray = NDArray[np.bool_]
+
+FORMAT = "modeharvest-scores-1"
+TEMPLATE = "score_report.html"
+EVERYWHERE, COMMON = "everywhere", "where all measure"
+"""Rows of the table beside the regions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grading:
+    """Graded fields of one deformed image.
+
+    Parameters
+    ----------
+    truth
+        What they are graded by.
+    strain
+        Of the image [-].
+    edge_px
+        Width of the region of edges [px].
+    labels
+        (rows, cols) of :func:`modeharvest.validation.regions.regions`.
+    scores
+        The best first.
+    spectra
+        Of each field's error, by its name; None where it has none.
+    remarks
+        Sentences about probable mistakes in what was declared.
+    """
+
+    truth: BenchmarkTruth
+    strain: float
+    edge_px: int
+    labels: NDArray[np.int8]
+    scores: tuple[Score, ...]
+    spectra: Mapping[str, ErrorSpectrum | None]
+    remarks: tuple[str, ...] = ()
+
+    @cached_property
+    def common(self) -> dict[str, RegionScore]:
+        """By name, the error over the material that all fields cover."""
+        where = np.logical_and.reduce([graded.near for graded in self.scores])
+        return {graded.source: graded.over(where, self.truth.grid) for graded in self.scores}
+
+    @cached_property
+    def common_share(self) -> float:
+        """Share of the material that all fields cover [-]."""
+        where = np.logical_and.reduce([graded.near for graded in self.scores])
+        return float(where.sum() / (self.labels >= 0).sum())
+
+    def parts(self, graded: Score) -> dict[str, RegionScore]:
+        """A field's rows of the table: everywhere, where all measure, by region."""
+        common = {COMMON: self.common[graded.source]} if len(self.scores) > 1 else {}
+        return {EVERYWHERE: graded.everywhere, **common, **graded.by_region}
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know, in sentences."""
+        told = list(self.remarks)
+        for graded in self.scores:
+            if graded.covered < ENOUGH_COVERED:
+                told.append(
+                    f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less "
+                    f"than {100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
+                )
+        return told
+
+
+def write_grading(folder: Path | str, grading: Grading) -> None:
+    """Write ``scores.json``, ``scores.csv`` and ``report.html``, each whole or not at all."""
+    folder = Path(folder)
+    write_json(folder / "scores.json", _plain(summary(grading)))
+    with atomic(folder / "scores.csv") as part:
+        part.write_text("\n".join(_lines(grading)) + "\n", "utf-8")
+    with atomic(folder / "report.html") as part:
+        part.write_text(page(grading), "utf-8")
+
+
+def summary(grading: Grading) -> dict[str, Any]:
+    """The grades as plain values: for each field, the best first, all that is known of it."""
+    return {
+        "format": FORMAT,
+        "benchmark": grading.truth.id,
+        "nominal_strain": grading.strain,
+        "edge_px": grading.edge_px,
+        "percentiles": list(PERCENTILES),
+        "covered_by_all": grading.common_share,
+        "fields": [_plain_field(grading, graded) for graded in grading.scores],
+        "remarks": grading.notes,
+    }
+
+
+def _plain_field(grading: Grading, graded: Score) -> dict[str, Any]:
+    spectrum = grading.spectra.get(graded.source)
+    return {
+        "name": graded.source,
+        "points_off_material": graded.off_material,
+        "spacing_px": graded.spacing_px,
+        "covered": graded.covered,
+        **{name: asdict(part) for name, part in grading.parts(graded).items()},
+        "spectrum": None
+        if spectrum is None
+        else {
+            "wavelength_px": spectrum.wavelength_px.tolist(),
+            "rms_px": spectrum.rms_px.tolist(),
+            "affine_px": spectrum.affine_px,
+        },
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The same without NaN, which JSON doesn't know."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def _lines(grading: Grading) -> Iterator[str]:
+    """The table as CSV: a line for each field and region."""
+    percentiles = ",".join(f"p{p} [px]" for p in PERCENTILES)
+    yield ("field,region,points,returned [-],covered [-],bias x [px],bias y up [px],rms [px],"
+           f"{percentiles},max [px]")  # fmt: skip
+    for graded in grading.scores:
+        for name, part in grading.parts(graded).items():
+            covered = f"{graded.covered:.6g}" if name == EVERYWHERE else ""
+            values = [*part.bias_px, part.rms_px, *part.percentiles_px, part.max_px]
+            numbers = ",".join(f"{v:.6g}" for v in values)
+            yield f'"{graded.source}",{name},{part.points},{part.returned:.6g},{covered},{numbers}'
+
+
+def page(grading: Grading) -> str:
+    """The report, HTML."""
+    maps = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, grading.scores)
+    curves = [
+        _picture("distribution", "Share of points with a larger error",
+                 draw_distribution(grading.scores)),
+        _picture("regions", "By region", draw_regions(grading.scores)),
+    ]  # fmt: skip
+    if any(grading.spectra.values()):
+        drawn = draw_spectra(grading.spectra)
+        curves.append(_picture("spectrum", "By wavelength", drawn))
+    return render(
+        TEMPLATE,
+        title=f"Benchmark {grading.truth.id} at {100 * grading.strain:g} %",
+        grading=grading,
+        everywhere=EVERYWHERE,
+        common=COMMON,
+        percentiles=PERCENTILES,
+        curves=curves,
+        fields=[_field(maps, graded, n) for n, graded in enumerate(grading.scores)],
+    )
+
+
+def _field(maps: ErrorMaps, graded: Score, n: int) -> dict[str, Any]:
+    """A field's maps."""
+    return {
+        "score": graded,
+        "pictures": [
+            _picture(f"length-{n}", "Length of the error", draw_length(maps, graded)),
+            _picture(f"x-{n}", "Error along x", draw_component(maps, graded, 0)),
+            _picture(f"y-{n}", "Error along y", draw_component(maps, graded, 1)),
+        ],
+    }
+
+
+def _picture(name: str, label: str, drawn: Figure) -> Picture:
+    return Picture(name, label, to_svg(drawn, name, label))

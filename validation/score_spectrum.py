@@ -1,0 +1,73 @@
+"""At which wavelengths the error of a measured field sits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.measured_spectrum import gridded
+from modeharvest.idic.spectrum import spectral_density
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.scoring import Score
+
+FloatArray = NDArray[np.float64]
+
+BANDS_AN_OCTAVE = 3
+_MOST = 1000  # points along the longer side: finer fields are averaged to so many
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSpectrum:
+    """The error by wavelength, in thirds of an octave.
+
+    Parameters
+    ----------
+    wavelength_px
+        (m,) middle of each band, ascending [px].
+    rms_px
+        (m,) rms error per component in it [px]: the squares of all and of ``affine_px`` add up to
+        that of the whole error, but for what bins of a fine field average out.
+    affine_px
+        Rms of the error's affine part: translation, rotation, strain [px].
+    """
+
+    wavelength_px: FloatArray
+    rms_px: FloatArray
+    affine_px: float
+
+
+def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
+    """Decompose a field's error; None where its points don't fill a box.
+
+    Gaps, at holes and where points were lost, count as zero error: what the pattern of gaps does
+    to a wave is spread over its neighbours.
+    """
+    error = graded.error_px * grid.pixel_size
+    try:
+        u, points, mask = gridded(LocalField(graded.x, graded.y, error, source=graded.source))
+        factor = -(-max(points.shape) // _MOST)
+        unit = 10.0 * factor * points.pixel_size  # any: wavelengths are told in px
+        spectrum = spectral_density(u, points, mask, unit, bins_per_cell=10, padding=1)
+    except InputError:
+        return None
+    density = (spectrum.S_xx + spectrum.S_yy).ravel()
+    cell = (spectrum.xi1[1] - spectrum.xi1[0]) * (spectrum.xi2[1] - spectrum.xi2[0]) / unit**2
+    area = mask.sum() * points.pixel_size**2
+    frequency = np.hypot(spectrum.xi1[None, :], spectrum.xi2[:, None]).ravel() / unit
+    waves = frequency > 0
+    wavelength = 1.0 / (frequency[waves] * grid.pixel_size)
+    band = np.rint(BANDS_AN_OCTAVE * np.log2(wavelength)).astype(int)
+    low = int(band.min())
+    square_mm = np.bincount(band - low, density[waves] * cell) / (2.0 * area)
+    middle = 2.0 ** ((low + np.arange(square_mm.size)) / BANDS_AN_OCTAVE)
+    there = np.bincount(band - low) > 0
+    rms = np.sqrt(square_mm) / grid.pixel_size
+    x, y = graded.x, graded.y
+    plane = np.column_stack([np.ones_like(x), x, y]) @ spectrum.affine.T
+    return ErrorSpectrum(
+        middle[there], rms[there], float(np.sqrt(np.mean(plane**2))) / grid.pixel_size
+    )
