@@ -101,6 +101,7 @@ def leftover_covariance(
     mask: NDArray[np.bool_],
     block: float,
     order: int = 5,
+    soft: FloatArray | None = None,
 ) -> FloatArray:
     """(n, n) covariance of the unknowns by what the ansatz leaves over, its residual included.
 
@@ -119,6 +120,8 @@ def leftover_covariance(
         Edge of the blocks [mm]: the unit cell.
     order
         Of the spline.
+    soft
+        Of :func:`softness`, if it is known already.
 
     Raises
     ------
@@ -127,7 +130,9 @@ def leftover_covariance(
     """
     blocks = _blocks(result, mask, block)
     pushes = _pushes(blocks, result, reference, deformed, order)
-    return _sandwich(softness(result, reference, deformed, mask, order), pushes)
+    if soft is None:
+        soft = softness(result, reference, deformed, mask, order)
+    return _sandwich(soft, pushes)
 
 
 def noise_covariance(
@@ -138,6 +143,7 @@ def noise_covariance(
     mask: NDArray[np.bool_],
     block: float,
     order: int = 5,
+    soft: FloatArray | None = None,
 ) -> FloatArray:
     """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
 
@@ -148,7 +154,7 @@ def noise_covariance(
 
     Parameters
     ----------
-    result, reference, deformed, mask, block, order
+    result, reference, deformed, mask, block, order, soft
         As for :func:`leftover_covariance`.
     noises
         Examples of the noise in f and in g, (rows, cols) each, filtered as they were.
@@ -161,8 +167,28 @@ def noise_covariance(
         small_f, small_g = (_SMALL * np.asarray(n, dtype=np.float32) for n in (in_f, in_g))
         pushed = _pushes(blocks, result, f + small_f, g + small_g, order)
         examples.append((pushed - quiet) / _SMALL)
-    soft = softness(result, f, g, mask, order)
+    if soft is None:
+        soft = softness(result, f, g, mask, order)
     return _sandwich(soft, np.vstack(examples)) / len(examples)
+
+
+def softened(result: Result, covariance: ArrayLike, soft: FloatArray) -> FloatArray:
+    """A covariance for JᵀJ turned into one for the cost's own curvature: H⁻¹ M C M H⁻¹.
+
+    Parameters
+    ----------
+    result
+        Of a correlation.
+    covariance
+        (n, n) C, such as ``result.covariance(noise_sd)``.
+    soft
+        (n, n) of :func:`softness`.
+    """
+    kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
+    found = np.array(covariance, dtype=np.float64)
+    turn = soft[kept] @ np.linalg.inv(result.inverse[kept])
+    found[kept] = turn @ found[kept] @ turn.T
+    return found
 
 
 def softness(
