@@ -18,9 +18,9 @@ from modeharvest.cli import app
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.inputs import named_files
 from modeharvest.harvest.noise import estimated_noise, measured_noise
 from modeharvest.harvest.pipeline import Harvesting, harvest
-from modeharvest.harvest.prepare import named_files
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.sensor import Sensor

@@ -60,8 +60,8 @@ def _waves(
 
 
 def _largest(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
-    """The largest |v| and the largest length of v phi among the holes, where there is material."""
-    grid, box = harvest.grid, harvest.cellular
+    """The largest |v| and the largest length of v phi on the material of the mode's own part."""
+    grid, box = harvest.grid, frame.result.ansatz.modes[i].taper.cellular
     step = max(1, round(max(grid.shape) / _CELLS))
     x, y, mask = grid.x[::step], grid.y[::step], harvest.mask[::step, ::step]
     inside = mask & ((box.y_min <= y) & (y <= box.y_max))[:, None]

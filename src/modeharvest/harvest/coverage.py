@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.measure import Pair
+from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.pipeline import Harvesting
 from modeharvest.harvest.told import covariances
 from modeharvest.harvest.twin import Twin

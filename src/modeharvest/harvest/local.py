@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Experiment
+from modeharvest.harvest.inputs import of_each_photograph
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.field_files import read_field
 from modeharvest.idic.local_field import LocalField
@@ -21,7 +21,7 @@ def local_field(
     experiment: Experiment,
     base: Path,
     prepared: Prepared,
-    number: int,
+    name: str,
     distortion: Distortion | None,
 ) -> LocalField | None:
     """The displacement field of one deformed photograph by a local DIC; None if there is none.
@@ -34,32 +34,27 @@ def local_field(
         What there is, and the folder its names are relative to.
     prepared
         The photographs, made ready.
-    number
-        Of the deformed photograph, from 0.
+    name
+        Of the deformed photograph.
     distortion
         Of the lens.
 
     Raises
     ------
     InputError
-        If there are files, but none for this photograph.
+        If there aren't as many files as photographs, or this one's can't be used.
     """
     table, grid = experiment.local, prepared.grid
     if table.code == "none":
         return None
     if table.code == "pyvale":
-        name = prepared.names[number]
         options = SubsetOptions(subset_px=table.subset, step_px=table.step)
         return subset_field(
             prepared.image(), prepared.image(name), grid, prepared.mask(), prepared.mask(name),
             options,
         )  # fmt: skip
-    if number >= len(table.files):
-        raise InputError(
-            f"local: expected a field for each of {len(prepared.names)} deformed images, got "
-            f"{len(table.files)} files"
-        )
-    field = read_field(base / table.files[number], grid, units=table.unit, y_axis=table.y_axis)
+    path = of_each_photograph(experiment, base, table.files, "local.files")[name]
+    field = read_field(path, grid, units=table.unit, y_axis=table.y_axis)
     return field if distortion is None else without_distortion(field, grid, distortion)
 
 

@@ -9,44 +9,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.harvest.experiment import Measurement
 from modeharvest.harvest.geometry import Geometry
+from modeharvest.harvest.modes import chosen_modes, has_new_modes
+from modeharvest.harvest.options import Measurement
+from modeharvest.harvest.pair import Pair
+from modeharvest.harvest.surface import confirmed, followed_holes
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.automatic_start import Start, StartOptions, automatic_start
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.finish import Finish, blurred_pair, finish_for
-from modeharvest.idic.fourier import FourierMode, square_family
 from modeharvest.idic.gauss_newton import Outcome
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.local_field import LocalField
-from modeharvest.idic.region import junction
 from modeharvest.idic.result import Result
-from modeharvest.idic.scene import Expected, compare_scenes, require_same_scene
-from modeharvest.idic.support import Taper
 from modeharvest.progress import Progress, silent
 
 FloatArray = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """What is correlated.
-
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) f and g.
-    mask, deformed_mask
-        (rows, cols) True on material.
-    """
-
-    reference: FloatImage
-    deformed: FloatImage
-    mask: BoolArray
-    deformed_mask: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +77,9 @@ def measure(
     local
         A local DIC's field.
     before
-        What came out of the photograph before. If it had a pattern, its ansatz is kept and its
-        unknowns are the start; the start is found anew if that leads nowhere.
+        What came out of the photograph before. If it shows all modes that are seen now, its
+        ansatz is kept and its unknowns are the start; the start is found anew if that leads
+        nowhere.
     progress
         Listener.
 
@@ -108,23 +88,22 @@ def measure(
     InputError
         If the two images don't show the same surface, or the spectrum contradicts the cell size.
     """
-    motion, said = geometry.motion_in(pair.deformed_mask)
+    motion, said = followed_holes(pair, geometry)
     holes = None if motion is None else motion.in_mm(geometry.grid)
-    expected: Expected | None = None if motion is None else motion.at
     if motion is None and before is not None:
-        holes, expected = _moved_holes(before.result, geometry), partial(_moved_to, before.result)
-        said += " v0 starts from the photograph before."
-    if expected is not None:
-        said += " " + _same_surface(pair, expected)
+        holes = _moved_holes(before.result, geometry)
+        said += " v0 starts from the photograph before. "
+        said += confirmed(pair, partial(_moved_to, before.result))
     options = StartOptions(how.v0_degree, how.v_degree, how.brightness())
+    boxes = [part.box for part in geometry.parts]
     start = automatic_start(
-        pair.reference, pair.deformed, geometry.grid, cell_size, geometry.region.cellular,
-        pair.mask, pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
+        pair.reference, pair.deformed, geometry.grid, cell_size, boxes, pair.mask,
+        pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=options,
     )  # fmt: skip
     ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
-    sentences = (said, *start.sentences)
-    if before is not None and _goes_on(before, held):
+    sentences = (said, *_start_in_words(start, ansatz, geometry))
+    if before is not None and _goes_on(before, ansatz, held):
         found, finish = correlated(pair, geometry, *_lit(before.result, how), how, progress)
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
@@ -186,56 +165,23 @@ def _lit(result: Result, how: Measurement) -> tuple[Ansatz, FloatArray]:
     return ansatz, start
 
 
-def _same_surface(pair: Pair, expected: Expected) -> str:
-    """A sentence about blocks of the reference that were found where they are expected."""
-    seen = compare_scenes(pair.reference, pair.deformed, pair.mask, expected)
-    require_same_scene(seen, "the reference", "the deformed one")
-    return seen.sentence
+def _goes_on(before: Measured, ansatz: Ansatz, held: bool) -> bool:
+    """Whether the photograph before is a start: it was measured, and shows all that is seen now."""
+    was_measured = before.result.outcome is Outcome.CONVERGED and before.held == held
+    return was_measured and not has_new_modes(before.result.ansatz, ansatz)
 
 
-def chosen_modes(
-    start: Start, geometry: Geometry, cell_size: float, how: Measurement
-) -> tuple[Ansatz, FloatArray, bool]:
-    """The start's ansatz and unknowns with the family and the holding that were asked for."""
-    ansatz, unknowns, held = start.ansatz, start.unknowns, start.held
-    wants_square = how.family == "square" and geometry.lattice is not None
-    if (wants_square and "square" not in start.family) or (held and how.hold_mode is False):
-        ansatz, unknowns = _with_square_mode(ansatz, unknowns, geometry, cell_size)
-        held = False
-    if how.hold_mode is True and not held:
-        ansatz, unknowns = with_held_modes(ansatz, unknowns)
-        held = True
-    return ansatz, unknowns, held
-
-
-def with_held_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, FloatArray]:
-    """The same ansatz with its modes held where the unknowns have them, and fewer unknowns."""
-    modes = []
-    for i, mode in enumerate(ansatz.modes):
-        here = replace(mode.family, start=unknowns[ansatz.phi_slice(i)])
-        modes.append(replace(mode, family=here.held()))
-    first, last = ansatz.phi_offset(0), ansatz.phi_offset(len(ansatz.modes))
-    return replace(ansatz, modes=tuple(modes)), np.concatenate([unknowns[:first], unknowns[last:]])
-
-
-def _with_square_mode(
-    ansatz: Ansatz, unknowns: FloatArray, geometry: Geometry, cell_size: float
-) -> tuple[Ansatz, FloatArray]:
-    """The paper's Eq. (mode) with its origin on a junction, started as in the paper."""
-    assert geometry.lattice is not None
-    family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
-    taper = Taper(geometry.region.cellular, 0.5 * cell_size)
-    mode = FourierMode.scaled(family, cell_size, taper)
-    made = replace(ansatz, modes=(mode,))
-    a = made.start()
-    slow = 2 * ansatz.v0_space.size
-    a[:slow] = unknowns[:slow]
-    return made, a
-
-
-def _goes_on(before: Measured, held: bool) -> bool:
-    """Whether the photograph before is a start: it was measured, and the pattern is still there."""
-    return before.result.outcome is Outcome.CONVERGED and before.held == held
+def _start_in_words(start: Start, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:
+    """The start's sentences; those about a spectrum name its part, where there are several."""
+    if len(geometry.parts) == 1:
+        return start.sentences
+    read = {sentence for region in start.regions for sentence in region.pattern.sentences}
+    said = [sentence for sentence in start.sentences if sentence not in read]
+    for part, region in zip(geometry.parts, start.regions, strict=True):
+        own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == part.box]
+        modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
+        said.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.sentences)}")
+    return tuple(said)
 
 
 def _moved_holes(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray] | None:

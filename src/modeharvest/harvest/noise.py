@@ -11,6 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, stats
 
+from modeharvest.errors import InputError
+
+_OTHER_STATE = 0.25
+"""Share of an exposure's variance that noise alone can hardly make: speckle has far more."""
+_MOVED = 2.0
+"""Times the noise that a single image shows, beyond which motion is the likelier cause."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -37,15 +44,33 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> N
     Parameters
     ----------
     images
-        Two or more of (rows, cols) [grey levels].
+        Two or more of (rows, cols) [grey levels], the reference first.
     mask
         (rows, cols) True on material.
+
+    Raises
+    ------
+    InputError
+        If two exposures have so little in common that they are of different states.
     """
-    halves = [0.5 * _unexplained(a[mask], b[mask]) for a, b in pairwise(images)]
-    return Noise(
-        float(np.sqrt(np.mean(halves))),
-        f"measured from {len(images)} exposures of the reference",
-    )
+    halves = []
+    for number, (a, b) in enumerate(pairwise(images), start=1):
+        left, there = _unexplained(a[mask], b[mask]), float(b[mask].var(dtype=np.float64))
+        if left > _OTHER_STATE * there:
+            raise InputError(
+                "images.repeats: expected exposures of the reference's state, got number "
+                f"{number}, {100 * left / there:.0f} % of whose variance the exposure before "
+                f"doesn't explain (a noise of {np.sqrt(0.5 * left):.3g} grey levels); leave it out"
+            )
+        halves.append(0.5 * left)
+    sd, seen = float(np.sqrt(np.mean(halves))), estimated_noise(images[0], mask).sd
+    source = f"measured from {len(images)} exposures of the reference"
+    if sd > _MOVED * seen:
+        source += (
+            f"; the reference's finest details show {seen:.2g} grey levels only: if anything "
+            "moved between the exposures, leave the repeats out"
+        )
+    return Noise(sd, source)
 
 
 def _unexplained(a: NDArray[Any], b: NDArray[Any]) -> float:

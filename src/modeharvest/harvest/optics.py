@@ -10,7 +10,7 @@ import numpy as np
 
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import DistortionTable
-from modeharvest.harvest.prepare import named_files
+from modeharvest.harvest.inputs import named_files
 from modeharvest.idic.calibration import calibrate
 from modeharvest.idic.calibration_result import Calibration, DegreeTrial
 from modeharvest.imaging.distortion import PolynomialDistortion

@@ -25,10 +25,12 @@ from modeharvest.errors import InputError
 from modeharvest.files import read_json, require_writable, write_json
 from modeharvest.harvest.experiment import Experiment, read_experiment
 from modeharvest.harvest.geometry import Geometry, find_geometry
+from modeharvest.harvest.inputs import all_files, named_files, of_each_photograph, require_inputs
 from modeharvest.harvest.local import local_field
-from modeharvest.harvest.measure import Measured, Pair, measure
+from modeharvest.harvest.measure import Measured, measure
 from modeharvest.harvest.optics import Optics, calibrate_lens, calibrated_lens
-from modeharvest.harvest.prepare import RECORD, Prepared, named_files, prepare
+from modeharvest.harvest.pair import Pair
+from modeharvest.harvest.prepare import RECORD, Prepared, prepare
 from modeharvest.harvest.told import harvest_of
 from modeharvest.idic.field_files import read_field, write_field
 from modeharvest.idic.local_field import LocalField
@@ -119,13 +121,12 @@ class Harvesting:
         """
         prepared = self.prepared()
         found: dict[str, Measured] = {}
-        before: Measured | None = None
         key = digest([self._prepared_key(), self._how()])
-        for number, name in enumerate(prepared.names):
-            key = digest([key, name, self._local_digest(number)])
-            self._measure_one(prepared, number, before, key)
+        for name in prepared.names:
+            key = digest([key, name, self._local_digest(name)])
+            self._measure_one(prepared, name, found, key)
             if not self._told(name)["failed"]:
-                before = found[name] = self._read(name)
+                found[name] = self._read(name)
         if not found:
             name = prepared.names[0]
             raise InputError(f"{name}: {self._told(name)['failed']}")
@@ -168,43 +169,44 @@ class Harvesting:
     # -- parts --------------------------------------------------------------------------
 
     def _measure_one(
-        self, prepared: Prepared, number: int, before: Measured | None, key: str
+        self, prepared: Prepared, name: str, found: dict[str, Measured], key: str
     ) -> None:
-        name = prepared.names[number]
+        """Measure a photograph, from the last of those before it that were measured."""
         result, field, start = self._paths(name)
+        before = next(reversed(found), None)
 
         def work() -> None:
             try:
-                found = measure(
-                    self._pair(prepared, number, before),
+                measured = measure(
+                    self._pair(prepared, name, before, found),
                     self.geometry,
                     self.experiment.specimen.cell_size,
                     self.experiment.correlation,
-                    self._local(prepared, number),
-                    before,
+                    self._local(prepared, name),
+                    None if before is None else found[before],
                     self.progress,
                 )
             except InputError as error:
                 write_json(start, {"failed": str(error)})
                 return
-            write_field(field, found.local)
-            found.result.write(result)
-            told = {"held": found.held, "blur_px": found.blur_px, "said": found.sentences}
+            write_field(field, measured.local)
+            measured.result.write(result)
+            told = {"held": measured.held, "blur_px": measured.blur_px, "said": measured.sentences}
             write_json(start, {"failed": "", **told})
 
         self.stages.do(f"correlate {name}", key, work, start)
 
-    def _local(self, prepared: Prepared, number: int) -> LocalField | None:
-        return local_field(self.experiment, self.base, prepared, number, self.optics.distortion)
+    def _local(self, prepared: Prepared, name: str) -> LocalField | None:
+        return local_field(self.experiment, self.base, prepared, name, self.optics.distortion)
 
-    def _pair(self, prepared: Prepared, number: int, before: Measured | None) -> Pair:
+    def _pair(
+        self, prepared: Prepared, name: str, before: str | None, found: dict[str, Measured]
+    ) -> Pair:
         """The photograph and what it is correlated with."""
-        name = prepared.names[number]
         reference, mask = prepared.image(), prepared.mask()
         if self.experiment.correlation.formulation == "updated" and before is not None:
-            earlier = prepared.image(prepared.names[number - 1])
             order = self.experiment.correlation.order
-            reference, seen = pulled_back(earlier, before.result, order)
+            reference, seen = pulled_back(prepared.image(before), found[before].result, order)
             mask = mask & seen
         return Pair(reference, prepared.image(name), mask, prepared.mask(name))
 
@@ -227,14 +229,7 @@ class Harvesting:
         return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
 
     def _prepared_key(self) -> str:
-        tables = self.experiment.plain()
-        images = self.experiment.images
-        names = [images.reference, *images.deformed, *images.repeats]
-        table = self.experiment.specimen
-        masks = [table.material, table.cells, *table.deformed_material]
-        lens = [self.experiment.distortion.file, *self.experiment.distortion.calibration]
-        files = named_files(self.base, [name for name in names if name], unique=False)
-        files += named_files(self.base, [n for n in (*masks, *lens) if n], unique=False)
+        tables, files = self.experiment.plain(), all_files(self.experiment, self.base)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
         return digest([wanted, [[path.name, file_digest(path)] for path in files], __version__])
 
@@ -242,9 +237,10 @@ class Harvesting:
         tables = self.experiment.plain()
         return [tables["correlation"], tables["local"]]
 
-    def _local_digest(self, number: int) -> str:
+    def _local_digest(self, name: str) -> str:
         files = self.experiment.local.files
-        return file_digest(self.base / files[number]) if number < len(files) else ""
+        path = of_each_photograph(self.experiment, self.base, files, "local.files").get(name)
+        return "" if path is None else file_digest(path)
 
 
 def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
@@ -263,14 +259,15 @@ def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -
     -------
     dict
         The content of ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        If the experiment can't be used; before anything is computed, if a file is missing.
     """
     path = Path(path)
     experiment = read_experiment(path)
-    if not (path.parent / experiment.images.reference).is_file():
-        raise InputError(
-            f"{path}: expected the reference image at {path.parent / experiment.images.reference}, "
-            "found no such file"
-        )
+    require_inputs(experiment, path.parent)
     return Harvesting(experiment, path.parent, Path(folder), progress, str(path)).all()
 
 

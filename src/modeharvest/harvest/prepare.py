@@ -12,7 +12,6 @@ are white on material.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import Experiment
+from modeharvest.harvest.inputs import named_files, of_each_photograph
 from modeharvest.harvest.noise import Noise, estimated_noise, measured_noise
 from modeharvest.idic.material import MaterialOptions, find_material
 from modeharvest.imaging.distortion import undistorted, undistorted_mask
@@ -121,13 +121,15 @@ def prepare(
     ready = _Maker(folder, distortion, material_options(cell_px))
     mask = ready.save("reference", reference, _given(base, table.material))
     deformed = named_files(base, images.deformed)
+    masks = of_each_photograph(
+        experiment, base, table.deformed_material, "specimen.deformed_material"
+    )
     names, skipped, notes = [], [], list(reference.notes) + ready.sentences
     for k, path in enumerate(deformed):
         progress(k, len(deformed), "prepare photographs")
-        given = table.deformed_material[k] if k < len(table.deformed_material) else ""
         try:
             frame = read_frame(path, reference)
-            ready.save(path.stem, frame, _given(base, given))
+            ready.save(path.stem, frame, masks.get(path.stem))
         except InputError as error:
             skipped.append((path.name, str(error)))
             continue
@@ -150,35 +152,6 @@ def prepare(
     }
     write_json(folder / RECORD, info)
     return Prepared(folder, info)
-
-
-def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
-    """The files that names, or patterns with wildcards, stand for.
-
-    ``unique``: no two may have the same stem, because results are named by it.
-
-    Raises
-    ------
-    InputError
-        If a pattern matches no file, or two files would leave results of the same name.
-    """
-    paths: list[Path] = []
-    for name in names:
-        if any(sign in name for sign in "*?["):
-            found = sorted(base.glob(name))
-            if not found:
-                raise InputError(f"expected files that match {base / name}, found none")
-            paths += found
-        else:
-            paths.append(base / name)
-    stems = [path.stem for path in paths]
-    twice = next((stem for stem in stems if stems.count(stem) > 1 or stem == "reference"), None)
-    if unique and twice is not None and len(paths) > 1:
-        raise InputError(
-            f"expected images whose names differ, and none called 'reference', got {twice!r} "
-            "again; rename it, or narrow the pattern"
-        )
-    return tuple(paths)
 
 
 def material_options(cell_px: float) -> MaterialOptions:
@@ -234,5 +207,5 @@ def _noise(experiment: Experiment, base: Path, reference: Photograph, mask: Bool
     repeats = experiment.images.repeats
     if not repeats:
         return estimated_noise(reference.image, mask)
-    others = [read_frame(path, reference).image for path in named_files(base, repeats)]
+    others = [read_frame(path, reference).image for path in named_files(base, repeats, False)]
     return measured_noise([reference.image, *others], mask)

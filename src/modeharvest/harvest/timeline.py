@@ -26,11 +26,12 @@ class Moment:
     strain
         Mean nominal compression of the cellular part, from v0 [-].
     amplitude_px
-        Rms of v1 phi1 per component [px].
+        Rms of v1 phi1 per component [px]; of several modes the root of their squares' sum.
     leftover_px
         What the ansatz leaves over, rms per component [px].
     noise_px
-        Standard deviation of v1 phi1 by the images' noise, rms per component [px].
+        Standard deviation of v1 phi1 by the images' noise, rms per component [px]; of several
+        modes as above.
     """
 
     name: str

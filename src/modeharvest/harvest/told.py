@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.geometry import Geometry
-from modeharvest.harvest.measure import Measured, Pair
+from modeharvest.harvest.measure import Measured
 from modeharvest.harvest.optics import Optics
+from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.harvest.timeline import Moment, find_buckling, mean_strain
 from modeharvest.idic.agreement import Agreement, autocorrelation
@@ -23,6 +24,8 @@ from modeharvest.idic.error_bars import (
     field_errors,
     leftover_covariance,
     noise_covariance,
+    softened,
+    softness,
 )
 from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.identifiability import identifiability
@@ -166,22 +169,23 @@ def covariances(
     """
     result, blur = measured.result, measured.blur_px
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
-    masks = pair.mask, pair.deformed_mask
     if blur > 0.0:
-        images = blurred_pair(*images, *masks, blur)
+        images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
+    used = eroded(pair.mask, _EDGE_PX)
+    soft = softness(result, *images, used, order)
+    by_noise = softened(result, result.covariance(noise_sd), soft)
     try:
-        by_leftover = leftover_covariance(result, *images, pair.mask, cell, order)
-        if blur == 0.0:
-            return result.covariance(noise_sd), by_leftover, ()
-        examples = _noises(pair, blur, noise_sd)
-        by_noise = noise_covariance(result, *images, examples, pair.mask, cell, order)
+        by_leftover = leftover_covariance(result, *images, used, cell, order, soft)
+        if blur > 0.0:
+            examples = _noises(pair, blur, noise_sd)
+            by_noise = noise_covariance(result, *images, examples, used, cell, order, soft)
     except InputError as error:
-        return (
-            result.covariance(noise_sd),
-            None,
-            (f"No error bars for what the ansatz leaves over: {error}.",),
-        )
+        return by_noise, None, (f"No error bars for what the ansatz leaves over: {error}.",)
     return by_noise, by_leftover, ()
+
+
+_EDGE_PX = 3
+"""Pixels so near to a hole have no say in error bars [px]."""
 
 
 def _noises(
@@ -215,7 +219,7 @@ def _agreement(
     if measured.blur_px == 0.0:
         return result.agreement(prepared.noise.sd, order=order)
     back, seen = pulled_back(image, result, order)
-    used = eroded(prepared.mask(), 3) & seen
+    used = eroded(prepared.mask(), _EDGE_PX) & seen
     f, g = reference[used], back[used]
     gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
     offset = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
@@ -232,7 +236,7 @@ def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
     return Moment(
         name=frame.name,
         strain=frame.strain_x,
-        amplitude_px=seen.amplitude_px[0] if seen.amplitude_px else 0.0,
+        amplitude_px=float(np.linalg.norm(seen.amplitude_px)),
         leftover_px=seen.leftover_px,
         noise_px=_inside(frame.by_noise, frame.error_x, frame.error_y, cellular) / px,
     )
@@ -243,8 +247,8 @@ def _inside(errors: FieldErrors, x: FloatArray, y: FloatArray, box: Box) -> floa
     if not len(errors.fluctuation):
         return 0.0
     cols, rows = (box.x_min <= x) & (x <= box.x_max), (box.y_min <= y) & (y <= box.y_max)
-    part = errors.fluctuation[0][np.ix_(rows, cols)]
-    return float(np.sqrt(np.mean(part**2)))
+    variance = (errors.fluctuation**2).sum(axis=0)[np.ix_(rows, cols)]
+    return float(np.sqrt(np.mean(variance)))
 
 
 def _axes(domain: Box) -> tuple[FloatArray, FloatArray]:

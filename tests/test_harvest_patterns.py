@@ -1,0 +1,167 @@
+"""Several modes, several regions, holes that leave the image: through the whole path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from synthetic_photographs import Displacement, Photographed, lattice_points, of
+
+from modeharvest.errors import InputError
+from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.measure import Measured
+from modeharvest.harvest.pipeline import Harvesting
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.fourier import FourierMode, free_family, square_family
+from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.idic.support import Taper
+from modeharvest.imaging.grid import PixelGrid
+
+PITCH, PIXEL = 1.9, 0.035
+FloatArray = NDArray[np.float64]
+
+
+def corners(box: Box, grid: PixelGrid) -> list[list[float]]:
+    """A box as corners [column, row] [px]."""
+    (top, bottom), (left, right) = grid.to_px([box.x_min, box.x_max], [box.y_max, box.y_min])
+    return [[float(c), float(r)] for c, r in
+            ((left, top), (right, top), (right, bottom), (left, bottom))]  # fmt: skip
+
+
+def harvesting(folder: Path, specimen: str = "", correlation: str = "") -> Harvesting:
+    """Of the photographs in a folder."""
+    (folder / "experiment.toml").write_text(
+        '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
+        f"[scale]\npixel_size = {PIXEL}\n[correlation]\nv0_degree = 3\nv_degree = 1\n{correlation}"
+        f"\n[specimen]\ncell_size = {PITCH}\n{specimen}"
+    )
+    return Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+
+
+def error_px(measured: Measured, scene: Photographed, truth: Displacement) -> float:
+    """Rms per component over the material."""
+    off = (measured.result.displacement() - truth(scene.points))[scene.mask]
+    return float(np.sqrt(np.mean(off**2)) / PIXEL)
+
+
+def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> None:
+    """Waves that share no vector of the reciprocal lattice, each with its own amplitude."""
+    vectors = PITCH * np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
+    cellular = Box.centred(6 * PITCH, 7 * vectors[1, 1])
+    domain = Box.centred(6 * PITCH + 1.6, 7 * vectors[1, 1] + 1.6)
+    first, second = PITCH * np.linalg.inv(vectors).T
+    waves = [first / 2, second / 2, (first + second) / 2]
+    modes = []
+    for k, xi in enumerate(waves):
+        across = np.array([-xi[1], xi[0]]) / np.linalg.norm(xi)
+        family = free_family([[*across, *(2 * xi), 0.4 * k]])
+        modes.append(FourierMode.scaled(family, PITCH, Taper(cellular, PITCH / 2)))
+    ansatz = Ansatz(domain, tuple(modes), v0_degree=3, v_degree=0)
+    a = ansatz.start(0.05)
+    for i, size in enumerate((3.0, -2.2, 2.6)):
+        a[ansatz.v_slice(i)][0] = size
+    holes = lattice_points(vectors, Box.centred(5 * PITCH + 0.1, 6.4 * vectors[1, 1]), (0.0, 0.0))
+    scene = Photographed(PixelGrid.centred(430, 430, PIXEL), domain, holes, 1.4)
+    scene.save(tmp_path, {"frame": of(ansatz, a)})
+    run = harvesting(tmp_path, f"polygon = {corners(cellular, scene.grid)}")
+    measured = run.results()["frame"]
+    assert run.geometry.lattice is not None
+    assert run.geometry.lattice.kind == "hexagonal"
+    assert measured.result.outcome is Outcome.CONVERGED
+    found = [
+        mode.family.waves(measured.result.mode_parameters(i))[0][2:4] / 2
+        for i, mode in enumerate(measured.result.ansatz.modes)
+    ]
+    assert len(found) == 3
+    for xi in waves:
+        near = min(min(np.linalg.norm(f - xi), np.linalg.norm(f + xi)) for f in found)
+        assert near < 0.01 * np.linalg.norm(xi)
+    # The truth is in the ansatz: what is left is noise, of 1 % of the contrast and 70 unknowns.
+    assert error_px(measured, scene, of(ansatz, a)) < 0.03
+
+
+def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
+    """Square pattern above; below, rows of holes that shear alternately."""
+    cellular, domain = Box.centred(6 * PITCH, 8 * PITCH), Box.centred(6 * PITCH + 1.6, 17.0)
+    above = Box(cellular.x_min, cellular.x_max, 0.0, cellular.y_max)
+    below = Box(cellular.x_min, cellular.x_max, cellular.y_min, 0.0)
+    shear = free_family([[0.0, 1.0, 1.0, 0.0, 0.3]])
+    modes = tuple(
+        FourierMode.scaled(family, PITCH, Taper(box, PITCH / 2))
+        for family, box in ((square_family("junction"), above), (shear, below))
+    )
+    ansatz = Ansatz(domain, modes, v0_degree=3, v_degree=0)
+    a = ansatz.start(0.04)
+    for i, size in enumerate((3.0, 2.5)):
+        a[ansatz.v_slice(i)][0] = size
+    holes = lattice_points(PITCH * np.eye(2), cellular, (PITCH / 2, PITCH / 2))
+    scene = Photographed(PixelGrid.centred(540, 430, PIXEL), domain, holes, 1.4)
+    return scene, of(ansatz, a), (above, below)
+
+
+def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
+    scene, truth, boxes = two_patterns()
+    scene.save(tmp_path, {"frame": truth})
+    tables = [
+        f'[[specimen.regions]]\nname = "{name}"\npolygon = {corners(box, scene.grid)}\n'
+        for name, box in zip(("above", "below"), boxes, strict=True)
+    ]
+    measured = harvesting(tmp_path, "".join(tables)).results()["frame"]
+    modes = measured.result.ansatz.modes
+    assert measured.result.outcome is Outcome.CONVERGED
+    assert [mode.family.name for mode in modes] == ["square", "1 wave, free"]
+    for mode, box in zip(modes, boxes, strict=True):
+        own = mode.taper.cellular
+        assert (own.y_min, own.y_max) == pytest.approx((box.y_min, box.y_max), abs=1e-9)
+    said = " ".join(measured.sentences)
+    assert "Region 'above', v1 phi1:" in said
+    assert "Region 'below', v2 phi2:" in said
+    assert error_px(measured, scene, truth) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("polygons", "message"),
+    [
+        (([0, 0, 100, 100], [50, 50, 150, 150]), "overlap by"),
+        (([0, 0, 100, 100], [200, 200, 900, 300]), "specimen.regions 'b': expected a polygon"),
+    ],
+)
+def test_parts_that_can_not_be_are_refused(
+    tmp_path: Path, polygons: tuple[list[int], list[int]], message: str
+) -> None:
+    scene, truth, _ = two_patterns()
+    scene.save(tmp_path, {"frame": truth})
+    tables = [
+        f'[[specimen.regions]]\nname = "{name}"\n'
+        f"polygon = [[{a},{b}],[{c},{b}],[{c},{d}],[{a},{d}]]\n"
+        for name, (a, b, c, d) in zip("ab", polygons, strict=True)
+    ]
+    with pytest.raises(InputError, match=message):
+        harvesting(tmp_path, "".join(tables)).results()
+
+
+@pytest.mark.parametrize("edge", [True, False])
+def test_a_column_that_leaves_the_image_does_not_move_the_lattice_by_a_cell(
+    tmp_path: Path, edge: bool
+) -> None:
+    """Motion of 0.8 cells: the other answer, 0.2 cells back, is the shorter one.
+
+    With the specimen's edge in the image both match as many holes; without it, where a column
+    enters at the other side, the wrong answer matches more.
+    """
+    outline = Box(-5.8 if edge else -30.0, 30.0, -30.0, 30.0)
+    holes = lattice_points(PITCH * np.eye(2), Box(-5.0, 12.0, -12.0, 12.0), (0.0, 0.0))
+    if not edge:
+        holes = lattice_points(PITCH * np.eye(2), Box.centred(30.0, 24.0), (0.0, 0.0))
+    scene = Photographed(PixelGrid.centred(330, 400, PIXEL), outline, holes, 1.4)
+
+    def truth(points: FloatArray) -> FloatArray:
+        return 0.8 * PITCH * np.array([1.0, 0.0]) - 0.01 * points
+
+    scene.save(tmp_path, {"frame": truth})
+    measured = harvesting(tmp_path).results()["frame"]
+    assert "told by the speckle" in measured.sentences[0]
+    assert error_px(measured, scene, truth) < 0.1
