@@ -74,6 +74,8 @@ class Findings:
         Pictures.
     tables
         Tables by their titles.
+    attachments
+        Tables that are too long for the page: files only.
     """
 
     numbers: Mapping[str, Any]
@@ -81,6 +83,7 @@ class Findings:
     keys: tuple[KeyNumber, ...] = ()
     plots: tuple[Plot, ...] = ()
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    attachments: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
 
 class Study(Protocol):

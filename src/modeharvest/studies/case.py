@@ -28,10 +28,11 @@ from pydantic import field_validator, model_validator
 from modeharvest.case import Case
 from modeharvest.case_file import checked, kind_of, nearest, of_kind, read_tables
 from modeharvest.errors import InputError
+from modeharvest.validation.studies.noise import Noise
 from modeharvest.validation.studies.robustness import Robustness
 from modeharvest.validation.studies.study import Study
 
-KINDS: dict[str, type[Any]] = {"robustness": Robustness}
+KINDS: dict[str, type[Any]] = {"robustness": Robustness, "noise": Noise}
 _SHIPPED = resources.files("modeharvest") / "studies"
 _QUICK = 2.0
 """A quick study's pixels are that much larger."""
