@@ -1,0 +1,91 @@
+"""A test from photograph to photograph: when it buckles, and where each correlation starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from synthetic_photographs import Displacement, Photographed, lattice_points, of
+
+from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.pipeline import Harvesting
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.imaging.grid import PixelGrid
+
+PITCH, PIXEL = 1.9, 0.035
+CRITICAL = 0.042
+STRAINS = (0.03, 0.04, 0.05, 0.06, 0.07)
+FOREIGN = "frame_500"
+CELLULAR = Box.centred(4 * PITCH, 5 * PITCH)
+DOMAIN = Box.centred(4 * PITCH + 1.6, 5 * PITCH + 1.6)
+HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, 0.0))
+
+
+def scene(seed: int = 2) -> Photographed:
+    return Photographed(PixelGrid.centred(360, 300, PIXEL), DOMAIN, HOLES, 1.4, seed)
+
+
+def truth(strain: float) -> Displacement:
+    """A pitchfork: beyond a strain, a pattern whose square grows with the strain."""
+    ansatz = Ansatz.square(DOMAIN, CELLULAR, PITCH)
+    return of(ansatz, ansatz.start(strain, 20.0 * np.sqrt(max(0.0, strain - CRITICAL))))
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five states, and a photograph of another specimen between the third and the fourth."""
+    folder = tmp_path_factory.mktemp("photographs")
+    scene().save(folder, {f"frame_{1e4 * e:03.0f}": truth(e) for e in STRAINS})
+    tifffile.imwrite(folder / f"{FOREIGN}x.tif", scene(seed=9).image(truth(0.052)))
+    return folder
+
+
+@pytest.fixture(scope="module", params=["total", "updated"])
+def harvesting(
+    request: pytest.FixtureRequest, photographs: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Harvesting:
+    """In both formulations."""
+    path = photographs / f"{request.param}.toml"
+    path.write_text(
+        '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
+        f'[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = "{request.param}"\n'
+    )
+    folder = tmp_path_factory.mktemp(request.param)
+    return Harvesting(read_experiment(path), photographs, folder)
+
+
+def test_buckling_is_bracketed_and_estimated(harvesting: Harvesting) -> None:
+    found = harvesting.harvest()
+    strains = [moment.strain for moment in found.timeline]
+    # 0.1 px between two edges that are 217 px apart.
+    assert strains == pytest.approx(STRAINS, abs=5e-4)
+    assert [moment.has_pattern for moment in found.timeline] == [e > CRITICAL for e in STRAINS]
+    buckling = found.buckling
+    assert buckling is not None
+    assert (buckling.before, buckling.after) == pytest.approx((0.04, 0.05), abs=5e-4)
+    assert buckling.estimate == pytest.approx(CRITICAL, abs=5e-4)
+
+
+def test_every_frame_is_measured(harvesting: Harvesting) -> None:
+    results, shown = harvesting.results(), scene()
+    assert [name for name, _ in harvesting.failures()] == [f"{FOREIGN}x"]
+    for strain, measured in zip(STRAINS, results.values(), strict=True):
+        assert measured.result.outcome is Outcome.CONVERGED
+        off = (measured.result.displacement() - truth(strain)(shown.points))[shown.mask]
+        # Before buckling the held mode can't be in the way; the updated formulation inherits
+        # what earlier frames err by, and interpolates once more.
+        assert np.sqrt(np.mean(off**2)) / PIXEL < 0.03
+
+
+def test_each_goes_on_from_the_one_before(harvesting: Harvesting) -> None:
+    """As long as it shows what the one before has shown."""
+    results = list(harvesting.results().values())
+    goes_on = ["started from the result of the photograph before" in " ".join(m.sentences)
+               for m in results]  # fmt: skip
+    # The second has a held mode as the first; the third shows a pattern that the second has not.
+    assert goes_on == [False, True, False, True, True]
