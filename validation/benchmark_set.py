@@ -30,7 +30,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.files import atomic, read_json, write_json
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.imageset import ImageSet, ImagingSpec
 from modeharvest.imaging.isoparametric import interpolate, locate
 from modeharvest.imaging.pointwise import locate_points
 from modeharvest.validation.benchmark_words import RETURNED, readme
@@ -183,11 +183,7 @@ def publish(
     """
     public, truth = Path(public), Path(truth)
     require_apart(public, truth)
-    if images.spec.distortion is not None:
-        raise InputError(
-            "expected images without a lens for a benchmark, got distorted ones, in which a "
-            "displacement isn't that of the specimen; leave out [imaging.distortion]"
-        )
+    require_no_lens(images.spec)
     if not _is_whole(public, truth, images):
         for part in (public / SIDECAR, truth / SIDECAR):
             part.unlink(missing_ok=True)
@@ -219,6 +215,15 @@ def require_apart(public: Path, truth: Path) -> None:
         raise InputError(
             f"expected a public folder without truth, got {secrets[0]} in {public}; "
             "give another --out"
+        )
+
+
+def require_no_lens(spec: ImagingSpec) -> None:
+    """Raise InputError if images are distorted: what they show is not the specimen's motion."""
+    if spec.distortion is not None:
+        raise InputError(
+            "expected images without a lens for a benchmark, got distorted ones, in which a "
+            "displacement isn't that of the specimen; leave out [imaging.distortion]"
         )
 
 

@@ -177,6 +177,7 @@ def page(grading: Grading) -> str:
         TEMPLATE,
         title=f"Benchmark {grading.truth.id} at {100 * grading.strain:g} %",
         grading=grading,
+        hero=to_svg(draw_length(maps, grading.scores[0]), "best", "Length of the best one's error"),
         everywhere=EVERYWHERE,
         common=COMMON,
         percentiles=PERCENTILES,

@@ -181,12 +181,15 @@ def _labels_at(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> 
 def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> None:
     """Recognise positions in another unit, or beside the specimen."""
     there = float((_labels_at(field, labels, grid) >= 0).mean())
-    x, y = grid.to_mm(-field.y, field.x)  # as if pixels, rows down, had been called mm
     row, col = grid.to_px(field.x, field.y)
-    for other, words in (
-        (LocalField(x, y, field.u, field.good), "pixels declared as mm"),
-        (LocalField(col, -row, field.u, field.good), "mm declared as pixels"),
+    last, px, mm = grid.rows - 1, "pixels declared as mm", "mm declared as pixels"
+    for (x, y), words in (
+        (grid.to_mm(-field.y, field.x), px),  # rows down
+        (grid.to_mm(last - field.y, field.x), px),
+        ((col, -row), mm),
+        ((col, last - row), mm),
     ):
+        other = LocalField(x, y, field.u, field.good)
         share = float((_labels_at(other, labels, grid) >= 0).mean())
         if share > 0.1 and there < 0.2 * share:
             raise InputError(

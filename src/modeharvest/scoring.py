@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from modeharvest.case import Case, TwinCase, read_case
+from modeharvest.case import Case, read_case
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, require_writable
@@ -30,6 +30,7 @@ from modeharvest.validation.benchmark_set import (
     BenchmarkTruth,
     publish,
     require_apart,
+    require_no_lens,
 )
 from modeharvest.validation.regions import EDGE_PX, REGIONS, regions
 from modeharvest.validation.score_fields import Declared, read_measured
@@ -78,10 +79,7 @@ def make_benchmark(
         If the case's images are distorted, or the truth would be in the public folder.
     """
     case, public = case if isinstance(case, Case) else read_case(case), Path(public)
-    if isinstance(case, TwinCase):
-        raise InputError(
-            "expected a case without a lens for a benchmark, got the twin of a real experiment"
-        )
+    require_no_lens(case.imaging)
     truth = truth_folder(public) if truth is None else Path(truth)
     require_apart(public, truth)
     require_writable(public)

@@ -1,0 +1,198 @@
+"""Several fields: ranked, in files and on a page, by command.
+
+Guards: the best comes first, whoever covers little does not win; numbers of table, files and page
+are the same; nothing is loaded from elsewhere; the error's spectrum adds up.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_benchmark as made
+from html_page import Page
+from numpy.typing import NDArray
+from synthetic_benchmark import PIXEL, STRAIN
+
+from modeharvest import cli
+from modeharvest.idic.field_files import write_field
+from modeharvest.idic.local_field import LocalField
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.benchmark_set import BenchmarkTruth
+from modeharvest.validation.page import short
+from modeharvest.validation.regions import REGIONS, regions
+from modeharvest.validation.score_spectrum import error_spectrum
+from modeharvest.validation.scoring import Score, ranked, score
+
+FloatArray = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> BenchmarkTruth:
+    return BenchmarkTruth.read(made.make(tmp_path_factory.mktemp("benchmark"))[1])
+
+
+def noisy(truth: BenchmarkTruth, sd_px: float, name: str, share: float = 1.0) -> LocalField:
+    """The truth with noise; the last points lost."""
+    x, y, u = made.points(truth)
+    u = u + sd_px * PIXEL * np.random.default_rng(0).normal(size=u.shape)
+    u[int(share * len(u)) :] = np.nan
+    return LocalField(x, y, u, source=name)
+
+
+def labels(truth: BenchmarkTruth) -> NDArray[np.int8]:
+    return regions(truth.mask, truth.grid, truth.specimen, edge_px=3)
+
+
+def score_of(truth: BenchmarkTruth, field: LocalField) -> Score:
+    true = truth.displacement(STRAIN, field.x, field.y)
+    return score(field, true, labels(truth), truth.grid)
+
+
+@pytest.fixture(scope="module")
+def command(
+    truth: BenchmarkTruth, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str, int]:
+    """Folder, what was said, and exit code of ``modeharvest score`` on three fields."""
+    folder = tmp_path_factory.mktemp("codes")
+    for name, sd, share in (("fair", 0.1, 0.9), ("good", 0.01, 1.0), ("sparse", 0.001, 0.4)):
+        write_field(folder / f"{name}.csv", noisy(truth, sd, name, share))
+    fields = [folder / f"{name}.csv" for name in ("fair", "sparse", "good")]
+    with pytest.MonkeyPatch.context() as patch:
+        return folder, *run(patch, folder, truth, fields)
+
+
+def run(
+    patch: pytest.MonkeyPatch, folder: Path, truth: BenchmarkTruth, fields: list[Path]
+) -> tuple[str, int]:
+    arguments = ["score", *fields, "--truth", truth.folder, "--strain", STRAIN]
+    patch.setattr(sys, "argv", ["modeharvest", *map(str, arguments), "--out", str(folder / "out")])
+    said: list[str] = []
+    patch.setattr("rich.console.Console.print", lambda _, *what, **how: said.extend(map(str, what)))
+    try:
+        cli.main()
+    except SystemExit as end:
+        return "\n".join(said), int(end.code or 0)
+    return "\n".join(said), 0
+
+
+def test_the_best_comes_first_and_the_sparse_last(truth: BenchmarkTruth) -> None:
+    fields = [noisy(truth, 0.1, "fair"), noisy(truth, 0.001, "sparse", 0.4),
+              noisy(truth, 0.01, "good"), noisy(truth, 0.05, "holey", 0.8)]  # fmt: skip
+    scores = [score_of(truth, field) for field in fields]
+    assert [s.source for s in ranked(scores)] == ["good", "holey", "fair", "sparse"]
+    assert [s.source for s in ranked(scores[::-1])] == ["good", "holey", "fair", "sparse"]
+
+
+def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
+    folder, said, code = command
+    assert code == 0
+    summary = json.loads((folder / "out" / "scores.json").read_text("utf-8"))
+    assert [field["name"] for field in summary["fields"]] == ["good", "fair", "sparse"]
+    assert summary["fields"][1]["everywhere"]["returned"] == pytest.approx(0.9, abs=1e-3)
+    page = (folder / "out" / "report.html").read_text("utf-8")
+    with (folder / "out" / "scores.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * (2 + len(REGIONS))
+    for field in summary["fields"]:
+        rms = field["everywhere"]["rms_px"]
+        (row,) = (r for r in rows if (r["field"], r["region"]) == (field["name"], "everywhere"))
+        assert float(row["rms [px]"]) == pytest.approx(rms, rel=1e-5)
+        assert short(rms) in page
+    assert "sparse covers" in said
+    assert "sparse covers" in page
+    assert "report.html" in said
+
+
+def test_no_number_is_not_a_number_in_json(command: tuple[Path, str, int]) -> None:
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    text = (command[0] / "out" / "scores.json").read_text("utf-8")
+    json.loads(text, parse_constant=refuse)
+
+
+def test_where_all_measure_is_where_the_sparse_one_does(command: tuple[Path, str, int]) -> None:
+    summary = json.loads((command[0] / "out" / "scores.json").read_text("utf-8"))
+    sparse = summary["fields"][-1]
+    assert summary["covered_by_all"] == pytest.approx(sparse["covered"], abs=0.01)
+    for field, sd in zip(summary["fields"], (0.01, 0.1, 0.001), strict=True):
+        # Of several hundred points: within a few percent of the noise that was put in.
+        assert field["where all measure"]["rms_px"] == pytest.approx(sd, rel=0.15)
+
+
+def test_the_page_is_whole_and_loads_nothing(command: tuple[Path, str, int]) -> None:
+    text = (command[0] / "out" / "report.html").read_text("utf-8")
+    page = Page(text)
+    assert page.open == []
+    assert max(page.ids.values()) == 1
+    assert all(source.startswith("data:") for source in page.sources)
+    outside = [link for link in page.links if not link.startswith("#")]
+    assert all(link.startswith("https://doi.org/") for link in outside)
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    for name in ("ranking", "distribution", "regions", "spectrum", "maps", "notes"):
+        assert page.ids[name] == 1
+    for n in range(3):
+        assert all(page.ids[f"{kind}-{n}"] == 1 for kind in ("length", "x", "y"))
+
+
+def test_a_perfect_field_alone_gets_its_page(
+    truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing to compare with, and no logarithm of its errors."""
+    x, y, u = made.points(truth)
+    np.savez(tmp_path / "exact.npz", **{"x [mm]": x, "y up [mm]": y, "u [mm]": u[:, 0],
+                                        "v up [mm]": u[:, 1]})  # fmt: skip
+    said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "exact.npz"])
+    assert code == 0
+    assert "that all cover" not in said
+    text = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert Page(text).open == []
+    assert "where all measure" not in text
+
+
+def test_bad_input_is_one_line(
+    truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "none.csv"])
+    assert code == 2
+    assert re.search(r"error:.*none\.csv", said)
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.parametrize("length_px", [12.0, 30.0])
+def test_a_wave_of_error_is_found_at_its_wavelength(length_px: float) -> None:
+    """On a full grid: nothing leaks but by the box's edges."""
+    grid = PixelGrid.centred(240, 360, PIXEL)
+    row, col = np.mgrid[0 : grid.rows : 2, 0 : grid.cols : 2]
+    x, y = grid.to_mm(row.ravel(), col.ravel())
+    wave = 0.2 * np.cos(2 * np.pi * col.ravel() / length_px)
+    error = np.column_stack([wave, np.zeros_like(wave)])
+    plain = LocalField(x, y, PIXEL * error, source="wave")
+    graded = score(plain, np.zeros((x.size, 2)), np.zeros(grid.shape, dtype=np.int8), grid)
+    spectrum = error_spectrum(graded, grid)
+    assert spectrum is not None
+    top = int(np.argmax(spectrum.rms_px))
+    # The middle of its third of an octave is at most a sixth of one away.
+    assert abs(np.log2(spectrum.wavelength_px[top] / length_px)) < 1 / 6 + 1e-9
+    rms = 0.2 / 2  # of a cosine, over two components
+    assert spectrum.rms_px[top] == pytest.approx(rms, rel=0.02)
+    everything = np.sqrt((spectrum.rms_px**2).sum() + spectrum.affine_px**2)
+    assert everything == pytest.approx(graded.everywhere.rms_px, rel=1e-9)
+    moved = replace(graded, error_px=graded.error_px + np.array([0.3, 0.0]))
+    shifted = error_spectrum(moved, grid)
+    assert shifted is not None
+    assert shifted.affine_px == pytest.approx(0.3 / np.sqrt(2), rel=1e-2)
+
+
+def test_points_in_a_line_have_no_spectrum(truth: BenchmarkTruth) -> None:
+    field = noisy(truth, 0.1, "line")
+    (x,) = {field.x[0]}
+    line = field.selected(field.x == x)
+    assert error_spectrum(score_of(truth, line), truth.grid) is None
