@@ -110,18 +110,36 @@ def modes(case: CaseName, out: OutFolder) -> None:
     print_lattice(_of_lattice(case, out, lambda analysis: analysis.all()), out)
 
 
+def _example(wanted: bool) -> None:
+    if wanted:
+        from modeharvest.harvest.example import EXAMPLE
+
+        print(EXAMPLE, end="")
+        raise typer.Exit
+
+
 @app.command()
 def harvest(
     experiment: Annotated[
         Path, typer.Argument(metavar="EXPERIMENT.toml", help="What there are photographs of.")
     ],
     out: OutFolder,
+    example: Annotated[
+        bool,
+        typer.Option(
+            "--example",
+            callback=_example,
+            is_eager=True,
+            help="Print a commented EXPERIMENT.toml with every option, and stop.",
+        ),
+    ] = False,
 ) -> None:
     """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
 
     The TOML file names the reference and the deformed images, the pixel size and the cell size;
-    all else is found or has a default. Leaves results/, report.html and summary.json in DIR. Run
-    the same command again after an interruption: finished photographs are not measured again.
+    all else is found or has a default. Begin with 'modeharvest harvest --example >
+    experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
+    again after an interruption: finished photographs are not measured again.
     """
     from modeharvest.harvest import pipeline, terminal
 

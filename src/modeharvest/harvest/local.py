@@ -54,8 +54,19 @@ def local_field(
             options,
         )  # fmt: skip
     path = of_each_photograph(experiment, base, table.files, "local.files")[name]
-    field = read_field(path, grid, units=table.unit, y_axis=table.y_axis)
+    field = read_field(
+        path,
+        grid,
+        units=_told(table.unit),
+        y_axis=_told(table.y_axis),
+        first_pixel=table.first_pixel,
+        columns=table.columns,
+    )
     return field if distortion is None else without_distortion(field, grid, distortion)
+
+
+def _told(value: str) -> str | None:
+    return None if value == "auto" else value
 
 
 def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:

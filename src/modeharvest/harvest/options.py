@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from modeharvest.case_file import nearest
 from modeharvest.errors import InputError
@@ -23,17 +23,24 @@ class LocalTable:
     files
         A field for each deformed image (CSV, NPZ, HDF5, MAT), with code = "file".
     unit
-        "px" or "mm", of the files.
+        "px" or "mm", of the files; "auto" as their columns' names say.
     y_axis
-        "down" or "up", of the files.
+        "down" or "up", of the files; "auto" as their columns' names say.
+    first_pixel
+        What the files call the first pixel, 0 or 1.
+    columns
+        Names, or numbers from 1, of the files' columns for "x", "y", "u" and "v", where they
+        can't be known by themselves.
     subset, step
         Edge of the subsets, odd, and their distance [px], with code = "pyvale".
     """
 
     code: str = "none"
     files: tuple[str, ...] = ()
-    unit: str = "px"
-    y_axis: str = "down"
+    unit: str = "auto"
+    y_axis: str = "auto"
+    first_pixel: int = 0
+    columns: dict[str, str | int] = field(default_factory=dict)
     subset: int = 21
     step: int = 5
 
@@ -45,10 +52,10 @@ class LocalTable:
                 "local: expected files with code = 'file' and only then, got code = "
                 f"{self.code!r} and {len(self.files)} files"
             )
-        if self.unit not in ("px", "mm") or self.y_axis not in ("down", "up"):
+        if self.unit not in ("auto", "px", "mm") or self.y_axis not in ("auto", "down", "up"):
             raise InputError(
-                f"local: expected unit 'px' or 'mm' and y_axis 'down' or 'up', got {self.unit!r} "
-                f"and {self.y_axis!r}"
+                "local: expected unit 'auto', 'px' or 'mm' and y_axis 'auto', 'down' or 'up', got "
+                f"{self.unit!r} and {self.y_axis!r}"
             )
         if self.subset < 5 or self.subset % 2 == 0 or self.step < 1:
             raise InputError(
