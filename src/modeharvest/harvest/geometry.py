@@ -17,7 +17,7 @@ from modeharvest.idic.hole_lattice import HoleLattice, find_hole_lattice
 from modeharvest.idic.hole_motion import HoleMotion, possible_motions
 from modeharvest.idic.region import Region, region_of_lattice, region_of_mask, region_of_polygon
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.io import read_mask
+from modeharvest.imaging.io import read_mask, require_same_shape
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -139,7 +139,9 @@ def _region(
     if table.polygon:
         return _polygon(table.polygon, mask, grid, "specimen.polygon")
     if table.cells:
-        return region_of_mask(read_mask(base / table.cells), mask, grid)
+        cells = read_mask(base / table.cells)
+        require_same_shape(mask, cells, "the photographs", str(base / table.cells))
+        return region_of_mask(cells, mask, grid)
     if lattice is not None:
         return region_of_lattice(lattice, mask, grid)
     corners = np.array([corner for region in table.regions for corner in region.polygon])

@@ -120,6 +120,7 @@ class Harvesting:
             If none can be measured.
         """
         prepared = self.prepared()
+        _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
         found: dict[str, Measured] = {}
         key = digest([self._prepared_key(), self._how()])
         for name in prepared.names:

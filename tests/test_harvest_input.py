@@ -1,0 +1,197 @@
+"""What users get wrong: one line, exit code 2, and what was there before is still there."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from synthetic_photographs import Photographed, lattice_points, of
+
+from modeharvest import cli
+from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.pipeline import Harvesting
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.imaging.grid import PixelGrid
+
+PITCH, PIXEL = 1.9, 0.035
+CELLULAR, DOMAIN = Box.centred(3 * PITCH, 4 * PITCH), Box.centred(3 * PITCH + 1.6, 4 * PITCH + 1.6)
+HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (0.0, PITCH / 2))
+ANSATZ = Ansatz.square(DOMAIN, CELLULAR, PITCH)
+EXPERIMENT = f"""
+[images]
+reference = "reference.tif"
+deformed = ["frame_*.tif"]
+[scale]
+pixel_size = {PIXEL}
+[specimen]
+cell_size = {PITCH}
+[correlation]
+v0_degree = 2
+v_degree = 1
+"""
+
+
+def scene(seed: int = 2) -> Photographed:
+    return Photographed(PixelGrid.centred(310, 250, PIXEL), DOMAIN, HOLES, 1.4, seed)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with nothing wrong in it."""
+    folder = tmp_path_factory.mktemp("sound")
+    states = {f"frame_{n}": of(ANSATZ, ANSATZ.start(0.02 * n, 0.0)) for n in (1, 2, 3)}
+    scene().save(folder, states)
+    (folder / "experiment.toml").write_text(EXPERIMENT)
+    return folder
+
+
+@pytest.fixture
+def folder(sound: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be spoilt."""
+    return Path(shutil.copytree(sound, tmp_path / "test"))
+
+
+Spoil = Callable[[Path], None]
+
+
+def text(old: str, new: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        assert old in EXPERIMENT
+        (folder / "experiment.toml").write_text(EXPERIMENT.replace(old, new))
+
+    return spoil
+
+
+def and_a_file(spoil: Spoil, name: str, image: np.ndarray | bytes) -> Spoil:
+    def both(folder: Path) -> None:
+        spoil(folder)
+        if isinstance(image, bytes):
+            (folder / name).write_bytes(image)
+        else:
+            tifffile.imwrite(folder / name, image)
+
+    return both
+
+
+def no_file(folder: Path) -> None:
+    (folder / "experiment.toml").unlink()
+
+
+def nothing(folder: Path) -> None:
+    pass
+
+
+def mask(key: str, name: str) -> Spoil:
+    return text(f"cell_size = {PITCH}", f'cell_size = {PITCH}\n{key} = "{name}"')
+
+
+def tables(more: str) -> Spoil:
+    return text("[correlation]", f"{more}\n[correlation]")
+
+
+def table_of(field: str) -> Spoil:
+    return tables(f'[local]\ncode = "file"\nfiles = ["{field}", "{field}", "{field}"]')
+
+
+SMALL = np.full((100, 100), 255, dtype=np.uint8)
+LENS = '[distortion]\ncalibration = ["frame_1.tif", "frame_2.tif"]'
+OUTSIDE = f"cell_size = {PITCH}\npolygon = [[10, 10], [900, 10], [900, 200]]"
+CASES: dict[str, tuple[Spoil, str]] = {
+    "cell size": (text(f"= {PITCH}", "= 2.3"), "correct the cell size"),
+    "no TOML": (no_file, "experiment.toml"),
+    "not TOML": (text("[images]", "[images"), "not valid TOML"),
+    "unknown key": (text("v_degree", "v_degre"), "did you mean 'v_degree'?"),
+    "unknown table": (tables("[corelation]"), "did you mean 'correlation'?"),
+    "no scale": (text(f"pixel_size = {PIXEL}", ""), "pixel_size"),
+    "missing frame": (text('"frame_*.tif"', '"frame_1.tif", "no.tif"'), "no.tif"),
+    "other specimen": (
+        and_a_file(nothing, "reference.tif", scene(seed=7).image()), "not the reference"),
+    "material of other size": (and_a_file(mask("material", "m.tif"), "m.tif", SMALL), "m.tif"),
+    "cells of other size": (and_a_file(mask("cells", "m.tif"), "m.tif", SMALL), "m.tif"),
+    "no such mask": (mask("material", "m.tif"), "m.tif"),
+    "too few masks": (
+        text(f"= {PITCH}", f'= {PITCH}\ndeformed_material = ["frame_1.tif"]'), "each of 3"),
+    "polygon outside": (text(f"cell_size = {PITCH}", OUTSIDE), "polygon inside the image"),
+    "two calibration images": (tables(LENS), "at least 3 photographs"),
+    "repeats of another state": (
+        text('"reference.tif"', '"reference.tif"\nrepeats = ["frame_3.tif"]'), "images.repeats"),
+    "pyvale": (tables('[local]\ncode = "pyvale"'), "MODEHARVEST_PYVALE"),
+    "field's columns": (
+        and_a_file(table_of("f.csv"), "f.csv", b"a,b,c\n1,2,3\n"), "f.csv"),
+    "too few fields": (
+        tables('[local]\ncode = "file"\nfiles = ["frame_1.tif"]'), "local.files: expected one"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_one_line_and_nothing_is_lost(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    case: str,
+) -> None:
+    spoil, message = CASES[case]
+    spoil(folder)
+    out = folder / "out"
+    out.mkdir()
+    (out / "report.html").write_text("of an earlier harvest")
+    monkeypatch.setenv("MODEHARVEST_PYVALE", str(folder / "no-such-python"))
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    arguments = ["modeharvest", "harvest", str(folder / "experiment.toml"), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    said = capsys.readouterr().err
+    assert end.value.code == 2
+    assert "Traceback" not in said
+    (line,) = [row for row in said.splitlines() if row.startswith("error:")]
+    assert message in line
+    assert all(path.read_bytes() == content for path, content in before.items())
+    assert not (out / "summary.json").exists()
+
+
+def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
+    """A constant one, one of 16 bits, and one whose mask is of another size."""
+    shape = scene().grid.shape
+    tifffile.imwrite(folder / "frame_1a.tif", np.full(shape, 90, dtype=np.uint8))
+    deep = tifffile.imread(folder / "frame_2.tif").astype(np.uint16) * 257
+    tifffile.imwrite(folder / "frame_1b.tif", deep)
+    shutil.copy(folder / "frame_2.tif", folder / "frame_2a.tif")
+    for path in sorted(folder.glob("frame_*.tif")):
+        whole = SMALL if path.stem == "frame_2a" else np.full(shape, 255, dtype=np.uint8)
+        tifffile.imwrite(folder / f"mask_{path.name}", whole)
+    text(f"= {PITCH}", f'= {PITCH}\ndeformed_material = ["mask_*.tif"]')(folder)
+    run = Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+    prepared = run.prepared()
+    assert prepared.names == ("frame_1", "frame_2", "frame_3")
+    reasons = dict(prepared.skipped)
+    assert "level 90 in 100 %" in reasons["frame_1a.tif"]
+    assert "16 bits" in reasons["frame_1b.tif"]
+    assert "100 x 100" in reasons["frame_2a.tif"]
+    assert not any("\n" in reason for reason in reasons.values())
+
+
+def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) -> None:
+    """The files are counted by the photographs that were given, not by those that were left."""
+    tifffile.imwrite(folder / "frame_2.tif", np.full(scene().grid.shape, 90, dtype=np.uint8))
+    grid = np.stack(np.meshgrid(np.arange(40, 210, 8), np.arange(40, 270, 8)), -1).reshape(-1, 2)
+    for n in (1, 2, 3):
+        points = np.column_stack(scene().grid.to_mm(grid[:, 1], grid[:, 0]))
+        u = of(ANSATZ, ANSATZ.start(0.02 * n, 0.0))(points) / PIXEL
+        rows = np.column_stack([grid, u[:, 0], -u[:, 1]])
+        header = "x [px],y [px],u [px],v [px]"
+        np.savetxt(folder / f"f{n}.csv", rows, delimiter=",", header=header, comments="")
+    tables('[local]\ncode = "file"\nfiles = ["f*.csv"]\ny_axis = "down"')(folder)
+    run = Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+    results = run.results()
+    assert list(results) == ["frame_1", "frame_3"]
+    for n in (1, 3):
+        local = results[f"frame_{n}"].local
+        truth = of(ANSATZ, ANSATZ.start(0.02 * n, 0.0))(np.column_stack([local.x, local.y]))
+        assert np.abs(local.u - truth).max() < 1e-6 * PITCH
