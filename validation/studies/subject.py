@@ -144,7 +144,7 @@ class Scene:
         InputError
             If there is no such pair, or the folder's solution is not the one it is of.
         """
-        described = read_json(folder / "subjects" / f"{name}.json")
+        described = _description(folder, name)
         return cls(
             _image_set(folder, described, progress),
             float(described["strain"]),
@@ -152,6 +152,11 @@ class Scene:
             Identification(**described["correlation"]),
             float(described["taper"]),
         )
+
+    @staticmethod
+    def images_folder(folder: Path, name: str) -> Path:
+        """Where the images of a pair are, or will be; pairs may share theirs."""
+        return folder / "images" / str(_description(folder, name)["images"])
 
     def discard(self) -> None:
         """Remove the images from the disk: there are many where a study varies them."""
@@ -184,6 +189,10 @@ class Scene:
     def mask(self) -> NDArray[np.bool_]:
         """(rows, cols) True on material of the reference."""
         return _masks(self.images.folder, self.strain)[0]
+
+
+def _description(folder: Path, name: str) -> dict[str, Any]:
+    return dict(read_json(folder / "subjects" / f"{name}.json"))
 
 
 def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> ImageSet:

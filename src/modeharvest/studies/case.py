@@ -31,8 +31,9 @@ from modeharvest.errors import InputError
 from modeharvest.validation.studies.noise import Noise
 from modeharvest.validation.studies.robustness import Robustness
 from modeharvest.validation.studies.study import Study
+from modeharvest.validation.studies.systematic import Systematic
 
-KINDS: dict[str, type[Any]] = {"robustness": Robustness, "noise": Noise}
+KINDS: dict[str, type[Any]] = {"robustness": Robustness, "noise": Noise, "systematic": Systematic}
 _SHIPPED = resources.files("modeharvest") / "studies"
 _QUICK = 2.0
 """A quick study's pixels are that much larger."""

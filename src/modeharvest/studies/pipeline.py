@@ -40,6 +40,9 @@ _QUESTIONS = {
     "images is correlated under many realisations of white noise; bias and scatter are set "
     "against the Cramér–Rao bound, and the error bars that each result tells of itself against "
     "its errors.",
+    "systematic": "Without noise a measurement is still wrong. What makes it so? One option of the "
+    "images or of the correlation is changed at a time, and the error is split into what the "
+    "ansatz can’t describe and what the measurement adds.",
 }
 
 
