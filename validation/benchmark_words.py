@@ -29,7 +29,7 @@ of every point is known, and is not in this folder. Measure it, and have your fi
 
 The float images hold grey levels as fractions of full scale, as exact as they could be made; the
 {bits}-bit images are what a camera would have stored. Say which you used. Holes and surroundings
-are {background:g}. The specimen consists of unit cells of {unit_cell_mm:g} mm; a pixel is
+are {background:g}. The specimen's unit cells measure {unit_cell_mm:g} mm, a pixel
 {pixel_size_mm:g} mm. `{mask}` is white where the reference image shows material.
 `benchmark.json` says the same to programs, with the SHA-256 of every file.
 
@@ -47,7 +47,7 @@ x [px],y down [px],u [px],v down [px]
 ```
 
 Points that your code could not measure stay in the file, as NaN: they are counted. In millimetres,
-*y* up, the same pixel is at x = {x0:.6g} mm, y = {y0:.6g} mm.
+with *y* up, the centre of the upper left pixel is at x = {x0:.6g} mm, y = {y0:.6g} mm.
 
 ## How it is graded
 

@@ -115,6 +115,25 @@ def draw_distribution(scores: Sequence[Score]) -> Figure:
     return drawn
 
 
+def draw_histogram(scores: Sequence[Score]) -> Figure:
+    """Draw how many of a field's points err by how much, in tenths of a decade."""
+    with style():
+        drawn, axes = curve(
+            "length of the error [px]", "share of points per tenth of a decade [%]"
+        )
+        for n, graded in enumerate(scores):
+            length = np.maximum(_length(graded), 1e-9)
+            if not len(length):
+                continue
+            low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
+            edges = 10.0 ** (np.arange(low, high + 2) / 10)
+            count, _ = np.histogram(length, edges)
+            axes.stairs(100 * count / graded.everywhere.points, edges, lw=1.5, **_look(n, graded))
+        axes.set(xscale="log", ylim=(0, None))
+        _legend(axes)
+    return drawn
+
+
 def draw_regions(scores: Sequence[Score]) -> Figure:
     """Draw bars of the rms error by region."""
     with style():

@@ -19,6 +19,7 @@ from modeharvest.validation.plots_scores import (
     ErrorMaps,
     draw_component,
     draw_distribution,
+    draw_histogram,
     draw_length,
     draw_regions,
     draw_spectra,
@@ -166,6 +167,7 @@ def page(grading: Grading) -> str:
     """The report, HTML."""
     maps = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, grading.scores)
     curves = [
+        _picture("histogram", "Histogram of errors", draw_histogram(grading.scores)),
         _picture("distribution", "Share of points with a larger error",
                  draw_distribution(grading.scores)),
         _picture("regions", "By region", draw_regions(grading.scores)),

@@ -32,7 +32,7 @@ from modeharvest.validation.benchmark_set import (
     require_apart,
     require_no_lens,
 )
-from modeharvest.validation.regions import EDGE_PX, REGIONS, regions
+from modeharvest.validation.regions import EDGE_PX, regions
 from modeharvest.validation.score_fields import Declared, read_measured
 from modeharvest.validation.score_mistakes import mistakes
 from modeharvest.validation.score_report import Grading, write_grading
@@ -231,35 +231,38 @@ def _column(text: str) -> tuple[str, str | int]:
 def print_grading(grading: Grading, out: Path | str) -> None:
     """Print the ranked table, what is to be kept in mind, and where the report is."""
     console = Console(highlight=False)
-    title = f"benchmark {grading.truth.id} at {100 * grading.strain:g} %; errors in px"
+    title = f"benchmark {grading.truth.id} at {100 * grading.strain:g} %, the best first"
     table = Table(title=title, title_justify="left")
-    for heading in ("", "field"):
-        table.add_column(heading)
-    headings = ("points", "returned", "covered", "bias x, y", "rms", "50 %", "95 %", "max",
-                *REGIONS)  # fmt: skip
-    for heading in headings:
-        table.add_column(heading, justify="right")
+    table.add_column("errors in px")
     for rank, graded in enumerate(grading.scores, start=1):
-        table.add_row(str(rank), escape(graded.source), *_cells(graded))
+        table.add_column(escape(f"{rank}. {graded.source}"), justify="right")
+    rows = [_cells(grading, graded) for graded in grading.scores]
+    for label in rows[0]:
+        table.add_row(label, *(cells[label] for cells in rows))
     console.print(table)
-    console.print("rms: per component; after 'max': rms by region; 50 and 95 %: of the lengths")
-    if len(grading.scores) > 1:
-        common = ", ".join(f"{n} {part.rms_px:.3g}" for n, part in grading.common.items())
-        share = f"{100 * grading.common_share:.0f} %"
-        console.print(f"rms on the {share} of the material that all cover: {escape(common)}")
+    console.print("rms: per component; 50 % and 95 % of the points err by less (length)")
     for note in grading.notes:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
     console.print(f"report: {Path(out) / 'report.html'}")
 
 
-def _cells(graded: Score) -> list[str]:
+def _cells(grading: Grading, graded: Score) -> dict[str, str]:
+    """A field's column of the table, by the rows' names."""
     every = graded.everywhere
     percentiles = dict(zip(PERCENTILES, every.percentiles_px, strict=True))
-    return [
-        str(every.points),
-        f"{100 * every.returned:.1f} %",
-        f"{100 * graded.covered:.1f} %",
-        ", ".join(f"{b:.2g}" for b in every.bias_px),
-        *(f"{v:.3g}" for v in (every.rms_px, percentiles[50], percentiles[95], every.max_px)),
-        *(f"{graded.by_region[name].rms_px:.3g}" for name in REGIONS),
-    ]
+    cells = {
+        "rms": f"{every.rms_px:.3g}",
+        "bias x": f"{every.bias_px[0]:.2g}",
+        "bias y": f"{every.bias_px[1]:.2g}",
+        "50 %": f"{percentiles[50]:.3g}",
+        "95 %": f"{percentiles[95]:.3g}",
+        "largest": f"{every.max_px:.3g}",
+        **{f"rms, {name}": f"{part.rms_px:.3g}" for name, part in graded.by_region.items()},
+        "points": str(every.points),
+        "returned": f"{100 * every.returned:.1f} %",
+        "material covered": f"{100 * graded.covered:.1f} %",
+    }
+    if len(grading.scores) > 1:
+        share = f"{100 * grading.common_share:.0f} %"
+        cells[f"rms, {share} that all cover"] = f"{grading.common[graded.source].rms_px:.3g}"
+    return cells

@@ -1,0 +1,51 @@
+"""al-dic on a public folder, without modeharvest: ``python aldic_side.py PUBLIC IMAGE FIELD``.
+
+Subsets of 20 px every 4 px with its augmented-Lagrangian global step, its own treatment of partly
+masked subsets, its own first guess by Fourier correlation; options at their defaults otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from al_dic import dicpara_default, run_aldic
+from al_dic.core.data_structures import GridxyROIRange
+from PIL import Image
+
+WINDOW_PX, STEP_PX, SEARCH_PX = 20, 4, 48
+
+
+def main(public: Path, deformed: str, field: Path) -> None:
+    info = json.loads((public / "benchmark.json").read_text("utf-8"))
+    names = info["reference"]["camera_image"], deformed
+    images = [np.asarray(Image.open(public / name), dtype=np.float64) / 255.0 for name in names]
+    mask = np.asarray(Image.open(public / info["reference"]["mask"])) > 0
+    masks = [mask.astype(np.float64), (images[1] > 0.1).astype(np.float64)]
+    row, col = np.nonzero(mask)
+    para = dicpara_default(
+        winsize=WINDOW_PX,
+        winstepsize=STEP_PX,
+        winsize_min=STEP_PX,
+        use_masks=True,
+        reference_mode="accumulative",
+        size_of_fft_search_region=SEARCH_PX,
+        show_plots=False,
+        gridxy_roi_range=GridxyROIRange(
+            gridx=(int(col.min()), int(col.max())), gridy=(int(row.min()), int(row.max()))
+        ),
+    )
+    found = run_aldic(para, images, masks, compute_strain=False)
+    nodes = np.asarray(found.dic_mesh.coordinates_fem)
+    u = np.asarray(found.result_disp[0].U_accum).reshape(-1, 2)
+    x, y = np.rint(nodes).astype(int).T
+    inside = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+    header = f"# benchmark: {info['id']}\nx [px],y down [px],u [px],v down [px]"
+    table = np.column_stack([nodes, u])[inside]
+    np.savetxt(field, table, "%.6f", ",", header=header, comments="")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))

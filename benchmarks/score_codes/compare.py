@@ -1,0 +1,158 @@
+"""Three DIC codes from PyPI and micromorphic IDIC on one benchmark, scored and ranked.
+
+Run: benchmarks/score_codes/run [--pixel-size 0.02] [--strain 0.128] [--only CODE ...]
+
+Each code gets the public folder and nothing else: the 8-bit images, the mask, benchmark.json. Each
+returns a file, as anybody's would be, and 'modeharvest score' grades the files. All of it stays in
+out/score_codes, with the report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeharvest.case import read_case, shipped_solution
+from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.automatic_start import automatic_start
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.field_files import write_field
+from modeharvest.idic.local_field import sampled_field
+from modeharvest.idic.subsets import WHERE, SubsetOptions, subset_field
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.io import read_image, read_mask
+from modeharvest.scoring import grade, make_benchmark, print_grading, truth_folder
+
+HERE = Path(__file__).resolve().parent
+OUT = HERE.parents[1] / "out" / "score_codes"
+SUBSET_PX, STEP_PX = 21, 5
+TIMEOUT_S = 600.0
+"""Far more than any code takes: it ends one that hangs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What a code gets: images [0 ... 255], masks and their pixels."""
+
+    public: Path
+    image: str
+    reference: np.ndarray
+    deformed: np.ndarray
+    mask: np.ndarray
+    grid: PixelGrid
+    cell: float
+
+    @classmethod
+    def read(cls, public: Path, strain: float) -> Task:
+        """Of a public folder."""
+        info: dict[str, Any] = json.loads((public / "benchmark.json").read_text("utf-8"))
+        (entry,) = (d for d in info["deformed"] if abs(d["nominal_strain"] - strain) < 1e-9)
+        first = info["first_pixel_mm"]
+        grid = PixelGrid(info["rows"], info["cols"], info["pixel_size_mm"], first["x"],
+                         first["y_up"])  # fmt: skip
+        f, g = (255.0 * read_image(public / name)
+                for name in (info["reference"]["camera_image"], entry["camera_image"]))  # fmt: skip
+        mask = read_mask(public / info["reference"]["mask"])
+        return cls(public, entry["camera_image"], f, g, mask, grid, info["unit_cell_mm"])
+
+    @property
+    def deformed_mask(self) -> np.ndarray:
+        """Material is nowhere black."""
+        return np.asarray(self.deformed > 25)
+
+
+def idic(task: Task, field: Path, codes: str) -> None:
+    """Micromorphic IDIC; all it is told besides is which part of the specimen has holes."""
+    box = Box.centred(*(2.0 * half for half in Specimen().cellular_half_size))
+    images = task.reference, task.deformed, task.grid
+    masks = task.mask, task.deformed_mask
+    start = automatic_start(*images, task.cell, box, *masks)
+    found = correlate(*images, start.ansatz, start.unknowns, *masks)
+    write_field(field, sampled_field(found.displacement(), task.grid, task.mask, STEP_PX))
+
+
+def pyvale(task: Task, field: Path, codes: str) -> None:
+    """pyvale's subsets: whole ones only, as their own docs' 2-D DIC but for the first window."""
+    os.environ[WHERE] = codes
+    options = SubsetOptions(subset_px=SUBSET_PX, step_px=STEP_PX)
+    images = task.reference, task.deformed, task.grid
+    write_field(field, subset_field(*images, task.mask, task.deformed_mask, options))
+
+
+def other(script: str) -> Callable[[Task, Path, str], None]:
+    """A code that runs in the environment of the codes."""
+
+    def run(task: Task, field: Path, codes: str) -> None:
+        field.parent.mkdir(parents=True, exist_ok=True)
+        quiet = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        done = subprocess.run(
+            [codes, str(HERE / script), str(task.public), task.image, str(field)],
+            cwd=field.parent, capture_output=True, text=True, timeout=TIMEOUT_S, env=quiet,
+            check=False,
+        )  # fmt: skip
+        (field.with_suffix(".log")).write_text(done.stdout + done.stderr, "utf-8")
+        if done.returncode != 0:
+            raise RuntimeError(done.stderr.strip().rsplit("\n", 1)[-1] or f"{done.returncode}")
+
+    return run
+
+
+CODES: dict[str, Callable[[Task, Path, str], None]] = {
+    "micromorphic IDIC": idic,
+    "pyvale": pyvale,
+    "pyxel-dic": other("pyxel_side.py"),
+    "al-dic": other("aldic_side.py"),
+}
+
+
+def main() -> None:
+    arguments = _arguments()
+    case = read_case("paper-virtual")
+    case = case.model_copy(
+        update={"imaging": replace(case.imaging, pixel_size=arguments.pixel_size)}
+    )
+    public = OUT / "set"
+    solution = shipped_solution("paper-virtual")
+    info = make_benchmark(case, public, solution=solution)
+    task = Task.read(public, arguments.strain)
+    print(f"benchmark {info['id']}: {task.grid.rows} x {task.grid.cols} px")
+    fields: list[Path] = []
+    for name in arguments.only or CODES:
+        field = OUT / "fields" / f"{name}.csv"
+        begin = time.perf_counter()
+        try:
+            CODES[name](task, field, arguments.codes)
+        except (RuntimeError, InputError, MissingDependencyError, subprocess.TimeoutExpired) as e:
+            print(f"{name}: failed: {e}")
+            continue
+        print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
+        fields.append(field)
+    graded = OUT / "graded"
+    print_grading(grade(fields, truth_folder(public), arguments.strain, graded), graded)
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="benchmarks/score_codes/run", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--pixel-size", type=float, default=0.02, help="[mm/px]")
+    parser.add_argument("--strain", type=float, default=0.128, help="0.078 or 0.128")
+    parser.add_argument("--only", nargs="+", choices=list(CODES), help="only these codes")
+    parser.add_argument("--codes", required=True, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
