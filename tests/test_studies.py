@@ -1,0 +1,382 @@
+"""Studies: what their tables tell, what runs them, what is left, and bad input in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from html_page import Page
+from scipy import stats
+
+from modeharvest import cli
+from modeharvest.case import shipped_solution
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Solution
+from modeharvest.files import read_json
+from modeharvest.studies.case import StudyCase, read_study, shipped_studies
+from modeharvest.validation.studies import robustness_findings as told
+from modeharvest.validation.studies.factors import FACTORS, Setting
+from modeharvest.validation.studies.noise import Noise, one_realisation
+from modeharvest.validation.studies.noise_statistics import Pairs
+from modeharvest.validation.studies.robustness import Robustness, one_start
+from modeharvest.validation.studies.subject import Scene, Subject
+from modeharvest.validation.studies.systematic import Systematic, one_level
+
+PAPER = shipped_solution("paper-virtual")
+TINY = """
+title = "A <tiny> study"
+[study]
+kind = "robustness"
+starts = 2
+radii = [0.5]
+per_radius = 1
+strain_errors = []
+[imaging]
+pixel_size = 0.05
+"""
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
+    case = StudyCase()
+    assert PAPER is not None
+    imaging = replace(case.imaging, pixel_size=0.05)
+    return Subject(case.experiment, imaging, case.correlation, Solution.read(PAPER))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("studies")
+
+
+def starts_table(distances: list[float], outcomes: list[str] | None = None) -> pd.DataFrame:
+    """A table as a robustness study of one radius leaves it."""
+    n = len(distances)
+    return pd.DataFrame({
+        "radius": 0.1, "start": range(n), "strain_error": 0.0, "seed": 0, "error": "",
+        "seconds": 1.0, "distance_px": distances, "start_distance_px": 9.0,
+        "epsilon_percent": np.array(distances), "outcome": outcomes or ["converged"] * n,
+        "iterations": 5, "all_iterations": 20, "residual": 0.01,
+    })  # fmt: skip
+
+
+# -- robustness ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("good", "n"), [(98, 100), (100, 100), (0, 7), (3, 5)])
+def test_intervals_are_wilson_s(good: int, n: int) -> None:
+    """Against the score test that they invert: its p-value at their ends is 5 %."""
+    low, high = told.wilson(good, n)
+    share = good / n
+    for end, is_open in ((low, share > 0.0), (high, share < 1.0)):
+        if is_open:
+            z = (share - end) / np.sqrt(end * (1.0 - end) / n)
+            assert 2.0 * stats.norm.sf(abs(z)) == pytest.approx(0.05, rel=1e-9)
+        else:
+            assert end == pytest.approx(share, abs=1e-12)
+
+
+def test_numbers_of_a_robustness_study() -> None:
+    table = starts_table([1e-9] * 97 + [0.5, 2.0, 4.0])
+    table.loc[98, "outcome"] = "trapped"
+    table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
+    table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
+    found = told.findings(table, 0.1, "seed 0")
+    numbers = found.numbers
+    assert (numbers["starts"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
+    assert numbers["success"] == 0.97
+    assert numbers["outliers"] == 1  # 2 % is above the paper's 1.5 %
+    assert numbers["mean_epsilon_percent"] == pytest.approx(2.5 / 99)
+    assert numbers["mean_epsilon_without_outliers_percent"] == pytest.approx(0.5 / 98)
+    assert numbers["largest_distance_px"] == 2.0
+    assert numbers["elsewhere_but_called_converged"] == 1
+    assert found.sentences[0].startswith("97 of 100 starts")
+    assert any("1 failed, and count as not arrived" in s for s in found.sentences)
+    assert any("2 that end elsewhere, 1 pass for converged" in s for s in found.sentences)
+
+
+def test_the_basin_ends_where_the_first_start_is_lost() -> None:
+    parts = []
+    for radius, lost in ((0.05, 0), (0.1, 0), (0.2, 1), (0.3, 0), (0.5, 3)):
+        part = starts_table([9.0] * lost + [1e-9] * (4 - lost), ["trapped"] * lost
+                            + ["converged"] * (4 - lost))  # fmt: skip
+        parts.append(part.assign(radius=radius))
+    found = told.findings(pd.concat(parts, ignore_index=True), 0.1, "seed 0")
+    (said,) = [s for s in found.sentences if "All starts arrive" in s]
+    assert "up to 10 % off" in said
+    assert "50 %: 1 of 4" in said
+    basin = found.tables["Basin of convergence"]
+    assert list(basin["same minimum"]) == [4, 4, 3, 4, 1]
+    assert list(basin["others recognised"]) == ["0 of 0", "0 of 0", "1 of 1", "0 of 0", "3 of 3"]
+
+
+def test_one_start_against_a_calculation_of_its_own(subject: Subject, folder: Path) -> None:
+    study = Robustness(starts=1, radii=(), strain_errors=(-0.5,))
+    near, far = study.prepare(subject, folder)
+    found = one_start(near, folder)
+    scene = Scene.open(folder, near["subject"])
+    home = scene.correlate()
+    start = scene.start()
+    unit = np.random.default_rng([0, 0]).uniform(-1.0, 1.0, 7)
+    start[scene.ansatz.phi_slice(0)] += 0.1 * unit * np.array([1] * 5 + [1.9] * 2)
+    end = scene.correlate(start)
+    u, other = (r.displacement()[::4, ::4][scene.mask()[::4, ::4]] / 0.05 for r in (home, end))
+    norm, other_norm = np.linalg.norm(u), np.linalg.norm(other)
+    epsilon = 100.0 * abs(norm - other_norm) / norm
+    assert found["epsilon_percent"] == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
+    distance = np.linalg.norm(u - other) / np.sqrt(len(u))
+    assert found["distance_px"] == pytest.approx(distance, rel=1e-6, abs=1e-12)
+    assert found["distance_px"] < told.SAME_PX < found["start_distance_px"]
+    assert one_start(far, folder)["start_distance_px"] > 1.0
+
+
+# -- noise --------------------------------------------------------------------------------
+
+
+def normal_pairs(bias: float = 0.0, told_by: float = 1.0, pairs: int = 400) -> Pairs:
+    """Errors at the bound, with a bias [bounds]; the bound differs from one to the next."""
+    bound = np.array([1.0, 2.0, 5.0])
+    noise = np.random.default_rng(1).normal(size=(pairs, 1, 3)) * np.array([1.0, -1.0])[:, None]
+    errors = (noise + bias) * bound
+    return Pairs(errors, np.full(errors.shape, told_by) * bound, bound)
+
+
+def test_statistics_of_errors_at_the_bound() -> None:
+    pairs = normal_pairs()
+    # 400 pairs, whose two errors have the same square: 1/sqrt(2 * 400) = 3.5 % a quantity.
+    assert pairs.ratios == pytest.approx(np.ones(3), abs=0.15)
+    assert abs(pairs.ratio.value - 1.0) < 4.0 * pairs.ratio.error < 0.2
+    assert abs(pairs.coverage.value - 0.95) < 4.0 * pairs.coverage.error < 0.05
+    assert pairs.bias.value < 1e-12  # n and -n leave nothing
+    assert pairs.biases == pytest.approx(np.zeros(3), abs=1e-12)
+    assert pairs.told_over_error == pytest.approx(1.0, abs=0.1)
+    assert pairs.standardised.rms_bound == 1.0
+
+
+def test_a_bias_and_error_bars_that_are_too_short_are_seen() -> None:
+    assert normal_pairs(bias=0.3).bias.value == pytest.approx(0.3, abs=1e-9)
+    assert normal_pairs(bias=0.3).biases == pytest.approx(np.full(3, 0.3))
+    short = normal_pairs(told_by=0.5)
+    expected = 1.0 - 2.0 * stats.norm.sf(0.5 * 1.959964)
+    assert abs(short.coverage.value - expected) < 4.0 * short.coverage.error
+    assert short.told_over_error == pytest.approx(0.5, abs=0.05)
+
+
+def test_what_no_noise_moves_does_not_count() -> None:
+    pairs = normal_pairs()
+    zero = np.zeros((400, 2, 2))
+    more = Pairs(np.concatenate([pairs.errors, zero], axis=2),
+                 np.concatenate([pairs.told, zero], axis=2),
+                 np.concatenate([pairs.bound, [0.0, 0.0]]))  # fmt: skip
+    for name in ("ratio", "bias", "coverage"):
+        assert str(getattr(more, name)) == str(getattr(pairs, name))
+    assert np.isnan(more.ratios[3:]).all()
+    assert np.isnan(more.covered[3:]).all()
+
+
+def test_noise_study_on_tiny_images(subject: Subject, folder: Path) -> None:
+    study = Noise(levels=(0.002,), pairs=2)
+    cases = study.prepare(subject, folder)
+    assert len(cases) == 5
+    rows = [{**case, "error": "", "seconds": 0.1, **one_realisation(case, folder)}
+            for case in cases]  # fmt: skip
+    found = study.findings(pd.DataFrame(rows), folder)
+    summary = found.tables["Noise levels"].set_index("quantity")
+    # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
+    assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
+    assert 0.6 < summary.loc["u", "rms error / bound"] < 1.6
+    assert len(found.attachments["Each unknown"]) == 77
+    assert {"ratio", "bias", "coverage", "unknowns", "maps"} == {p.name for p in found.plots}
+    # n and -n push the other way: what is common to them is of second order.
+    plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
+    assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)
+    with pytest.raises(InputError, match="two whole pairs"):
+        study.findings(pd.DataFrame(rows[:4]), folder)
+
+
+# -- systematic errors --------------------------------------------------------------------
+
+
+def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None:
+    study = Systematic(factors=("order", "bits"), levels={"bits": (2, 10)}, seeds_of_speckle=(0,))
+    cases = study.prepare(subject, folder)
+    assert [c["factor"] for c in cases] == ["base", "order", "bits", "bits"]  # 5 is the base
+    rows = [{**case, "error": "", **one_level(case, folder)} for case in cases]
+    kept = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if c["keep"]}
+    gone = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if not c["keep"]}
+    assert (kept, gone) == ({True}, {False})
+    found = study.findings(pd.DataFrame(rows), folder)
+    levels = found.tables["Every level"].set_index(["name", "level"])
+    moved = levels["moved from the base [px]"]
+    assert moved["order", 5] == 0.0
+    assert 0.0 < moved["bits", 10] < 0.1 * moved["bits", 2]  # rounding errors: 341 times
+    w, best, lost = (rows[0][name] for name in ("w_px", "best_px", "lost_px"))
+    assert best < w < best + lost  # the best fit is the best; the triangle inequality
+    assert any("g∘φ" in sentence for sentence in found.sentences)
+
+
+def test_every_factor_has_levels_that_can_be_set() -> None:
+    case = StudyCase()
+    base = Setting(case.imaging, case.correlation)
+    for name, factor in FACTORS.items():
+        changed = [factor.set(base, level) for level in factor.levels]
+        assert len({repr(setting) for setting in changed}) == len(changed), name
+        own = factor.base(base)
+        if own is not None:
+            assert factor.set(base, own) == base, name
+        else:
+            assert factor.base(changed[0]) == pytest.approx(factor.levels[0])
+
+
+# -- cases --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["robustness", "noise", "systematic"])
+def test_shipped_studies_spell_out_the_defaults(name: str) -> None:
+    case = read_study(name)
+    assert case.kind == name
+    assert case.study == type(case.study)()
+    assert case == StudyCase(title=shipped_studies()[name], study=case.study)
+    assert len(json.dumps(case.plain())) > 100
+
+
+def test_a_quick_study_is_smaller() -> None:
+    for name in shipped_studies():
+        case = read_study(name)
+        assert case.quick().imaging.pixel_size == 2.0 * case.imaging.pixel_size
+    assert Robustness().quick().starts == 20
+    assert Noise().quick().pairs == 5
+    assert Systematic().quick().levels["v_degree"] == (2, 5, 8)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[study]\nkind = "robustnes"', "kind among"),
+        ("[study]\nstart = 3", "did you mean 'start"),
+        ("[study]\nstarts = 0", "starts of 1 or more"),
+        ("[study]\nradius = 1.5", "radii above 0"),
+        ("[study]\nradii = [0.1]", "other than radius"),
+        ("[study]\nradii = [0.2, 0.2]", "radii that differ"),
+        ("[study]\nstrain = 0.1", "among experiment.strains"),
+        ("[study]\n[correlation]\nhold_mode = true", "hold_mode = false"),
+        ('[study]\nkind = "noise"\nlevels = [1.0]', "levels above 0"),
+        ('[study]\nkind = "noise"\npairs = 1', "pairs of 2 or more"),
+        ('[study]\nkind = "noise"\n[correlation]\ncamera = true', "camera = false"),
+        ('[study]\nkind = "systematic"\nfactors = ["colour"]', "factors among"),
+        ('[study]\nkind = "systematic"\nfactors = ["order"]\nlevels.bits = [8]', "only"),
+        ('[study]\nkind = "systematic"\nseeds_of_speckle = []', "seed of a speckle"),
+        ("[study]\n[imagin]\nbits = 8", "did you mean 'imaging'?"),
+        ('[imaging]\ndistortion = "lens.json"\n[study]', "perfect lens"),
+        ("[experiment]", "expected a table [study]"),
+    ],
+)
+def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(text, "utf-8")
+    with pytest.raises(InputError) as caught:
+        read_study(path)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_levels_out_of_range_are_told_before_anything_runs(subject: Subject, folder: Path) -> None:
+    for levels, said in (({"order": (4.5,)}, "whole numbers"), ({"order": (4,)}, "order 3 or 5")):
+        study = Systematic(factors=("order",), levels=levels)
+        with pytest.raises(InputError, match=said):
+            study.prepare(subject, folder)
+
+
+def test_a_solution_of_another_experiment_is_not_taken(subject: Subject, tmp_path: Path) -> None:
+    name = subject.describe(tmp_path, 0.128)
+    (tmp_path / "solution.h5").unlink()
+    first = subject.solution.snapshots[0]
+    other = replace(subject.solution, snapshots=(replace(first, nominal_strain=0.128),))
+    other.write(tmp_path / "solution.h5")
+    with pytest.raises(InputError, match="found another"):
+        Scene.open(tmp_path, name)
+
+
+# -- the command --------------------------------------------------------------------------
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """Exit code of the ``modeharvest`` command."""
+    monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def test_a_study_from_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert PAPER is not None
+    case, out = tmp_path / "tiny.toml", tmp_path / "out"
+    case.write_text(TINY, "utf-8")
+    arguments = ("study", case, "--out", out, "--solution", PAPER, "--workers", "1")
+    assert called(monkeypatch, *arguments) == 0
+    assert "2 of 2 starts" in (printed := capsys.readouterr().out)
+    assert "report.html" in printed
+    summary = read_json(out / "summary.json")
+    assert summary["numbers"]["starts"] == 2
+    assert summary["failed"] == []
+    assert len(pd.read_csv(out / "table.csv")) == 3
+    check_page((out / "report.html").read_text("utf-8"), summary)
+
+    # Again: nothing is run twice, and it needs no workers at all.
+    before = {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()}
+    monkeypatch.setattr("modeharvest.validation.campaign._client", None)
+    assert called(monkeypatch, *arguments) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()} == before
+
+
+def check_page(text: str, summary: dict[str, Any]) -> None:
+    """It is whole, loads nothing, and says what made each figure."""
+    seen = Page(text)
+    assert seen.open == []
+    assert all(source.startswith("data:") for source in seen.sources)
+    assert [name for name, count in seen.ids.items() if count > 1] == []
+    assert {link[1:] for link in seen.links if link.startswith("#")} <= set(seen.ids)
+    assert not {"script", "link", "iframe"} & set(seen.tags)
+    assert {"distances", "epsilon", "basin"} <= set(seen.ids)
+    assert "A &lt;tiny&gt; study" in text
+    made = re.findall(r'<p class="fact made">(.*?)</p>', text)
+    assert len(made) == 3
+    assert all("modeharvest study" in m and "seed 0" in m for m in made)
+    assert text.index("2 of 2 starts") < text.index('id="figures"')  # sentences first
+    assert summary["command"] in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("robustnes",), "did you mean 'robustness'"),
+        (("robustness", "--workers", "2", "--scheduler", "tcp://x:1"), "got both"),
+        (("robustness", "--workers", "0"), "at least 1 worker"),
+        (("robustness", "--memory", "much"), "memory like 4GiB"),
+        (("nowhere.toml",), "expected a case file at nowhere.toml"),
+    ],
+)
+def test_a_wrong_command_is_told_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    said: str,
+) -> None:
+    out = tmp_path / "out"
+    assert called(monkeypatch, "study", *arguments, "--out", out) == 2
+    text = capsys.readouterr().err
+    assert "Traceback" not in text
+    (line,) = [row for row in text.splitlines() if row.startswith("error:")]
+    assert said in line
+    assert not out.exists()
