@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import h5py
@@ -17,6 +18,7 @@ import pytest
 import synthetic_benchmark as made
 from synthetic_benchmark import PIXEL, STRAIN
 
+from modeharvest import cli
 from modeharvest.errors import InputError
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.scoring import make_benchmark
@@ -76,6 +78,24 @@ def test_the_images_are_whole_and_named_by_their_digests(both: tuple[Path, Path]
     assert read_image(public / info["deformed"][0]["image"]).shape == shape
     mask = read_mask(public / info["reference"]["mask"])
     assert np.array_equal(mask, BenchmarkTruth.read(truth).mask)
+
+
+def test_the_command_says_what_is_where(
+    copies: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    public, truth = copies
+    case, solution = tmp_path / "case.toml", tmp_path / "solution.h5"
+    arguments = ["benchmark", "make", case, "--out", public, "--solution", solution]
+    monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    said = capsys.readouterr().out
+    assert f"benchmark {BenchmarkTruth.read(truth).id}: 1 deformed images in {public}" in said
+    assert f"truth, not to be given away: {truth}" in said
 
 
 def test_making_it_again_changes_nothing(copies: tuple[Path, Path]) -> None:
