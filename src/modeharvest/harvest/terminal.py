@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+Cell = Callable[[dict[str, Any]], str]
+"""What a row of the table says of a photograph."""
 
 
 def print_harvest(summary: dict[str, Any], out: Path) -> None:
@@ -19,7 +23,7 @@ def print_harvest(summary: dict[str, Any], out: Path) -> None:
     frames = summary["frames"]
     for frame in frames:
         table.add_column(escape(frame["name"]), justify="right")
-    for label, cell in _ROWS.items():
+    for label, cell in _rows(frames).items():
         table.add_row(escape(label), *(cell(frame) for frame in frames))
     console.print(table)
     console.print("± noise of the images / ± what the ansatz leaves over; standard deviations")
@@ -49,30 +53,46 @@ def _skipped(summary: dict[str, Any]) -> list[tuple[str, str]]:
     return [(s["name"], s["reason"]) if isinstance(s, dict) else (s[0], s[1]) for s in found]
 
 
-def _mode(frame: dict[str, Any]) -> dict[str, Any]:
-    """The first mode; empty without one."""
-    modes = frame["modes"]
-    return dict(modes[0]) if modes else {}
+def _rows(frames: Sequence[dict[str, Any]]) -> dict[str, Cell]:
+    """What is printed of every photograph, the same for each of its modes."""
+    rows: dict[str, Cell] = {"compression along x, y [%]": _strain}
+    for i in range(max((len(frame["modes"]) for frame in frames), default=0)):
+        n = i + 1
+        rows[f"v{n} phi{n}"] = partial(_pattern, i=i)
+        rows[f"largest v{n} phi{n} [px]"] = partial(_largest, i=i)
+        rows[f"largest v{n} [mm]"] = partial(_amplitude, i=i)
+        rows[f"wave vectors of phi{n} [1/l]"] = partial(_waves, i=i)
+    rows["left over (w), rms [px]"] = lambda frame: f"{frame['leftover_px']:.3g}"
+    rows["iterations, all levels"] = lambda frame: str(frame["iterations_all_levels"])
+    rows["outcome"] = lambda frame: str(frame["outcome"])
+    return rows
 
 
 def _strain(frame: dict[str, Any]) -> str:
     return f"{100 * frame['strain_x']:.3f}, {100 * frame['strain_y']:.3f}"
 
 
-def _pattern(frame: dict[str, Any]) -> str:
-    mode = _mode(frame)
+def _mode(frame: dict[str, Any], i: int) -> dict[str, Any]:
+    """Mode number i, from 0; empty if the photograph has fewer."""
+    modes = frame["modes"]
+    return dict(modes[i]) if i < len(modes) else {}
+
+
+def _pattern(frame: dict[str, Any], i: int) -> str:
+    mode = _mode(frame, i)
     if not mode:
         return "no mode"
     seen = "seen" if mode["observable"] else "not seen"
     return f"{seen}, held" if mode["held"] else seen
 
 
-def _largest(frame: dict[str, Any]) -> str:
-    return f"{_mode(frame).get('largest_px', 0.0):.3g}"
+def _largest(frame: dict[str, Any], i: int) -> str:
+    mode = _mode(frame, i)
+    return f"{mode['largest_px']:.3g}" if mode else "–"
 
 
-def _amplitude(frame: dict[str, Any]) -> str:
-    mode = _mode(frame)
+def _amplitude(frame: dict[str, Any], i: int) -> str:
+    mode = _mode(frame, i)
     if not mode:
         return "–"
     parts = [mode["v_max_mm"], mode["v_max_sd_noise_mm"], mode["v_max_sd_leftover_mm"]]
@@ -80,18 +100,6 @@ def _amplitude(frame: dict[str, Any]) -> str:
     return f"{value} ± {noise} / {leftover}"
 
 
-def _waves(frame: dict[str, Any]) -> str:
-    waves = _mode(frame).get("waves", [])
-    return " ".join(f"({wave['xi'][0]:.4f}, {wave['xi'][1]:.4f})" for wave in waves)
-
-
-_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "compression along x, y [%]": _strain,
-    "pattern": _pattern,
-    "largest v1 phi1 [px]": _largest,
-    "largest v1 [mm]": _amplitude,
-    "wave vectors [1/l]": _waves,
-    "left over (w), rms [px]": lambda frame: f"{frame['leftover_px']:.3g}",
-    "iterations, all levels": lambda frame: str(frame["iterations_all_levels"]),
-    "outcome": lambda frame: str(frame["outcome"]),
-}
+def _waves(frame: dict[str, Any], i: int) -> str:
+    waves = _mode(frame, i).get("waves", [])
+    return " ".join(f"({wave['xi'][0]:.4f}, {wave['xi'][1]:.4f})" for wave in waves) or "–"
