@@ -1,0 +1,122 @@
+"""What a campaign costs: one worker against two, and the overhead of cases of a second.
+
+Two questions, each answered by whole campaigns, their workers' start included and apart:
+
+* speedup: correlations of the paper's images at a reduced resolution from perturbed starts, by
+  one worker and by two;
+* overhead: cases that sleep for a second, on two workers: what the campaign takes beyond that.
+
+A worker's start (a new process that imports numpy, scipy and numba) takes seconds, once for a
+campaign; it is told apart. The machine should have two idle cores.
+
+Run: scripts/env python benchmarks/campaign.py [--starts 24] [--sleeps 60] [--pixel 0.02]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from modeharvest.case import shipped_solution
+from modeharvest.fem.field import Solution
+from modeharvest.studies.case import StudyCase
+from modeharvest.validation.campaign import Campaign, Case, Workers, grid
+from modeharvest.validation.studies.robustness import Robustness
+from modeharvest.validation.studies.subject import Subject
+
+SLEEP_S = 1.0
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Wall-clock seconds of a campaign.
+
+    Parameters
+    ----------
+    whole
+        All of it.
+    first, last
+        Until the first case was done (what starting the workers takes, and one case), and until
+        the last was: the rest is stopping them.
+    work
+        Seconds that the cases themselves took, all together.
+    """
+
+    whole: float
+    first: float
+    last: float
+    work: float
+
+
+def sleep(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
+    """A case that takes exactly that long."""
+    time.sleep(case["seconds"])
+    return {}
+
+
+def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> Timing:
+    """Run a campaign and look at the clock."""
+    campaign = Campaign(function, cases, folder)
+    begin, ticks = time.perf_counter(), []
+
+    def listen(done: float, total: float, what: str) -> None:
+        ticks.append(time.perf_counter() - begin)
+
+    table = campaign.run(Workers(workers), listen)
+    whole = time.perf_counter() - begin
+    assert (table["error"] == "").all(), table["error"].iloc[0]
+    return Timing(whole, ticks[1], ticks[-1], float(table["seconds"].sum()))
+
+
+def speedup(starts: int, pixel: float, folder: Path) -> None:
+    """One worker against two."""
+    path, case = shipped_solution("paper-virtual"), StudyCase()
+    assert path is not None, "the case ships its solution"
+    imaging = replace(case.imaging, pixel_size=pixel)
+    subject = Subject(case.experiment, imaging, case.correlation, Solution.read(path))
+    study = Robustness(starts=starts, radii=(), strain_errors=())
+    found = {}
+    for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
+        own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"
+        cases = study.prepare(subject, own)
+        timing = run(study.function, cases, own, workers)
+        found.setdefault(workers, []).append(timing)
+        print(f"{workers} worker{'s' * (workers > 1)}: {timing.whole:.1f} s, "
+              f"{timing.first:.1f} s until the first case was done, "
+              f"{timing.work:.1f} s of work in the cases")  # fmt: skip
+    whole = {n: sum(t.whole for t in timings) for n, timings in found.items()}
+    after = {n: sum(t.last - t.first for t in timings) for n, timings in found.items()}
+    print(f"two workers are {whole[1] / whole[2]:.2f} times one with their start, "
+          f"{after[1] / after[2]:.2f} times between the first and the last case\n")  # fmt: skip
+
+
+def overhead(sleeps: int, folder: Path) -> None:
+    """Cases of a second on two workers."""
+    cases = grid({"seconds": SLEEP_S, "number": 0}, number=list(range(sleeps)))
+    timing = run("campaign:sleep", cases, folder, 2)
+    ideal = SLEEP_S * sleeps / 2
+    steady, steady_ideal = timing.last - timing.first, ideal - SLEEP_S
+    print(f"{sleeps} cases of {SLEEP_S:g} s on two workers: {timing.whole:.2f} s, "
+          f"{timing.first:.2f} s until the first was done")  # fmt: skip
+    print(f"overhead {100 * (timing.whole / ideal - 1):.1f} % with the workers' start, "
+          f"{100 * (steady / steady_ideal - 1):.1f} % between the first and the last case")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--starts", type=int, default=24, help="correlations in each campaign")
+    parser.add_argument("--pixel", type=float, default=0.02, help="of their images [mm]")
+    parser.add_argument("--sleeps", type=int, default=60, help="cases of a second")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        speedup(options.starts, options.pixel, Path(folder) / "speedup")
+        overhead(options.sleeps, Path(folder) / "overhead")
+
+
+if __name__ == "__main__":
+    main()
