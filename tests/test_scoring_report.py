@@ -157,6 +157,25 @@ def test_a_perfect_field_alone_gets_its_page(
     assert "where all measure" not in text
 
 
+def test_a_field_that_lost_all_of_the_material_gets_its_page(
+    truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, y, u = made.points(truth)
+    hole = LocalField(np.append(x, 0.95), np.append(y, 0.0), np.vstack([u * np.nan, [0.0, 0.0]]))
+    write_field(tmp_path / "lost.csv", hole)
+    write_field(tmp_path / "good.csv", noisy(truth, 0.01, "good"))
+    fields = [tmp_path / "lost.csv", tmp_path / "good.csv"]
+    _, code = run(monkeypatch, tmp_path, truth, fields)
+    assert code == 0
+    summary = json.loads((tmp_path / "out" / "scores.json").read_text("utf-8"))
+    good, lost = summary["fields"]
+    assert (good["name"], lost["name"]) == ("good", "lost")
+    assert (lost["everywhere"]["returned"], lost["covered"]) == (0.0, 0.0)
+    assert lost["points_off_material"] == 1
+    assert lost["everywhere"]["rms_px"] is None
+    assert Page((tmp_path / "out" / "report.html").read_text("utf-8")).open == []
+
+
 def test_bad_input_is_one_line(
     truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,7 +31,7 @@ The float images hold grey levels as fractions of full scale, as exact as they c
 {bits}-bit images are what a camera would have stored. Say which you used. Holes and surroundings
 are {background:g}. The specimen's unit cells measure {unit_cell_mm:g} mm, a pixel
 {pixel_size_mm:g} mm. `{mask}` is white where the reference image shows material.
-`benchmark.json` says the same to programs, with the SHA-256 of every file.
+`benchmark.json` says the same to programs, with the SHA-256 of every image.
 
 ## What to return
 
