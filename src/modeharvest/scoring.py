@@ -95,7 +95,8 @@ def make_benchmark(
 
 def truth_folder(public: Path) -> Path:
     """Where the truth of a public folder is by default."""
-    return public.with_name(f"{public.resolve().name}-truth")
+    named = public if public.name not in ("", "..") else public.resolve()
+    return named.with_name(f"{named.name}-truth")
 
 
 def grade(
