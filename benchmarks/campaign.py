@@ -104,7 +104,7 @@ def overhead(sleeps: int, folder: Path) -> None:
     print(f"{sleeps} cases of {SLEEP_S:g} s on two workers: {timing.whole:.2f} s, "
           f"{timing.first:.2f} s until the first was done")  # fmt: skip
     print(f"overhead {100 * (timing.whole / ideal - 1):.1f} % with the workers' start, "
-          f"{100 * (steady / steady_ideal - 1):.1f} % between the first and the last case")  # fmt: skip
+          f"{100 * (steady / steady_ideal - 1):.1f} % from the first to the last case")  # fmt: skip
 
 
 def main() -> None:

@@ -160,8 +160,8 @@ def _sentences(found: Mapping[str, Any]) -> tuple[str, ...]:
         "A difference of norms can vanish for fields that differ. The norm of the difference is "
         f"{short(found['largest_distance_px'])} px rms at most, "
         f"{short(found['largest_distance_of_arrived_px'])} px among those that arrive.",
-        "Unlike the paper's, whose perturbation is a share of parameters that are zero there, "
-        "these starts have wrong phases too.",
+        "The paper's perturbations are shares of the parameters' nominal values, which are 0 for "
+        "the two phases; here these are off by up to the same share of the unit cell, too.",
     ]
     elsewhere = found["starts"] - found["same_minimum"] - found["failed"]
     if elsewhere:
