@@ -65,6 +65,16 @@ class Noise:
         require_different("levels", self.levels)
 
     @property
+    def question(self) -> str:
+        """What is asked, for the report."""
+        return (
+            "A camera adds noise. What does it do to what is measured? The same pair of virtual "
+            "images is correlated under many realisations of white noise; bias and scatter are "
+            "set against the Cramér–Rao bound, and the error bars that each result tells of "
+            "itself against its errors."
+        )
+
+    @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
         return f"{__name__}:one_realisation"

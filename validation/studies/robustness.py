@@ -78,6 +78,15 @@ class Robustness:
         require_different("strain_errors", self.strain_errors)
 
     @property
+    def question(self) -> str:
+        """What is asked, for the report."""
+        return (
+            "A correlation searches from a start. Does it matter which? The same pair of virtual "
+            "images is correlated from starts whose mode parameters are off, and their ends are "
+            "compared with that of the standard start."
+        )
+
+    @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
         return f"{__name__}:one_start"

@@ -89,11 +89,15 @@ class Findings:
 class Study(Protocol):
     """A question, as options in a frozen dataclass.
 
-    One's own needs these five and a module-level function for one case: see docs/studies.md.
+    One's own needs these and a module-level function for one case: see docs/studies.md.
     """
 
     strain: float
     """Of the deformed image [-]."""
+
+    @property
+    def question(self) -> str:
+        """What is asked, in a sentence or two, for the report."""
 
     @property
     def function(self) -> str:

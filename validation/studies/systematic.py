@@ -80,6 +80,15 @@ class Systematic:
             require_different(f"levels of {name}", tuple(levels))
 
     @property
+    def question(self) -> str:
+        """What is asked, for the report."""
+        return (
+            "Without noise a measurement is still wrong. What makes it so? One option of the "
+            "images or of the correlation is changed at a time, and the error is split into what "
+            "the ansatz can’t describe and what the measurement adds."
+        )
+
+    @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
         return f"{__name__}:one_level"
@@ -159,20 +168,26 @@ def one_level(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         the correlation ended, and the displacement at the junctions between holes.
     """
     scene = Scene.open(folder, case["subject"])
+    try:
+        return _measured(scene)
+    finally:
+        if not case["keep"]:
+            scene.discard()
+
+
+def _measured(scene: Scene) -> dict[str, Any]:
     result = scene.correlate()
-    found = {
+    specimen = scene.specimen
+    ligament = specimen.pitch - specimen.diameter
+    return {
         **against_truth(scene, result),
         "outcome": result.outcome.value,
         "iterations": result.iterations,
         "residual": result.residual_rms,
         "pixels": result.pixels,
-        "pixels_per_ligament": (scene.specimen.pitch - scene.specimen.diameter)
-        / scene.images.grid.pixel_size,
+        "pixels_per_ligament": ligament / scene.images.grid.pixel_size,
         "at_junctions_mm": _at_junctions(scene, result).ravel().tolist(),
     }
-    if not case["keep"]:
-        scene.discard()
-    return found
 
 
 def _at_junctions(scene: Scene, result: Result) -> FloatArray:

@@ -32,19 +32,6 @@ from modeharvest.validation.studies.report import StudyRun, slug, write_study_re
 from modeharvest.validation.studies.study import Findings, Study
 from modeharvest.validation.studies.subject import Subject
 
-_QUESTIONS = {
-    "robustness": "A correlation searches from a start. Does it matter which? The same pair of "
-    "virtual images is correlated from starts whose mode parameters are off, and their ends are "
-    "compared with that of the standard start.",
-    "noise": "A camera adds noise. What does it do to what is measured? The same pair of virtual "
-    "images is correlated under many realisations of white noise; bias and scatter are set "
-    "against the Cramér–Rao bound, and the error bars that each result tells of itself against "
-    "its errors.",
-    "systematic": "Without noise a measurement is still wrong. What makes it so? One option of the "
-    "images or of the correlation is changed at a time, and the error is split into what the "
-    "ansatz can’t describe and what the measurement adds.",
-}
-
 
 @dataclass(frozen=True)
 class StudyPipeline:
@@ -111,20 +98,41 @@ class StudyPipeline:
         self, campaign: Campaign, table: pd.DataFrame, findings: Findings, laps: dict[str, float]
     ) -> dict[str, Any]:
         """Leave tables, ``summary.json`` and ``report.html``."""
-        study: Study = self.case.study
         files = {"table.csv": "every case: its values, seconds, error, result"}
         for title, part in {**findings.tables, **findings.attachments}.items():
-            files[f"{slug(title)}.csv"] = title
-            with atomic(self.folder / f"{slug(title)}.csv") as temporary:
+            name = f"{slug(title)}.csv"
+            files[name] = title
+            with atomic(self.folder / name) as temporary:
                 part.to_csv(temporary, index=False)
         files["summary.json"] = "the findings' numbers and sentences, and the failures"
+        summary = self._summary(campaign, table, findings, laps)
+        write_json(self.folder / "summary.json", summary)
+        study: Study = self.case.study
+        run = StudyRun(
+            title=summary["title"],
+            question=study.question,
+            findings=findings,
+            command=self.command,
+            seeds=study.seeds,
+            case=summary["case"],
+            notes=_notes(summary),
+            files=files,
+            timings=laps,
+            versions=summary["versions"],
+        )
+        write_study_report(self.folder / "report.html", run)
+        return summary
+
+    def _summary(
+        self, campaign: Campaign, table: pd.DataFrame, findings: Findings, laps: dict[str, float]
+    ) -> dict[str, Any]:
+        """The content of ``summary.json``; docs/studies.md tells its keys."""
         failed = table[table["error"] != ""]
-        others = campaign.of_other_versions()
-        summary = {
-            "title": self.case.title,
+        return {
+            "title": self.case.title or self.case.kind.capitalize(),
             "kind": self.case.kind,
             "command": self.command,
-            "seeds": study.seeds,
+            "seeds": self.case.study.seeds,
             "sentences": list(findings.sentences),
             "numbers": _plain(dict(findings.numbers)),
             "cases": len(table),
@@ -133,27 +141,11 @@ class StudyPipeline:
                 {"file": campaign.path(campaign.cases[k]).name, "error": failed["error"][k]}
                 for k in failed.index
             ],
-            "other_results_by_version": others,
+            "other_results_by_version": campaign.of_other_versions(),
             "timings_s": laps,
             "versions": _versions(),
             "case": self.case.plain(),
         }
-        notes = _notes(summary)
-        write_json(self.folder / "summary.json", summary)
-        run = StudyRun(
-            title=self.case.title or self.case.kind.capitalize(),
-            question=_QUESTIONS[self.case.kind],
-            findings=findings,
-            command=self.command,
-            seeds=study.seeds,
-            case=self.case.plain(),
-            notes=notes,
-            files=files,
-            timings=laps,
-            versions=_versions(),
-        )
-        write_study_report(self.folder / "report.html", run)
-        return summary
 
 
 def study(
