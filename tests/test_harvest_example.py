@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import MISSING, fields
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -53,6 +54,16 @@ def test_every_key_is_there_and_no_other(table: str) -> None:
     given = tomllib.loads(EXAMPLE).get(table, {})
     names = {f.name for f in fields(tables()[table])} - {"regions"}  # a table of its own
     assert set(given) | set(options().get(table, {})) == names
+
+
+def test_the_user_s_guide_tells_of_every_key() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "harvest.md").read_text("utf-8")
+    rows = "".join(line for line in page.splitlines() if line.startswith("|"))
+    for kind in tables().values():
+        for field in fields(kind):
+            assert f"`{field.name}`" in rows or f"specimen.{field.name}" in rows, field.name
+    for text in re.findall(r"```toml\n(.*?)```", page, re.DOTALL):
+        tomllib.loads(text)
 
 
 @pytest.mark.parametrize("table", tables())
