@@ -15,12 +15,14 @@ import pytest
 from html_page import Page
 from scipy import stats
 
-from modeharvest import cli
+from modeharvest import __version__, cli
 from modeharvest.case import shipped_solution
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json
+from modeharvest.files import read_json, write_json
 from modeharvest.studies.case import StudyCase, read_study, shipped_studies
+from modeharvest.studies.pipeline import StudyPipeline
+from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.studies import robustness_findings as told
 from modeharvest.validation.studies.factors import FACTORS, Setting
 from modeharvest.validation.studies.noise import Noise, one_realisation
@@ -332,11 +334,36 @@ def test_a_study_from_the_command_line(
     assert len(pd.read_csv(out / "table.csv")) == 3
     check_page((out / "report.html").read_text("utf-8"), summary)
 
-    # Again: nothing is run twice, and it needs no workers at all.
+    # Again: nothing is run twice, it needs no workers at all, and other results are named.
+    write_json(out / "cases" / "old.json", {"version": "0.0.0", "error": "", "result": {}})
     before = {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()}
     monkeypatch.setattr("modeharvest.validation.campaign._client", None)
     assert called(monkeypatch, *arguments) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()} == before
+    assert "Stored results of modeharvest 0.0.0, 1 in number" in (out / "report.html").read_text()
+
+
+def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder in which one of two starts failed, and none is left to be run."""
+    assert PAPER is not None
+    case = StudyCase(study=Robustness(starts=2, radii=(), strain_errors=()))
+    case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
+    pipeline = StudyPipeline(case, tmp_path, solution=PAPER)
+    cases = case.study.prepare(pipeline.subject(), tmp_path)
+    campaign = Campaign(case.study.function, cases, tmp_path)
+    result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
+    traceback = "Traceback …\nMemoryError: too large"
+    for one, error in zip(cases, ("", traceback), strict=True):
+        record = {"version": __version__, "seconds": 1.0, "error": error}
+        write_json(campaign.path(one), {**record, "result": None if error else result})
+    monkeypatch.setattr(Campaign, "missing", lambda self: ())
+    summary = pipeline.all()
+    (failure,) = summary["failed"]
+    assert failure == {"file": campaign.path(cases[1]).name, "error": "MemoryError: too large"}
+    assert "1 of 2 cases failed" in (tmp_path / "report.html").read_text()
+    monkeypatch.setattr(Campaign, "table", lambda self: starts_table([1.0]).assign(error="No"))
+    with pytest.raises(InputError, match="all 1 cases failed; the first: No"):
+        pipeline.all()
 
 
 def check_page(text: str, summary: dict[str, Any]) -> None:

@@ -186,10 +186,8 @@ def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
             f"in cases/. The first, {first['file']}: {first['error']}"
         )
     for other, count in summary["other_results_by_version"].items():
-        said.append(
-            f"{count} stored results of version {other} are of other options"
-            f"{'' if other == __version__ else ' or of that other version'}: left alone, not mixed."
-        )
+        of = "other options" if other == __version__ else f"modeharvest {other}"
+        said.append(f"Stored results of {of}, {count} in number, were left alone and not mixed in.")
     said.append(
         "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
         "not plane) is not in it."
