@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.harvest.geometry import Geometry
-from modeharvest.harvest.modes import chosen_modes, has_new_modes
+from modeharvest.harvest.modes import chosen_modes, shows_more
 from modeharvest.harvest.options import Measurement
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.surface import confirmed, followed_holes
@@ -77,7 +77,7 @@ def measure(
     local
         A local DIC's field.
     before
-        What came out of the photograph before. If it shows all modes that are seen now, its
+        What came out of the photograph before. If it shows all waves that are seen now, its
         ansatz is kept and its unknowns are the start; the start is found anew if that leads
         nowhere.
     progress
@@ -103,7 +103,7 @@ def measure(
     )  # fmt: skip
     ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
     sentences = (said, *_start_in_words(start, ansatz, geometry))
-    if before is not None and _goes_on(before, ansatz, held):
+    if before is not None and _goes_on(before, ansatz, unknowns, held):
         found, finish = correlated(pair, geometry, *_lit(before.result, how), how, progress)
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
@@ -165,10 +165,12 @@ def _lit(result: Result, how: Measurement) -> tuple[Ansatz, FloatArray]:
     return ansatz, start
 
 
-def _goes_on(before: Measured, ansatz: Ansatz, held: bool) -> bool:
+def _goes_on(before: Measured, ansatz: Ansatz, unknowns: FloatArray, held: bool) -> bool:
     """Whether the photograph before is a start: it was measured, and shows all that is seen now."""
-    was_measured = before.result.outcome is Outcome.CONVERGED and before.held == held
-    return was_measured and not has_new_modes(before.result.ansatz, ansatz)
+    result = before.result
+    if result.outcome is not Outcome.CONVERGED or before.held != held:
+        return False
+    return not shows_more(ansatz, unknowns, result.ansatz, result.unknowns)
 
 
 def _start_in_words(start: Start, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:

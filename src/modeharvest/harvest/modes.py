@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.automatic_start import Start
 from modeharvest.idic.fourier import FourierMode, ModeFamily, square_family
 from modeharvest.idic.region import junction
+from modeharvest.idic.start_modes import SAME_WAVE
 from modeharvest.idic.support import Taper
 
 FloatArray = NDArray[np.float64]
@@ -48,13 +48,30 @@ def with_held_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, Float
     return replace(ansatz, modes=tuple(modes)), np.concatenate([unknowns[:first], unknowns[last:]])
 
 
-def has_new_modes(before: Ansatz, now: Ansatz) -> bool:
-    """Whether a part of the specimen shows more modes than it did before."""
-    return bool(_by_part(now) - _by_part(before))
+def shows_more(
+    now: Ansatz, unknowns: FloatArray, before: Ansatz, unknowns_before: FloatArray
+) -> bool:
+    """Whether a part of the specimen shows a wave that it did not show before."""
+    known = _waves(before, unknowns_before)
+    return any(
+        not any(part == other and _same(xi, k) for other, k in known)
+        for part, xi in _waves(now, unknowns)
+    )
 
 
-def _by_part(ansatz: Ansatz) -> Counter[Taper]:
-    return Counter(mode.taper for mode in ansatz.modes)
+def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray]]:
+    """Every wave's part of the specimen, and its vector in half turns a cell."""
+    return [
+        (mode.taper, wave[2:4])
+        for i, mode in enumerate(ansatz.modes)
+        for wave in mode.family.waves(unknowns[ansatz.phi_slice(i)])
+    ]
+
+
+def _same(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two wave vectors are one, or each other's opposite, up to what is read off."""
+    apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
+    return bool(0.5 * apart <= SAME_WAVE)
 
 
 def _in_every_part(
