@@ -109,7 +109,8 @@ def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
         f'[[specimen.regions]]\nname = "{name}"\npolygon = {corners(box, scene.grid)}\n'
         for name, box in zip(("above", "below"), boxes, strict=True)
     ]
-    measured = harvesting(tmp_path, "".join(tables)).results()["frame"]
+    run = harvesting(tmp_path, "".join(tables))
+    measured = run.results()["frame"]
     modes = measured.result.ansatz.modes
     assert measured.result.outcome is Outcome.CONVERGED
     assert [mode.family.name for mode in modes] == ["square", "1 wave, free"]
@@ -120,6 +121,14 @@ def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
     assert "Region 'above', v1 phi1:" in said
     assert "Region 'below', v2 phi2:" in said
     assert error_px(measured, scene, truth) < 0.03
+    (frame,) = run.harvest().frames
+    assert [part.name for part in frame.parts] == ["above", "below"]
+    waves = [[wave.xi for wave in part.pattern.waves] for part in frame.parts]
+    assert [len(found) for found in waves] == [2, 1]
+    assert np.abs(waves[1][0]) == pytest.approx((0.5, 0.0), abs=0.02)
+    run.all()
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "Spectral density along x, region “above”" in page
 
 
 def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_path: Path) -> None:

@@ -61,7 +61,10 @@ SECTIONS = (
 def panels(atlas: HarvestAtlas) -> list[HarvestPanel]:
     """Every panel of a harvest, those without a picture left out."""
     count = max((len(frame.modes) for frame in atlas.shown), default=0)
-    every = [*_PHOTOGRAPHS, *_SLOW]
+    every = [*_PHOTOGRAPHS]
+    for k, part in enumerate(atlas.shown[0].parts):
+        every += _part(k, part.name)
+    every += _SLOW
     for i in range(count):
         every += _mode(i, f"<sub>{i + 1}</sub>")
     every += [*_LEFT, *_errors("v0", "v<sub>0</sub>", "Smooth field", "")]
@@ -170,6 +173,19 @@ _TRUTH = (
         partial(maps.draw_error_against_truth, part="loss"), _has_truth,
     ),
 )  # fmt: skip
+
+
+def _part(k: int, name: str) -> list[HarvestPanel]:
+    """Spectral densities of part k (from 0)."""
+    return [
+        HarvestPanel(
+            "photographs", f"S{axis}{axis}-{k + 1}", f"S<sub>{axis}{axis}</sub>",
+            f"Spectral density along {axis}, region “{name}”", "",
+            "Of the displacement in this region alone, which has modes of its own.",
+            partial(maps.draw_part_spectrum, part=k, component=component),
+        )
+        for component, axis in enumerate("xy")
+    ]  # fmt: skip
 
 
 def _mode(i: int, n: str) -> list[HarvestPanel]:

@@ -77,6 +77,23 @@ class BucklingPoint(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class PartSpectrum:
+    """What a part of the specimen shows that has modes of its own.
+
+    Parameters
+    ----------
+    name
+        Of the part.
+    spectrum, pattern
+        Of the displacement there without its affine part, and what is read off it.
+    """
+
+    name: str
+    spectrum: Spectrum
+    pattern: Pattern
+
+
+@dataclass(frozen=True, eq=False)
 class HarvestedFrame:
     """What was found in one deformed photograph.
 
@@ -101,6 +118,8 @@ class HarvestedFrame:
         (n, n) of the unknowns by what the ansatz leaves over.
     spectrum, pattern
         Of the displacement without its affine part, and what is read off it.
+    parts
+        The same of every part that has modes of its own, in one order for all photographs.
     local
         Of a local DIC.
     start_sentences, warnings
@@ -122,6 +141,7 @@ class HarvestedFrame:
     leftover_covariance: FloatArray | None = None
     spectrum: Spectrum | None = None
     pattern: Pattern | None = None
+    parts: tuple[PartSpectrum, ...] = ()
     local: LocalField | None = None
     start_sentences: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()

@@ -57,6 +57,15 @@ def draw_spectrum(atlas: HarvestAtlas, frame: HarvestedFrame, component: int) ->
     return draw_density(frame.spectrum, frame.pattern or _NO_PATTERN, component, end)
 
 
+def draw_part_spectrum(
+    atlas: HarvestAtlas, frame: HarvestedFrame, part: int, component: int
+) -> Figure:
+    """Draw the same of a part with modes of its own; the colours are that part's."""
+    end = max(pattern_density(f.parts[part].spectrum, f.parts[part].pattern) for f in atlas.shown)
+    own = frame.parts[part]
+    return draw_density(own.spectrum, own.pattern, component, end)
+
+
 def draw_v0(atlas: HarvestAtlas, frame: HarvestedFrame, component: int) -> Figure:
     """Draw a component of the slow field."""
     v0 = UM * frame.result.v0(atlas.sheet().grid)[..., component]

@@ -34,7 +34,7 @@ from modeharvest.idic.pattern import read_pattern
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.pyramid import eroded
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.harvest_run import Harvest, HarvestedFrame, HarvestTruth
+from modeharvest.validation.harvest_run import Harvest, HarvestedFrame, HarvestTruth, PartSpectrum
 
 FloatArray = NDArray[np.float64]
 
@@ -138,10 +138,19 @@ def _frame(
         leftover_covariance=by_leftover,
         spectrum=spectrum,
         pattern=pattern,
+        parts=_parts(measured, geometry, cell),
         local=measured.local if experiment.local.code != "none" else None,
         start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
         warnings=warnings,
     )
+
+
+def _parts(measured: Measured, geometry: Geometry, cell: float) -> tuple[PartSpectrum, ...]:
+    """Spectra of the parts, where there are several."""
+    if len(geometry.parts) == 1:
+        return ()
+    spectra = {p.name: measured_spectrum(measured.local, cell, p.box) for p in geometry.parts}
+    return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
 
 
 def covariances(
