@@ -82,7 +82,9 @@ def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
         for k in range(first.shape[1]):
             for m in range(width):
                 start[m] += first[p, k] * lines[k, m]
-        lines[0] = start
+        # One by one: assigning arrays brings error messages that take a second to compile.
+        for m in range(width):
+            lines[0, m] = start[m]
         for i in range(1, n):
             for m in range(width):
                 lines[i, m] += z * lines[i - 1, m]
