@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from synthetic_photographs import Photographed, lattice_points, of
+from synthetic_photographs import NOISE, Photographed, lattice_points, of
 
 from modeharvest import cli
 from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.noise import measured_noise
 from modeharvest.harvest.pipeline import Harvesting
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
@@ -195,3 +196,17 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
         local = results[f"frame_{n}"].local
         truth = of(ANSATZ, ANSATZ.start(0.02 * n, 0.0))(np.column_stack([local.x, local.y]))
         assert np.abs(local.u - truth).max() < 1e-6 * PITCH
+
+
+def test_repeats_between_which_something_moved_are_told() -> None:
+    """Half a pixel looks like noise, but not like that of a single photograph."""
+    shown = scene()
+    still, moved = (
+        measured_noise([shown.image(), shown.image(state, exposure=1)], shown.mask)
+        for state in (None, lambda points: np.full_like(points, 0.5 * PIXEL))
+    )
+    # The camera's noise and rounding to whole grey levels.
+    assert still.sd == pytest.approx(np.hypot(NOISE, 12**-0.5), rel=0.05)
+    assert "if anything moved" not in still.source
+    assert moved.sd > 2 * still.sd
+    assert "if anything moved" in moved.source
