@@ -96,7 +96,8 @@ class Systematic:
     @property
     def seeds(self) -> str:
         """Of the speckles."""
-        return f"seeds {', '.join(map(str, self.seeds_of_speckle))} of the speckle"
+        plural = "s" if len(self.seeds_of_speckle) > 1 else ""
+        return f"seed{plural} {', '.join(map(str, self.seeds_of_speckle))} of the speckle"
 
     def require(self, correlation: Identification) -> None:
         """Accept any correlation."""

@@ -59,7 +59,7 @@ def findings(
 def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) -> pd.DataFrame:
     """A row for each factor and level, the base's among them: means over the speckles."""
     done = table[table["error"] == ""]
-    done = done.assign(moved=_moved(done) / px)
+    done = _in_base_pixels(done).assign(moved=_moved(done) / px)
     base = done[done["factor"] == "base"]
     rows = []
     for name, at_base in bases.items():
@@ -80,6 +80,13 @@ def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) 
             row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
+    """Errors in pixels of one size: a ligament tells how large a level's own are."""
+    at_base = done.loc[done["factor"] == "base", "pixels_per_ligament"].mean()
+    factor = at_base / done["pixels_per_ligament"]
+    return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
 
 
 def _moved(done: pd.DataFrame) -> pd.Series:
@@ -154,7 +161,7 @@ def _sentences(
     said.append(
         "What the ansatz can't describe makes most of the error here, and hides smaller ones: how "
         "far a factor moves the measurement is told beside, rms per component at the junctions "
-        "between holes, in pixels of the base."
+        "between holes. All are in pixels of the base."
     )
     said.append(
         "The engine has one gradient only, that of the deformed image at the displaced position "
@@ -185,9 +192,9 @@ def _curves(levels: pd.DataFrame, bases: Mapping[str, float | None], seeds: str)
         grid[0].legend(frameon=False, fontsize=7)
         drawn.tight_layout()
     caption = (
-        f"Rms per component; means over {seeds}. Blue: what the measurement adds to the best fit "
-        "of its ansatz; green: what the ansatz can’t describe; gold: how far the measurement is "
-        "from the base’s. Dotted: the base."
+        f"Rms per component, in pixels of the base; means over {seeds}. Blue: what the "
+        "measurement adds to the best fit of its ansatz; green: what the ansatz can’t describe; "
+        "gold: how far the measurement is from the base’s. Dotted: the base."
     )
     return Plot("factors", "Error against each factor", drawn, caption, wide=True)
 
