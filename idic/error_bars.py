@@ -172,22 +172,25 @@ def noise_covariance(
     return _sandwich(soft, np.vstack(examples)) / len(examples)
 
 
-def softened(result: Result, covariance: ArrayLike, soft: FloatArray) -> FloatArray:
-    """A covariance for JᵀJ turned into one for the cost's own curvature: H⁻¹ M C M H⁻¹.
+def softened(result: Result, noise_sd: float, soft: FloatArray) -> FloatArray:
+    """(n, n) covariance by white noise in both images against the cost's own curvature.
+
+    H⁻¹ V H⁻¹, where V are the pushes that make ``result.covariance(noise_sd)``, C = 2σ²M⁻¹, with
+    Gauss and Newton's curvature: V = 2σ²M = (2σ²)² C⁻¹.
 
     Parameters
     ----------
     result
         Of a correlation.
-    covariance
-        (n, n) C, such as ``result.covariance(noise_sd)``.
+    noise_sd
+        Of each image [grey levels].
     soft
         (n, n) of :func:`softness`.
     """
     kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
-    found = np.array(covariance, dtype=np.float64)
-    turn = soft[kept] @ np.linalg.inv(result.inverse[kept])
-    found[kept] = turn @ found[kept] @ turn.T
+    found = result.covariance(noise_sd)
+    pushes = (2.0 * noise_sd**2) ** 2 * np.linalg.inv(found[kept])
+    found[kept] = soft[kept] @ pushes @ soft[kept].T
     return found
 
 
@@ -200,15 +203,17 @@ def softness(
 ) -> FloatArray:
     """(n, n) inverse of the cost's own curvature H at a result; infinite where M⁻¹ is.
 
-    H by central differences of the gradient, from every fourth row of pixels.
+    H by differences of the gradient; of large images from some of the rows, which is what the
+    speckles in them are many enough for.
 
     Parameters
     ----------
     result, reference, deformed, mask, order
         As for :func:`leftover_covariance`.
     """
+    every = int(np.clip(mask.sum() // _ENOUGH_PX, 1, 4))
     some = np.zeros_like(mask)
-    some[::_EVERY] = mask[::_EVERY]
+    some[::every] = mask[::every]
     assembly = Assembly(result.ansatz, result.grid, some)
     f = np.ascontiguousarray(reference, dtype=np.float32)
     g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
@@ -223,7 +228,8 @@ def softness(
         a[kept[number]] += step
         return np.asarray(assembly.images(a, f, g, False).gradient[kept])
 
-    columns = [(at(k, h) - at(k, -h)) / (2.0 * h) for k, h in enumerate(steps)]
+    here = at(0, 0.0)
+    columns = [(at(k, h) - here) / h for k, h in enumerate(steps)]
     share = some.sum() / max(1, mask.sum())
     curvature = 0.5 * (np.array(columns) + np.array(columns).T) / share
     found = result.inverse.copy()
@@ -231,7 +237,7 @@ def softness(
     return found
 
 
-_EVERY, _STEP_PX = 4, 0.02
+_ENOUGH_PX, _STEP_PX = 800_000, 0.002
 
 
 _SMALL = np.float32(0.05)

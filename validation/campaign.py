@@ -279,7 +279,7 @@ def _client(workers: Workers) -> Iterator[Any]:
             n_workers=workers.count,
             threads_per_worker=1,
             memory_limit=workers.memory,
-            dashboard_address=None,
+            dashboard_address=":0",  # any free port: campaigns may run side by side
         ) as cluster,
         Client(cluster) as client,  # type: ignore[no-untyped-call]
     ):

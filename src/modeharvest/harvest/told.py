@@ -182,7 +182,7 @@ def covariances(
         images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
     used = eroded(pair.mask, _EDGE_PX)
     soft = softness(result, *images, used, order)
-    by_noise = softened(result, result.covariance(noise_sd), soft)
+    by_noise = softened(result, noise_sd, soft)
     try:
         by_leftover = leftover_covariance(result, *images, used, cell, order, soft)
         if blur > 0.0:
