@@ -18,17 +18,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.idic.calibration import Calibration, CalibrationOptions, calibrate
-from modeharvest.idic.calibration_camera import recover_camera
-from modeharvest.idic.calibration_gauge import affine_aside
-from modeharvest.imaging.distortion import (
+from modeharvest.idic.calibration.calibrate import Calibration, CalibrationOptions, calibrate
+from modeharvest.idic.calibration.camera import recover_camera
+from modeharvest.idic.calibration.gauge import affine_aside
+from modeharvest.imaging.distortion.files import read_distortion
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import (
     CameraDistortion,
     PolynomialDistortion,
     undistorted,
     undistorted_mask,
 )
-from modeharvest.imaging.distortion_files import read_distortion
-from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.io import quantise, read_image
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 

@@ -18,12 +18,12 @@ import numpy as np
 from modeharvest.case import shipped_solution
 from modeharvest.errors import MissingDependencyError
 from modeharvest.fem.field import Solution
-from modeharvest.idic.automatic_start import Start, automatic_start
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.result import Result
-from modeharvest.idic.subsets import SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.start.automatic import Start, automatic_start
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
 
 CELL, CELLULAR = 1.9, Box.centred(11.4, 19.0)

@@ -16,9 +16,9 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Solution
-from modeharvest.idic.hole_lattice import find_hole_lattice
-from modeharvest.idic.hole_motion import HoleMotion, match
-from modeharvest.idic.material import find_material
+from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
+from modeharvest.idic.specimen.hole_motion import HoleMotion, match
+from modeharvest.idic.specimen.material import find_material
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.truth import read_truth

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.calibration_noise import undistorted_noise
+from modeharvest.idic.calibration.noise import undistorted_noise
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions, correlate
 from modeharvest.idic.pyramid import Level
-from modeharvest.imaging.distortion import CameraDistortion, undistorted
+from modeharvest.imaging.distortion.undistort import CameraDistortion, undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 

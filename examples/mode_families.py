@@ -11,7 +11,7 @@ from modeharvest.fem.lattice_modes import real_modes
 from modeharvest.fem.lattices import UnitCell, hexagonal, square
 from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.idic.automatic import mode_family
+from modeharvest.idic.families.automatic import mode_family
 
 
 def show(name: str, cell: UnitCell, loading: MacroLoading, *, combined: bool = False) -> None:

@@ -14,8 +14,8 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.distortion import PolynomialDistortion
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.isoparametric import interpolate
 from modeharvest.imaging.pointwise import locate_points

@@ -50,8 +50,8 @@ from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.imaging.distorted import Positions, render_seen, seen_points
-from modeharvest.imaging.distortion import CameraDistortion
-from modeharvest.imaging.distortion_files import read_distortion
+from modeharvest.imaging.distortion.files import read_distortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.integrate import Scene, integrate
 from modeharvest.imaging.io import read_image, read_mask, write_image

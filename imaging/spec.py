@@ -11,8 +11,8 @@ import numpy as np
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.distorted import without_affine
-from modeharvest.imaging.distortion import CameraDistortion
-from modeharvest.imaging.distortion_files import AnyDistortion, read_distortion
+from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
@@ -40,7 +40,7 @@ class ImagingSpec:
         What a pixel averages, and its noise; the default shows points without noise.
     distortion
         Of the lens: a camera's, or a file that :func:`read_distortion
-        <modeharvest.imaging.distortion_files.read_distortion>` reads; None is a perfect lens.
+        <modeharvest.imaging.distortion.files.read_distortion>` reads; None is a perfect lens.
         Where there is one, pixels show points, in the images and in their masks as the lens
         distorts them; the truth stays on the ideal grid, that of the images once undistorted.
     affine_distortion

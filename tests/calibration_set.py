@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.imaging.distortion import PolynomialDistortion
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]

@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 
 from modeharvest.harvest.timeline import Moment, find_buckling
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.calibration_result import Calibration, DegreeTrial
+from modeharvest.idic.calibration.result import Calibration, DegreeTrial
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.error_bars import field_errors
+from modeharvest.idic.families.pattern import read_pattern
+from modeharvest.idic.families.spectrum import spectral_density
+from modeharvest.idic.fields.local_field import sampled_field
 from modeharvest.idic.fourier import FourierMode
 from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.hole_lattice import find_hole_lattice
 from modeharvest.idic.identifiability import identifiability
-from modeharvest.idic.local_field import sampled_field
-from modeharvest.idic.pattern import read_pattern
 from modeharvest.idic.result import Result
-from modeharvest.idic.spectrum import spectral_density
-from modeharvest.imaging.distortion import PolynomialDistortion
+from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.harvest_run import (
+from modeharvest.validation.harvest.run import (
     FrameTruth,
     Harvest,
     HarvestedFrame,

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from modeharvest.fem.dispersion import ZONES, Dispersion, ZoneMap
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.modes import Branch, BranchState, ModeSet
-from modeharvest.validation.independence import EQ_MODE, PatternMode, wave_sum
-from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
-from modeharvest.validation.mode_study import FirstModeLimit, ModeStudy
-from modeharvest.validation.mode_table import ModeRow
+from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wave_sum
+from modeharvest.validation.lattice.mode_study import FirstModeLimit, ModeStudy
+from modeharvest.validation.lattice.mode_table import ModeRow
+from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
 
 FloatArray = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from modeharvest.case import Case
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.families.pattern import Pattern, read_pattern
+from modeharvest.idic.families.spectrum import Spectrum, spectral_density
 from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.pattern import Pattern, read_pattern
 from modeharvest.idic.result import Result
-from modeharvest.idic.spectrum import Spectrum, spectral_density
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.validation.plots import Atlas

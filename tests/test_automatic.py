@@ -15,11 +15,11 @@ from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.automatic import FoundFamily, mode_family
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.equivalents import square_mode
+from modeharvest.idic.families.automatic import FoundFamily, mode_family
+from modeharvest.idic.families.equivalents import square_mode
+from modeharvest.idic.families.overlap import overlap
 from modeharvest.idic.fourier import FourierMode, free_family, square_family
-from modeharvest.idic.overlap import overlap
 from modeharvest.idic.support import Taper
 
 SETTINGS = settings(deadline=None, derandomize=True, max_examples=10)

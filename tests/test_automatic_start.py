@@ -11,16 +11,16 @@ from modeharvest.case import shipped_solution
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.automatic_start import Start, StartOptions, automatic_start
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.equivalents import REFERENCE_MODE, square_mode
+from modeharvest.idic.families.equivalents import REFERENCE_MODE, square_mode
+from modeharvest.idic.fields.local_field import LocalField, sampled_field
 from modeharvest.idic.gauss_newton import Outcome
-from modeharvest.idic.local_field import LocalField, sampled_field
 from modeharvest.idic.setup import Identification
-from modeharvest.idic.start_fits import robust_fit
-from modeharvest.idic.start_motion import first_motion, hole_centres, outline_motion
+from modeharvest.idic.start.automatic import Start, StartOptions, automatic_start
+from modeharvest.idic.start.fits import robust_fit
+from modeharvest.idic.start.motion import first_motion, hole_centres, outline_motion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
 

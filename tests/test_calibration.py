@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.errors import InputError
-from modeharvest.idic.calibration import Calibration, CalibrationOptions, calibrate
-from modeharvest.idic.calibration_gauge import affine_aside
-from modeharvest.idic.calibration_noise import sampled_noise, undistorted_noise
-from modeharvest.imaging.distortion import PolynomialDistortion, undistorted
+from modeharvest.idic.calibration.calibrate import Calibration, CalibrationOptions, calibrate
+from modeharvest.idic.calibration.gauge import affine_aside
+from modeharvest.idic.calibration.noise import sampled_noise, undistorted_noise
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion, undistorted
 from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]

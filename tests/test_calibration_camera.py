@@ -8,10 +8,10 @@ from calibration_set import photographs, random_lens
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.calibration_camera import RecoveredLens, recover_camera
-from modeharvest.idic.calibration_model import CameraModel, PolynomialModel
-from modeharvest.imaging.distortion import CameraDistortion, PolynomialDistortion
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.idic.calibration.camera import RecoveredLens, recover_camera
+from modeharvest.idic.calibration.model import CameraModel, PolynomialModel
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion, PolynomialDistortion
 
 FloatArray = NDArray[np.float64]
 

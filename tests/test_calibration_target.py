@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.imaging.calibration_target import CalibrationTarget, photograph_target
 from modeharvest.imaging.distorted import seen_points
-from modeharvest.imaging.distortion import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion, PolynomialDistortion
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
 

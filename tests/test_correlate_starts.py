@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.equivalents import mode_equivalent
+from modeharvest.idic.families.equivalents import mode_equivalent
 from modeharvest.idic.fourier import FourierMode, free_family, square_family
 from modeharvest.idic.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.pyramid import Level, eroded

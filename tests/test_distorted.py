@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.imaging.distorted import render_seen, seen_points, without_affine
-from modeharvest.imaging.distortion import (
+from modeharvest.imaging.distortion.files import write_distortion
+from modeharvest.imaging.distortion.undistort import (
     CameraDistortion,
     PolynomialDistortion,
     undistorted,
     undistorted_mask,
 )
-from modeharvest.imaging.distortion_files import write_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.isoparametric import locate

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.imaging.distortion import (
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import (
     CameraDistortion,
     PolynomialDistortion,
     SampledDistortion,
     undistorted,
     undistorted_mask,
 )
-from modeharvest.imaging.distortion_map import Distortion
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]

@@ -13,13 +13,13 @@ from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.automatic import FoundFamily, mode_family
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.equivalents import square_mode
-from modeharvest.idic.family_file import FORMAT, read_family, read_spectrum, write_family
+from modeharvest.idic.families.automatic import FoundFamily, mode_family
+from modeharvest.idic.families.equivalents import square_mode
+from modeharvest.idic.families.files import FORMAT, read_family, read_spectrum, write_family
+from modeharvest.idic.families.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.fourier import FourierMode
-from modeharvest.idic.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.support import Taper
 from modeharvest.imaging.grid import PixelGrid
 

@@ -23,11 +23,11 @@ from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uni
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.modes import ModeSet
 from modeharvest.fem.postbuckling import follow
-from modeharvest.idic.automatic import FoundFamily, mode_family
-from modeharvest.idic.family_file import read_family
+from modeharvest.idic.families.automatic import FoundFamily, mode_family
+from modeharvest.idic.families.files import read_family
+from modeharvest.idic.families.lattice_spectrum import lattice_spectrum
+from modeharvest.idic.families.overlap import overlap
 from modeharvest.idic.fourier import square_family
-from modeharvest.idic.lattice_spectrum import lattice_spectrum
-from modeharvest.idic.overlap import overlap
 
 PITCH = 1.0
 LOADINGS = {"uniaxial": uniaxial(), "strain": uniaxial_strain(), "equibiaxial": equibiaxial()}

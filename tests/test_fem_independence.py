@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from modeharvest.errors import InputError
-from modeharvest.validation.independence import (
+from modeharvest.validation.lattice.independence import (
     LOADINGS,
     Lattice,
     PatternMode,
@@ -25,7 +25,7 @@ from modeharvest.validation.independence import (
     pattern_mode,
     pattern_row,
 )
-from modeharvest.validation.mode_study import Table, study_likeness
+from modeharvest.validation.lattice.mode_study import Table, study_likeness
 
 BASE = Lattice(ratio=0.8, loading=LOADINGS["equibiaxial"], divisions=6)
 

@@ -11,9 +11,9 @@ import pytest
 from scipy.io import savemat
 
 from modeharvest.errors import InputError
-from modeharvest.idic.field_columns import column
-from modeharvest.idic.field_files import read_field, write_field
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.columns import column
+from modeharvest.idic.fields.files import read_field, write_field
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 
 GRID = PixelGrid.centred(60, 80, 0.05)

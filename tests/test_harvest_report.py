@@ -25,15 +25,15 @@ from modeharvest.idic.error_bars import field_errors
 from modeharvest.idic.fourier import FourierMode, free_family
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.support import Taper
-from modeharvest.imaging.distortion import PolynomialDistortion
-from modeharvest.validation import harvest_words as words
-from modeharvest.validation.harvest_atlas import MOST, HarvestAtlas
-from modeharvest.validation.harvest_panels import panels
-from modeharvest.validation.harvest_report import write_harvest_report
-from modeharvest.validation.harvest_run import Harvest, HarvestedFrame
-from modeharvest.validation.harvest_summary import harvest_summary
-from modeharvest.validation.mask_outline import outline_of_mask
-from modeharvest.validation.plots_photographs import unaffine
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
+from modeharvest.validation.harvest import words
+from modeharvest.validation.harvest.atlas import MOST, HarvestAtlas
+from modeharvest.validation.harvest.mask_outline import outline_of_mask
+from modeharvest.validation.harvest.panels import panels
+from modeharvest.validation.harvest.plots_photographs import unaffine
+from modeharvest.validation.harvest.report import write_harvest_report
+from modeharvest.validation.harvest.run import Harvest, HarvestedFrame
+from modeharvest.validation.harvest.summary import harvest_summary
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.hole_lattice import HoleLattice, find_hole_lattice, lattice_of
-from modeharvest.idic.hole_motion import match, possible_motions
-from modeharvest.idic.holes import Holes, find_holes
+from modeharvest.idic.specimen.hole_lattice import HoleLattice, find_hole_lattice, lattice_of
+from modeharvest.idic.specimen.hole_motion import match, possible_motions
+from modeharvest.idic.specimen.holes import Holes, find_holes
 from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]

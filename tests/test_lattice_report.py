@@ -16,9 +16,9 @@ import synthetic_lattice as made_up
 from html_page import Page
 
 from modeharvest.errors import InputError
-from modeharvest.validation import lattice_words as words
-from modeharvest.validation.lattice_report import CriticalPoint, FoundPattern, write_lattice_report
-from modeharvest.validation.lattice_run import LatticeRun
+from modeharvest.validation.lattice import words
+from modeharvest.validation.lattice.report import CriticalPoint, FoundPattern, write_lattice_report
+from modeharvest.validation.lattice.run import LatticeRun
 
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
 

@@ -17,13 +17,13 @@ from scipy.special import j1
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.lattice_spectrum import (
+from modeharvest.idic.families.lattice_spectrum import (
     LatticeSpectrum,
     lattice_spectrum,
     reciprocal_vectors,
     upward,
 )
-from modeharvest.idic.quadrature import Quadrature, gauss_rule, points_for
+from modeharvest.idic.families.quadrature import Quadrature, gauss_rule, points_for
 
 SETTINGS = settings(deadline=None, derandomize=True, max_examples=8)
 TWO = np.array([[2], [2]])

@@ -7,7 +7,7 @@ import pytest
 
 from modeharvest.errors import InputError
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.local_field import LocalField, sampled_field
+from modeharvest.idic.fields.local_field import LocalField, sampled_field
 from modeharvest.imaging.grid import PixelGrid
 
 X, Y = (a.ravel() for a in np.meshgrid(np.arange(5.0), np.arange(4.0)))

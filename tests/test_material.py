@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from modeharvest.errors import InputError
-from modeharvest.idic.material import MaterialOptions, find_material
+from modeharvest.idic.specimen.material import MaterialOptions, find_material
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 BoolArray = NDArray[np.bool_]

@@ -7,12 +7,12 @@ import pytest
 
 from modeharvest.errors import InputError
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.equivalents import REFERENCE_MODE, square_mode
-from modeharvest.idic.local_field import LocalField, sampled_field
-from modeharvest.idic.measured_spectrum import gridded, measured_spectrum
-from modeharvest.idic.pattern import read_pattern
-from modeharvest.idic.spectrum import spectral_density
-from modeharvest.idic.waves import find_peaks
+from modeharvest.idic.families.equivalents import REFERENCE_MODE, square_mode
+from modeharvest.idic.families.pattern import read_pattern
+from modeharvest.idic.families.spectrum import spectral_density
+from modeharvest.idic.families.waves import find_peaks
+from modeharvest.idic.fields.local_field import LocalField, sampled_field
+from modeharvest.idic.fields.measured_spectrum import gridded, measured_spectrum
 from modeharvest.imaging.grid import PixelGrid
 
 PITCH, PIXEL = 1.9, 0.05

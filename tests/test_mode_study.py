@@ -19,8 +19,8 @@ from synthetic_lattice import row
 from modeharvest.errors import InputError
 from modeharvest.fem.macroscopic import simple_shear
 from modeharvest.fem.materials import Ogden
-from modeharvest.validation import mode_study
-from modeharvest.validation.independence import (
+from modeharvest.validation.lattice import mode_study
+from modeharvest.validation.lattice.independence import (
     LOADINGS,
     MATERIALS,
     Lattice,
@@ -28,8 +28,8 @@ from modeharvest.validation.independence import (
     ogden,
     ratio_lattices,
 )
-from modeharvest.validation.mode_study import Table, first_mode_limit, study_modes
-from modeharvest.validation.mode_table import ModeRow, read_rows, write_rows
+from modeharvest.validation.lattice.mode_study import Table, first_mode_limit, study_modes
+from modeharvest.validation.lattice.mode_table import ModeRow, read_rows, write_rows
 
 LIMIT = 0.671  # of the made-up lattices
 

@@ -20,15 +20,20 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from modeharvest.errors import InputError
-from modeharvest.imaging.image_files import _upright
-from modeharvest.imaging.photographs import (
+from modeharvest.imaging.photographs.image_files import _upright
+from modeharvest.imaging.photographs.photograph import (
     LUMA,
     neighbour_correlation,
     pixel_size,
     read_photograph,
     require_usable,
 )
-from modeharvest.imaging.series import read_frame, read_reference, require_alike, usable_frames
+from modeharvest.imaging.photographs.series import (
+    read_frame,
+    read_reference,
+    require_alike,
+    usable_frames,
+)
 
 
 def speckle(shape: tuple[int, int] = (96, 128), seed: int = 0, size: float = 1.5) -> NDArray[Any]:

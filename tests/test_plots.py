@@ -17,8 +17,8 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from modeharvest.idic.pattern import Pattern
-from modeharvest.idic.waves import Wave
+from modeharvest.idic.families.pattern import Pattern
+from modeharvest.idic.families.waves import Wave
 from modeharvest.validation.plots import PANELS, Atlas, Panel, draw_hero
 from modeharvest.validation.plots_fields import Scale, draw_field
 from modeharvest.validation.plots_path import (

@@ -20,9 +20,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from modeharvest.validation.independence import EQ_MODE, wave_sum
-from modeharvest.validation.patch import Patch
-from modeharvest.validation.plots_branches import (
+from modeharvest.validation.lattice.independence import EQ_MODE, wave_sum
+from modeharvest.validation.lattice.patch import Patch
+from modeharvest.validation.lattice.plots import draw_growth, draw_lattice, draw_overlay
+from modeharvest.validation.lattice.plots_branches import (
     combination_name,
     draw_amplitudes,
     draw_captured,
@@ -31,8 +32,11 @@ from modeharvest.validation.plots_branches import (
     draw_energies,
     draw_overlaps,
 )
-from modeharvest.validation.plots_lattice import draw_growth, draw_lattice, draw_overlay
-from modeharvest.validation.plots_waves import draw_dispersion, draw_lattice_spectrum, draw_zone_map
+from modeharvest.validation.lattice.plots_waves import (
+    draw_dispersion,
+    draw_lattice_spectrum,
+    draw_zone_map,
+)
 from modeharvest.validation.style import INK
 
 L = made_up.PITCH

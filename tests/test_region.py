@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.hole_lattice import find_hole_lattice
-from modeharvest.idic.region import junction, region_of_lattice, region_of_mask, region_of_polygon
+from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
+from modeharvest.idic.specimen.region import (
+    junction,
+    region_of_lattice,
+    region_of_mask,
+    region_of_polygon,
+)
 from modeharvest.imaging.grid import PixelGrid
 
 SPECIMEN = Specimen(holes_x=4, holes_y=3)

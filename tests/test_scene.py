@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.hole_motion import HoleMotion
-from modeharvest.idic.scene import compare_scenes, require_same_scene
+from modeharvest.idic.specimen.hole_motion import HoleMotion
+from modeharvest.idic.specimen.scene import compare_scenes, require_same_scene
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 

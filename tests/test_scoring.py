@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.regions import REGIONS, regions
 from modeharvest.validation.scoring import score

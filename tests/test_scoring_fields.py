@@ -21,7 +21,7 @@ from scipy.io import savemat
 from synthetic_benchmark import PIXEL, STRAIN
 
 from modeharvest.errors import InputError
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.scoring import Declared, declarations
 from modeharvest.validation.benchmark_set import BenchmarkTruth
 from modeharvest.validation.regions import regions

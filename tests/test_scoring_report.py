@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from synthetic_benchmark import PIXEL, STRAIN
 
 from modeharvest import cli
-from modeharvest.idic.field_files import write_field
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.files import write_field
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.benchmark_set import BenchmarkTruth
 from modeharvest.validation.page import short

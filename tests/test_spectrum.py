@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modeharvest.errors import InputError
-from modeharvest.idic.equivalents import (
+from modeharvest.idic.families.equivalents import (
     REFERENCE_MODE,
     mode_deviation,
     mode_equivalent,
     square_mode,
 )
-from modeharvest.idic.pattern import read_pattern
-from modeharvest.idic.spectrum import spectral_density
-from modeharvest.idic.waves import find_peaks
+from modeharvest.idic.families.pattern import read_pattern
+from modeharvest.idic.families.spectrum import spectral_density
+from modeharvest.idic.families.waves import find_peaks
 from modeharvest.imaging.grid import PixelGrid
 
 PITCH = 1.9

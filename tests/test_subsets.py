@@ -15,8 +15,8 @@ import pytest
 from scipy import ndimage
 
 from modeharvest.errors import InputError, MissingDependencyError
-from modeharvest.idic.local_field import LocalField
-from modeharvest.idic.subsets import (
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.subsets import (
     WHERE,
     SubsetOptions,
     predicted_sd,

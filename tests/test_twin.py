@@ -17,7 +17,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.harvest.experiment import read_experiment
 from modeharvest.harvest.twin import Twin, make_twin
 from modeharvest.imaging.calibration_target import CalibrationTarget
-from modeharvest.imaging.distortion import CameraDistortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion
 from modeharvest.imaging.io import read_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
-from modeharvest.idic.pattern import Pattern
-from modeharvest.idic.spectrum import Spectrum
+from modeharvest.idic.families.pattern import Pattern
+from modeharvest.idic.families.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.validation import plots_fields as fields
 from modeharvest.validation.plots_fields import Scale

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from modeharvest.idic.pattern import Pattern
+from modeharvest.idic.families.pattern import Pattern
+from modeharvest.idic.families.spectrum import Spectrum
 from modeharvest.idic.result import Result
-from modeharvest.idic.spectrum import Spectrum
 from modeharvest.validation.plots_fields import WIDTH, Scale, colour_bar
 from modeharvest.validation.style import BLUE, DENSITY, GOLD, GREEN, INK, MUTED, RED, figure, style
 

@@ -118,9 +118,7 @@ def draw_distribution(scores: Sequence[Score]) -> Figure:
 def draw_histogram(scores: Sequence[Score]) -> Figure:
     """Draw how many of a field's points err by how much, in tenths of a decade."""
     with style():
-        drawn, axes = curve(
-            "length of the error [px]", "share of points per tenth of a decade [%]"
-        )
+        drawn, axes = curve("length of the error [px]", "share of points per tenth of a decade [%]")
         for n, graded in enumerate(scores):
             length = np.maximum(_length(graded), 1e-9)
             if not len(length):

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
 from modeharvest.files import atomic
-from modeharvest.idic.pattern import Pattern
-from modeharvest.idic.spectrum import Spectrum
+from modeharvest.idic.families.pattern import Pattern
+from modeharvest.idic.families.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.progress import Progress, silent
 from modeharvest.validation import words

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.io import loadmat
 
 from modeharvest.errors import InputError
-from modeharvest.idic.field_files import read_field
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.files import read_field
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 
 _VTK = {".vtk", ".vtu", ".vtp"}
@@ -35,7 +35,7 @@ class Declared:
     name
         Of the code, for tables; the file's by default.
     units, displacement_units, y_axis, first_pixel, columns
-        As for :func:`modeharvest.idic.field_files.read_field`.
+        As for :func:`modeharvest.idic.fields.files.read_field`.
     """
 
     name: str | None = None

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.local_field import LocalField
-from modeharvest.idic.measured_spectrum import gridded
-from modeharvest.idic.spectrum import spectral_density
+from modeharvest.idic.families.spectrum import spectral_density
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.measured_spectrum import gridded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.scoring import Score
 

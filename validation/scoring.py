@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.errors import InputError
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.regions import REGIONS
 

@@ -48,12 +48,12 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.files import write_json
-from modeharvest.idic.equivalents import mode_deviation, mode_equivalent
+from modeharvest.idic.families.equivalents import mode_deviation, mode_equivalent
+from modeharvest.idic.families.pattern import Pattern, read_pattern
+from modeharvest.idic.families.spectrum import Spectrum, spectral_density
 from modeharvest.idic.identifiability import identifiability
-from modeharvest.idic.pattern import Pattern, read_pattern
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
-from modeharvest.idic.spectrum import Spectrum, spectral_density
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.metrics import describe

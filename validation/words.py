@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from modeharvest.idic.equivalents import REFERENCE_MODE
+from modeharvest.idic.families.equivalents import REFERENCE_MODE
 
 Snapshot = Mapping[str, Any]
 

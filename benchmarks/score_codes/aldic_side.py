@@ -15,7 +15,7 @@ from al_dic import dicpara_default, run_aldic
 from al_dic.core.data_structures import GridxyROIRange
 from PIL import Image
 
-WINDOW_PX, STEP_PX, SEARCH_PX = 20, 4, 48
+WINDOW_PX, STEP_PX, SEARCH_PX = 20, 4, 44
 
 
 def main(public: Path, deformed: str, field: Path) -> None:
@@ -32,6 +32,7 @@ def main(public: Path, deformed: str, field: Path) -> None:
         use_masks=True,
         reference_mode="accumulative",
         size_of_fft_search_region=SEARCH_PX,
+        fft_auto_expand_search=False,  # single clipped peaks at holes would widen it for all
         show_plots=False,
         gridxy_roi_range=GridxyROIRange(
             gridx=(int(col.min()), int(col.max())), gridy=(int(row.min()), int(row.max()))

@@ -24,12 +24,12 @@ import numpy as np
 from modeharvest.case import read_case, shipped_solution
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.automatic_start import automatic_start
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.field_files import write_field
-from modeharvest.idic.local_field import sampled_field
-from modeharvest.idic.subsets import WHERE, SubsetOptions, subset_field
+from modeharvest.idic.fields.files import write_field
+from modeharvest.idic.fields.local_field import sampled_field
+from modeharvest.idic.fields.subsets import WHERE, SubsetOptions, subset_field
+from modeharvest.idic.start.automatic import automatic_start
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.scoring import grade, make_benchmark, print_grading, truth_folder

@@ -44,7 +44,7 @@ from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.idic.setup import Identification
 from modeharvest.imaging.calibration_target import CalibrationTarget
-from modeharvest.imaging.distortion import CameraDistortion
+from modeharvest.imaging.distortion.undistort import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec
 
 __all__ = ["Case", "TwinCase", "case_text", "read_case", "shipped_cases", "shipped_solution"]

@@ -27,7 +27,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.error_bars import FieldErrors, field_errors
 from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.result import Result
-from modeharvest.imaging.distortion import undistorted
+from modeharvest.imaging.distortion.undistort import undistorted
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]

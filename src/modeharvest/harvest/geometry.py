@@ -13,9 +13,14 @@ from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Corners, SpecimenTable
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.hole_lattice import HoleLattice, find_hole_lattice
-from modeharvest.idic.hole_motion import HoleMotion, possible_motions
-from modeharvest.idic.region import Region, region_of_lattice, region_of_mask, region_of_polygon
+from modeharvest.idic.specimen.hole_lattice import HoleLattice, find_hole_lattice
+from modeharvest.idic.specimen.hole_motion import HoleMotion, possible_motions
+from modeharvest.idic.specimen.region import (
+    Region,
+    region_of_lattice,
+    region_of_mask,
+    region_of_polygon,
+)
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import read_mask, require_same_shape
 
@@ -88,7 +93,7 @@ class Geometry:
         """How the holes may have moved in a deformed image, the likeliest first.
 
         Nothing where they can't be followed; the sentence says why. See
-        :func:`modeharvest.idic.hole_motion.possible_motions`.
+        :func:`modeharvest.idic.specimen.hole_motion.possible_motions`.
 
         Parameters
         ----------

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Experiment
-from modeharvest.idic.subsets import pyvale_python
+from modeharvest.idic.fields.subsets import pyvale_python
 
 
 def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:

@@ -10,10 +10,10 @@ import numpy as np
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.inputs import of_each_photograph
 from modeharvest.harvest.prepare import Prepared
-from modeharvest.idic.field_files import read_field
-from modeharvest.idic.local_field import LocalField
-from modeharvest.idic.subsets import SubsetOptions, subset_field
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.idic.fields.files import read_field
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.subsets import SubsetOptions, subset_field
+from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.grid import PixelGrid
 
 

@@ -15,14 +15,14 @@ from modeharvest.harvest.options import Measurement
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.surface import confirmed, followed_holes
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.automatic_start import Start, StartOptions, automatic_start
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.idic.finish import Finish, blurred_pair, finish_for
 from modeharvest.idic.gauss_newton import Outcome
 from modeharvest.idic.identifiability import identifiability
-from modeharvest.idic.local_field import LocalField
 from modeharvest.idic.result import Result
+from modeharvest.idic.start.automatic import Start, StartOptions, automatic_start
 from modeharvest.progress import Progress, silent
 
 FloatArray = NDArray[np.float64]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from modeharvest.harvest.geometry import Geometry
 from modeharvest.harvest.options import Measurement
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.automatic_start import Start
 from modeharvest.idic.fourier import FourierMode, ModeFamily, square_family
-from modeharvest.idic.region import junction
-from modeharvest.idic.start_modes import SAME_WAVE
+from modeharvest.idic.specimen.region import junction
+from modeharvest.idic.start.automatic import Start
+from modeharvest.idic.start.modes import SAME_WAVE
 from modeharvest.idic.support import Taper
 
 FloatArray = NDArray[np.float64]

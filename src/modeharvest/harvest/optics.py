@@ -11,12 +11,12 @@ import numpy as np
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import DistortionTable
 from modeharvest.harvest.inputs import named_files
-from modeharvest.idic.calibration import calibrate
-from modeharvest.idic.calibration_result import Calibration, DegreeTrial
-from modeharvest.imaging.distortion import PolynomialDistortion
-from modeharvest.imaging.distortion_files import read_distortion, write_distortion
-from modeharvest.imaging.distortion_map import Distortion
-from modeharvest.imaging.photographs import read_photograph
+from modeharvest.idic.calibration.calibrate import calibrate
+from modeharvest.idic.calibration.result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.files import read_distortion, write_distortion
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
+from modeharvest.imaging.photographs.photograph import read_photograph
 from modeharvest.progress import Progress, silent
 
 _ARRAYS = ("shifts", "shifts_sd", "angles", "angles_sd", "matches", "covariance")

@@ -32,16 +32,16 @@ from modeharvest.harvest.optics import Optics, calibrate_lens, calibrated_lens
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import RECORD, Prepared, prepare
 from modeharvest.harvest.told import harvest_of
-from modeharvest.idic.field_files import read_field, write_field
-from modeharvest.idic.local_field import LocalField
+from modeharvest.idic.fields.files import read_field, write_field
+from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.result import Result
-from modeharvest.imaging.distortion_files import read_distortion
+from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
-from modeharvest.validation.harvest_report import write_harvest_report
-from modeharvest.validation.harvest_run import Harvest, HarvestTruth
-from modeharvest.validation.harvest_summary import harvest_summary
+from modeharvest.validation.harvest.report import write_harvest_report
+from modeharvest.validation.harvest.run import Harvest, HarvestTruth
+from modeharvest.validation.harvest.summary import harvest_summary
 
 
 @dataclass(frozen=True)

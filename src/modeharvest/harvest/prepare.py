@@ -24,13 +24,13 @@ from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.inputs import named_files, of_each_photograph
 from modeharvest.harvest.noise import Noise, estimated_noise, measured_noise
-from modeharvest.idic.material import MaterialOptions, find_material
-from modeharvest.imaging.distortion import undistorted, undistorted_mask
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.idic.specimen.material import MaterialOptions, find_material
+from modeharvest.imaging.distortion.mapping import Distortion
+from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import read_image, read_mask, require_same_shape, write_image
-from modeharvest.imaging.photographs import Photograph
-from modeharvest.imaging.series import read_frame, read_reference
+from modeharvest.imaging.photographs.photograph import Photograph
+from modeharvest.imaging.photographs.series import read_frame, read_reference
 from modeharvest.progress import Progress, silent
 
 FloatImage = NDArray[np.float32]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from modeharvest.harvest.geometry import Geometry
 from modeharvest.harvest.pair import Pair
-from modeharvest.idic.hole_motion import HoleMotion
-from modeharvest.idic.scene import Expected, SceneMatch, compare_scenes, require_same_scene
+from modeharvest.idic.specimen.hole_motion import HoleMotion
+from modeharvest.idic.specimen.scene import Expected, SceneMatch, compare_scenes, require_same_scene
 
 
 def followed_holes(pair: Pair, geometry: Geometry) -> tuple[HoleMotion | None, str]:

@@ -27,14 +27,14 @@ from modeharvest.idic.error_bars import (
     softened,
     softness,
 )
+from modeharvest.idic.families.pattern import read_pattern
+from modeharvest.idic.fields.measured_spectrum import measured_spectrum
 from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.identifiability import identifiability
-from modeharvest.idic.measured_spectrum import measured_spectrum
-from modeharvest.idic.pattern import read_pattern
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.pyramid import eroded
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.harvest_run import Harvest, HarvestedFrame, HarvestTruth, PartSpectrum
+from modeharvest.validation.harvest.run import Harvest, HarvestedFrame, HarvestTruth, PartSpectrum
 
 FloatArray = NDArray[np.float64]
 

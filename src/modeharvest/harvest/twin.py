@@ -31,7 +31,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, read_json, write_json
 from modeharvest.imaging.calibration_target import photograph_target
 from modeharvest.imaging.distorted import seen_points
-from modeharvest.imaging.distortion_files import AnyDistortion, read_distortion, write_distortion
+from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
 from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
 from modeharvest.imaging.io import write_image
 from modeharvest.progress import Progress, silent

@@ -27,11 +27,11 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.result import Result
-from modeharvest.imaging.distortion_map import Distortion
+from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.harvest_run import FrameTruth, HarvestTruth, TruthRow
+from modeharvest.validation.harvest.run import FrameTruth, HarvestTruth, TruthRow
 
 FloatArray = NDArray[np.float64]
 

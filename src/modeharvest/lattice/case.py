@@ -41,10 +41,10 @@ from modeharvest.fem.materials import Material, Ogden
 from modeharvest.lattice.kinds import LATTICES, Lattice, SquareLattice
 from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan, Search
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.independence import LOADINGS, RATIOS
-from modeharvest.validation.independence import MATERIALS as MATERIALS_BY_NAME
-from modeharvest.validation.independence import Lattice as StudiedLattice
-from modeharvest.validation.mode_study import SHOWN, ModeStudy, run_study
+from modeharvest.validation.lattice.independence import LOADINGS, RATIOS
+from modeharvest.validation.lattice.independence import MATERIALS as MATERIALS_BY_NAME
+from modeharvest.validation.lattice.independence import Lattice as StudiedLattice
+from modeharvest.validation.lattice.mode_study import SHOWN, ModeStudy, run_study
 
 
 @dataclass(frozen=True)

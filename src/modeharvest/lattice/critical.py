@@ -1,6 +1,6 @@
 """The first critical point of a lattice's case, and ``critical.json``, which keeps it.
 
-That holds ``point``, the fields of :class:`modeharvest.validation.lattice_run.CriticalPoint`, and
+That holds ``point``, the fields of :class:`modeharvest.validation.lattice.run.CriticalPoint`, and
 ``history``: for each load looked at the least stable wave (see ``fem.zone.LeastStable``).
 """
 
@@ -14,7 +14,7 @@ from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice.options import Search
 from modeharvest.progress import Progress, named, silent
-from modeharvest.validation.lattice_run import CriticalPoint
+from modeharvest.validation.lattice.run import CriticalPoint
 
 if TYPE_CHECKING:  # their modules need dolfinx
     from modeharvest.fem.bloch_critical import LatticeCritical

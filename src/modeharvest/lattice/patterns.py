@@ -15,13 +15,13 @@ from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
 from modeharvest.fem.modes import Branch, ModeSet
-from modeharvest.idic.automatic import mode_family
-from modeharvest.idic.family_file import read_family, read_spectrum, write_family
-from modeharvest.idic.lattice_spectrum import lattice_spectrum
+from modeharvest.idic.families.automatic import mode_family
+from modeharvest.idic.families.files import read_family, read_spectrum, write_family
+from modeharvest.idic.families.lattice_spectrum import lattice_spectrum
 from modeharvest.lattice.options import ModesPlan
 from modeharvest.progress import Progress, named, silent
-from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern
-from modeharvest.validation.plots_branches import combination_name
+from modeharvest.validation.lattice.plots_branches import combination_name
+from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern
 
 if TYPE_CHECKING:  # it needs dolfinx
     from modeharvest.fem.cell import CellPath, CellState

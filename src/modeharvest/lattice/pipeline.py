@@ -42,9 +42,9 @@ from modeharvest.lattice.patterns import (
 from modeharvest.lattice.summary import exports_in, summary_of
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
-from modeharvest.validation.lattice_report import write_lattice_report
-from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
-from modeharvest.validation.mode_study import ModeStudy
+from modeharvest.validation.lattice.mode_study import ModeStudy
+from modeharvest.validation.lattice.report import write_lattice_report
+from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ from modeharvest.fem.dispersion import Dispersion
 from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json
 from modeharvest.lattice.case import LatticeCase
-from modeharvest.validation.lattice_run import CriticalPoint, FoundPattern, LatticeRun
-from modeharvest.validation.mode_study import ModeStudy
+from modeharvest.validation.lattice.mode_study import ModeStudy
+from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
 
 _EXPORTS = {
     "dispersion.h5": "eigenvalues along the path and over the zone (HDF5)",

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from modeharvest.validation.plots_branches import combination_name
+from modeharvest.validation.lattice.plots_branches import combination_name
 
 
 def print_lattice(summary: dict[str, Any], out: Path) -> None:

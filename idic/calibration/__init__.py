@@ -1,0 +1,1 @@
+"""A lens's distortion from photographs of a shifted target, or from a pair of images."""

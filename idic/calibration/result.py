@@ -1,0 +1,203 @@
+"""A calibrated distortion: S, how it was chosen, how well it is known, and what it leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.idic.calibration.fit import Fit
+from modeharvest.idic.calibration.model import PolynomialModel
+from modeharvest.imaging.distortion.undistort import PolynomialDistortion
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DegreeTrial:
+    """What a degree of S gave.
+
+    Parameters
+    ----------
+    degree, unknowns
+        Total degree; number of all unknowns.
+    residual_rms
+        Scatter of the photographs about their mean [grey levels].
+    bic
+        Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
+        for N values; the degree with 0 is taken [-].
+    change_px
+        Rms per component over the image by which S differs from the degree before [px].
+    sd_px
+        Rms per component over the image of S's standard deviation [px].
+    """
+
+    degree: int
+    unknowns: int
+    residual_rms: float
+    bic: float
+    change_px: float
+    sd_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A lens's distortion as found, and how well.
+
+    Parameters
+    ----------
+    distortion
+        S, without the part that cannot be observed (see ``sentences``).
+    shifts, shifts_sd
+        (m, 2) motion of the target since the first photograph, along rows and columns [px], and
+        its standard deviation; 0 where given.
+    angles, angles_sd
+        (m,) its rotation, from the columns' to the rows' axis [rad], and its standard deviation.
+    trials
+        One for each degree.
+    noise_sd
+        Noise of a photograph, estimated from what is left over [grey levels].
+    matches
+        (m,) correlation of each photograph with the mean of the others [-].
+    covariance
+        (n, n) of S's unknown coefficients [px^2], those of the rows' component first.
+    fixed
+        How many terms of each component could not be seen and are zero.
+    sentences
+        What was found, and what could not be.
+    """
+
+    distortion: PolynomialDistortion
+    shifts: FloatArray
+    shifts_sd: FloatArray
+    angles: FloatArray
+    angles_sd: FloatArray
+    trials: tuple[DegreeTrial, ...]
+    noise_sd: float
+    matches: FloatArray
+    covariance: FloatArray
+    fixed: int
+    sentences: tuple[str, ...] = field(default=())
+
+    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Standard deviation of S along rows and columns [px] at ideal positions [px].
+
+        That of the photographs' noise; what a polynomial of this degree can't follow is not in it.
+        """
+        return _sd(self.distortion, self.covariance, self.fixed, row, col)
+
+
+def calibration_of(
+    trials: Sequence[tuple[PolynomialModel, Fit]], known: bool, noise: tuple[float, float]
+) -> Calibration:
+    """Choose the degree with the lowest BIC and say what is known of it.
+
+    Parameters
+    ----------
+    trials
+        One a degree.
+    known
+        Whether shifts were given.
+    noise
+        What became of white noise of variance 1 in a sample, and in the mean of many
+        (:func:`~modeharvest.idic.calibration.noise.sampled_noise`).
+    """
+    model, fit = min(trials, key=lambda trial: trial[1].bic)
+    one, many = noise
+    k = len(fit.coefficients)
+    covariance: FloatArray = fit.inverse * (fit.variance * many / one)
+    own = np.zeros(fit.free.shape)
+    own[fit.free] = np.sqrt(np.diag(covariance)[k:])
+    found = Calibration(
+        distortion=model.distortion(fit.coefficients),
+        shifts=np.array([pose.shift for pose in fit.poses]),
+        shifts_sd=own[:, :2],
+        angles=np.array([pose.angle for pose in fit.poses]),
+        angles_sd=own[:, 2],
+        trials=_trials(trials, many / one),
+        noise_sd=float(np.sqrt(fit.variance / one)),
+        matches=fit.matches,
+        covariance=covariance[:k, :k],
+        fixed=model.fixed,
+    )
+    return replace(found, sentences=sentences(found, known))
+
+
+def _trials(
+    fitted: Sequence[tuple[PolynomialModel, Fit]], factor: float
+) -> tuple[DegreeTrial, ...]:
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in fitted[0][0].shape)
+    at = row[:, None], col[None, :]
+    least = min(fit.bic for _, fit in fitted)
+    trials: list[DegreeTrial] = []
+    before: FloatArray = np.zeros((2, 25, 25))
+    for model, fit in fitted:
+        k = len(fit.coefficients)
+        lens = model.distortion(fit.coefficients)
+        now = np.stack(lens.shift(*at))
+        covariance = fit.inverse[:k, :k] * fit.variance * factor
+        sd = _sd(lens, covariance, model.fixed, *at)
+        trials.append(
+            DegreeTrial(
+                degree=model.degree,
+                unknowns=len(fit.inverse),
+                residual_rms=float(np.sqrt(fit.variance)),
+                bic=fit.bic - least,
+                change_px=float(np.sqrt(np.mean((now - before) ** 2))),
+                sd_px=float(np.sqrt(np.mean(np.square(sd)))),
+            )
+        )
+        before = now
+    return tuple(trials)
+
+
+def _sd(
+    lens: PolynomialDistortion, covariance: FloatArray, fixed: int, row: ArrayLike, col: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    basis = lens.basis(row, col)[..., fixed:]
+    n = basis.shape[-1]
+    along_row, along_col = (
+        np.sqrt(np.maximum(((basis @ part) * basis).sum(axis=-1), 0.0))
+        for part in (covariance[:n, :n], covariance[n:, n:])
+    )
+    return np.asarray(along_row), np.asarray(along_col)
+
+
+def sentences(found: Calibration, known: bool) -> tuple[str, ...]:
+    """What was found, and what could not be."""
+    chosen = next(t for t in found.trials if t.bic == 0.0)
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
+    size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
+    turned = np.abs(found.angles).max()
+    said = [
+        f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
+        f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
+        f"{chosen.sd_px:.4f} px rms over the image.",
+    ]
+    if chosen is found.trials[-1] and len(found.trials) > 1:
+        said.append(
+            f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
+            f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
+        )
+    if known:
+        said.append(
+            "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
+            "constant part can't be observed and is zero at the polynomial's mean."
+        )
+    else:
+        said.append(
+            "The shifts were not known, so the affine part of S can't be observed and is zero: "
+            "scale and skew of the image are open, as with any pixel size that isn't measured."
+        )
+    if turned > 0.0:
+        said.append(
+            f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
+            f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
+        )
+    said.append(
+        "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
+        "or a change of the distance to the lens would be taken for distortion."
+    )
+    return tuple(said)

@@ -1,0 +1,1 @@
+"""From spectra to waves, from waves to families of modes."""

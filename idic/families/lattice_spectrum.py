@@ -1,0 +1,268 @@
+"""Exact Fourier coefficients of a periodic field on a lattice, and the peaks among them.
+
+With l the pitch, A the area of the cell (holes included) and u zero in the holes::
+
+    û(ξ) = ∫_cell u(x) exp(−2πi ξ·x/l) dA   [mm³]      S_xx = |û_x|², S_yy = |û_y|²   [mm⁶]
+
+A periodic field has energy at the reciprocal vectors of its cell only, ξ = l (n1 b1 + n2 b2) with
+b_i·a_j = δ_ij; between them a lattice of many cells has nothing. Parseval's theorem reads
+Σ (S_xx + S_yy) = A ∫ |u|² dA. For u without a unit (a mode), take "mm" off once.
+
+This is :mod:`modeharvest.idic.families.spectrum` for fields of which one period is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from modeharvest.errors import InputError
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.families.quadrature import Quadrature, points_for
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+PERIODIC = 1e-4
+"""Largest difference of a field between partner nodes, of its largest value: far above what
+single precision leaves, far below what an affine part does."""
+PARTNERS = 1e-4
+"""Distance, in lattice vectors, up to which nodes are partners; elements are far larger."""
+SAME_WAVE = 1e-6
+"""Difference [1/l] of wave vectors that are the same."""
+LEAST_SHARE = 1e-6
+"""Least share of the energy of what is listed as a peak: below, symmetry forbids the wave and
+the number is the mesh's."""
+
+
+@dataclass(frozen=True)
+class LatticePeak:
+    """A wave vector of a periodic field and its mirror image −ξ.
+
+    Parameters
+    ----------
+    xi
+        (ξ1, ξ2) Cartesian [1/l], of the two the one with ξ2 > 0, or ξ1 > 0 on the axis.
+    density
+        S_xx + S_yy [mm⁶].
+    share
+        Share of the energy ∫ |u|² dA in ξ and −ξ together [-].
+    """
+
+    xi: tuple[float, float]
+    density: float
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeSpectrum:
+    """The Fourier coefficients of a periodic field up to some wave number.
+
+    Parameters
+    ----------
+    xi
+        (n, 2) reciprocal vectors of the cell, Cartesian [1/l], by length; ξ and −ξ both.
+    coefficients
+        (n, 2) û of u_x and u_y [mm³]; the phase origin is x = 0.
+    pitch
+        l [mm].
+    lattice
+        (2, 2) vectors of the cell as rows [mm].
+    energy
+        ∫ |u|² dA over the material of the cell, translation taken out [mm⁴].
+    material
+        Area of the material of the cell [mm²].
+    translation
+        (2,) mean over the material that was taken out [mm].
+    """
+
+    xi: FloatArray
+    coefficients: ComplexArray
+    pitch: float
+    lattice: FloatArray
+    energy: float
+    material: float
+    translation: tuple[float, float]
+
+    @property
+    def S_xx(self) -> FloatArray:
+        """(n,) energy spectral density of u_x [mm⁶]."""
+        return _squared(self.coefficients[:, 0])
+
+    @property
+    def S_yy(self) -> FloatArray:
+        """(n,) energy spectral density of u_y [mm⁶]."""
+        return _squared(self.coefficients[:, 1])
+
+    @property
+    def shares(self) -> FloatArray:
+        """(n,) share of the energy at each wave vector [-]; over all of them, the sum is 1."""
+        area = abs(float(np.linalg.det(self.lattice)))
+        return np.asarray((self.S_xx + self.S_yy) / (area * self.energy))
+
+    @property
+    def share(self) -> float:
+        """Share of the energy at all the wave vectors within reach [-]."""
+        return float(self.shares.sum())
+
+    def at(self, xi: ArrayLike) -> ComplexArray:
+        """(2,) û of u_x and u_y [mm³] at a wave vector; 0 where the cell has none of them.
+
+        Raises
+        ------
+        InputError
+            If it is beyond the reach.
+        """
+        wanted = np.asarray(xi, dtype=np.float64)
+        farthest = float(np.linalg.norm(self.xi, axis=1).max())
+        if not np.linalg.norm(wanted) <= farthest + SAME_WAVE:
+            raise InputError(
+                f"lattice spectrum: expected |ξ| <= {farthest:.4g}, got {wanted.tolist()}; "
+                "compute it with a larger reach"
+            )
+        distance = np.abs(self.xi - wanted).max(axis=1)
+        nearest = int(np.argmin(distance))
+        found = distance[nearest] <= SAME_WAVE
+        return np.asarray(self.coefficients[nearest] * found)
+
+    @property
+    def peaks(self) -> tuple[LatticePeak, ...]:
+        """Wave vectors that carry energy, one of each pair ± ξ, by density, largest first."""
+        density, shares = self.S_xx + self.S_yy, self.shares
+        listed = np.flatnonzero(upward(self.xi) & (2.0 * shares >= LEAST_SHARE))
+        order = listed[np.argsort(-density[listed], kind="stable")]
+        return tuple(
+            LatticePeak(_pair(self.xi[k]), float(density[k]), 2.0 * float(shares[k])) for k in order
+        )
+
+
+def lattice_spectrum(
+    mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float, reach: float = 3.0
+) -> LatticeSpectrum:
+    """Fourier coefficients of a periodic field, exact for its shape functions to about 1e-8.
+
+    Parameters
+    ----------
+    mesh
+        One cell of the lattice, of any outline that tiles the plane [mm].
+    lattice
+        (2, 2) lattice vectors as rows [mm]; they need not be at right angles.
+    values
+        (n, 2) field at the nodes, periodic: the affine part is already removed [mm].
+    pitch
+        l [mm], which makes the wave vectors dimensionless.
+    reach
+        Largest |ξ| [1/l].
+
+    Raises
+    ------
+    InputError
+        If the field has another shape than the nodes, is not finite, not periodic, or nothing
+        but a translation; if the mesh is larger than the cell; if pitch or reach aren't positive.
+    """
+    u, vectors = _checked_field(mesh, lattice, values, pitch)
+    if not 0 < reach < np.inf:
+        raise InputError(f"lattice spectrum: expected a positive reach in 1/l, got {reach}")
+    rule = Quadrature(mesh, points_for(mesh, 2.0 * np.pi * reach / pitch))
+    at_points = rule.values(u)
+    field = rule.without_mean(at_points)
+    energy = rule.product(field, field)
+    _check_energy(energy, rule.product(at_points, at_points), rule, vectors)
+    translation = np.asarray(rule.weights @ at_points / rule.area, dtype=np.float64)
+    xi = reciprocal_vectors(vectors, pitch, reach)
+    half = np.flatnonzero(upward(xi) | (np.abs(xi).max(axis=1) == 0))
+    coefficients = _transformed(rule, field, xi[half], pitch)
+    # u is real: û(−ξ) is the conjugate of û(ξ).
+    both = np.concatenate([xi[half], -xi[half[1:]]]) + 0.0
+    u_hat = np.concatenate([coefficients, coefficients[1:].conj()])
+    order = np.lexsort([np.arctan2(both[:, 1], both[:, 0]), np.linalg.norm(both, axis=1).round(9)])
+    return LatticeSpectrum(
+        both[order], u_hat[order], pitch, vectors, energy, rule.area, _pair(translation)
+    )
+
+
+def reciprocal_vectors(lattice: FloatArray, pitch: float, reach: float) -> FloatArray:
+    """(n, 2) all ξ = l (n1 b1 + n2 b2) with |ξ| <= ``reach``, by length; ξ = 0 is the first."""
+    reciprocal = pitch * np.linalg.inv(lattice).T
+    # n_i = ξ·a_i/l, so |n_i| can't be larger than |ξ| |a_i|/l.
+    most = np.floor(np.linalg.norm(lattice, axis=1) * reach / pitch + 1e-9).astype(int)
+    numbers = np.mgrid[-most[0] : most[0] + 1, -most[1] : most[1] + 1].reshape(2, -1).T
+    xi = np.round(numbers @ reciprocal, 12) + 0.0  # 1/2 and not 0.49999999999999994
+    lengths = np.linalg.norm(xi, axis=1)
+    order = np.argsort(lengths, kind="stable")
+    return np.asarray(xi[order][lengths[order] <= reach * (1.0 + 1e-9)])
+
+
+def upward(xi: FloatArray) -> NDArray[np.bool_]:
+    """(n,) True for one of each ± ξ: that with ξ2 > 0, or ξ1 > 0 on the axis; False for 0."""
+    on_axis = np.abs(xi[:, 1]) < 1e-9
+    return np.asarray(np.where(on_axis, xi[:, 0] > 1e-9, xi[:, 1] > 0))
+
+
+def _checked_field(
+    mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float
+) -> tuple[FloatArray, FloatArray]:
+    """Field (n, 2) and lattice (2, 2) as arrays, or an InputError that says what is wrong."""
+    u, vectors = np.asarray(values, dtype=np.float64), np.asarray(lattice, dtype=np.float64)
+    if u.shape != mesh.nodes.shape:
+        raise InputError(f"periodic field: expected shape {mesh.nodes.shape}, got {u.shape}")
+    if not np.isfinite(u).all():
+        raise InputError("periodic field: expected finite values at all nodes, got NaN")
+    if vectors.shape != (2, 2) or not abs(np.linalg.det(vectors)) > 0:
+        raise InputError(
+            f"lattice: expected two independent vectors as rows, got {vectors.tolist()}"
+        )
+    if not 0 < pitch < np.inf:
+        raise InputError(f"pitch: expected a positive length in mm, got {pitch}")
+    _check_periodic(mesh, vectors, u)
+    return u, vectors
+
+
+def _check_periodic(mesh: Mesh, lattice: FloatArray, u: FloatArray) -> None:
+    """Raise InputError where partner nodes differ in the field, or there are no partners."""
+    fractional = np.mod(np.mod(mesh.nodes @ np.linalg.inv(lattice), 1.0), 1.0)
+    pairs = cKDTree(fractional, boxsize=1.0).query_pairs(PARTNERS, output_type="ndarray")
+    distance = np.linalg.norm(np.diff(mesh.nodes[pairs], axis=1)[:, 0], axis=1)
+    if not np.any(distance > 0.5 * np.linalg.norm(lattice, axis=1).min()):
+        raise InputError(
+            f"lattice: expected nodes a lattice vector apart, got none for {lattice.tolist()} mm; "
+            "give the vectors of the very cell that is meshed"
+        )
+    jump = np.abs(u[pairs[:, 0]] - u[pairs[:, 1]]).max(axis=1)
+    if jump.max() > PERIODIC * np.abs(u).max():
+        a, b = pairs[int(np.argmax(jump))]
+        raise InputError(
+            f"periodic field: expected the same value at nodes {a} and {b}, a lattice vector "
+            f"apart, got {u[a].tolist()} and {u[b].tolist()}; remove the affine part"
+        )
+
+
+def _check_energy(energy: float, whole: float, rule: Quadrature, lattice: FloatArray) -> None:
+    """Raise InputError for a field that only translates, or a mesh that is more than a cell."""
+    cell = abs(float(np.linalg.det(lattice)))
+    if rule.area > cell * (1.0 + 1e-6):
+        raise InputError(
+            f"lattice: expected a cell of at least the material's {rule.area:.6g} mm², got "
+            f"{cell:.6g} mm²; give the lattice vectors of the enlarged cell"
+        )
+    if not energy > 1e-24 * whole:  # that is rounding
+        raise InputError("periodic field: expected more than a translation, got energy 0")
+
+
+def _transformed(rule: Quadrature, field: FloatArray, xi: FloatArray, pitch: float) -> ComplexArray:
+    """(n, 2) ∫ u exp(−2πi ξ·x/l) dA, one wave vector after the other: little memory."""
+    weighted = rule.weights[:, None] * field
+    positions = -2j * np.pi / pitch * rule.positions
+    return np.array([np.exp(positions @ vector) @ weighted for vector in xi])
+
+
+def _pair(vector: FloatArray) -> tuple[float, float]:
+    return float(vector[0]), float(vector[1])
+
+
+def _squared(value: ComplexArray) -> FloatArray:
+    squared: FloatArray = value.real**2 + value.imag**2
+    return squared

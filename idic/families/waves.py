@@ -1,0 +1,207 @@
+"""Plane waves in a displacement field: their peaks in the spectral density, and their fit.
+
+Peaks are looked for away from the lines that the specimen's edges cause. The jump of the mean
+deformation at a vertical edge spreads energy along ξ2 = 0, at a horizontal edge along ξ1 = 0,
+about l/L wide, L being the material's height or width; and as the holes repeat with the
+period l, copies of the lines stand at whole numbers of ξ1 and ξ2. Wave vectors within two
+such widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are left out, unless they
+stand out against the line itself, which falls off slowly along its length, where a wave is a peak
+(one of the three waves of a hexagonal lattice lies on such a line).
+
+The peak tells where a wave is. Its amplitude and phase can't be read off û alone, because the
+holes couple waves whose vectors differ by whole numbers of 1/l, and the diagonals of the
+square pattern do: a third of one shows up at the other. So all waves are fitted at once, by
+least squares over the material, under a Hann taper that keeps the edges out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+
+from modeharvest.idic.families.spectrum import Spectrum
+
+FloatArray = NDArray[np.float64]
+
+EDGE_LINE_WIDTHS = 2.0
+"""Distance from whole numbers of ξ [l/L] within which a maximum is taken for an edge line."""
+LINE_CONTRAST = 10.0
+"""Ratio of a maximum on a line to the largest density 1.5 to 2.5 l/L further along it, either way,
+from which it is a wave's: a wave's own side lobes give 20, the lines of the paper's
+specimen before buckling less than 3."""
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A maximum of S_xx + S_yy outside the edges' lines.
+
+    Parameters
+    ----------
+    xi
+        Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since
+        S(−ξ) = S(ξ).
+    density
+        S_xx + S_yy there [mm⁶].
+    contrast
+        That density over the median of all the wave vectors searched [-].
+    """
+
+    xi: tuple[float, float]
+    density: float
+    contrast: float
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One plane wave, A sin(π/l (k·x + c)), directed upwards (k_y > 0) or, if level, to the right.
+
+    Parameters
+    ----------
+    k
+        Wave vector [π/l]; (1, 1) is a wavelength of 2l along both axes.
+    amplitude
+        (x, y) amplitudes with their signs [mm], averaged under the Hann taper.
+    phase
+        Shift c [mm], between −l/2 and l/2; the rest is in the signs.
+    out_of_phase
+        Share of the wave that no common phase of x and y describes [-]; 0 for a plain sine.
+    """
+
+    k: tuple[float, float]
+    amplitude: tuple[float, float]
+    phase: float
+    out_of_phase: float
+
+    @property
+    def xi(self) -> tuple[float, float]:
+        """Wave vector [1/l], as on the axes of the spectral densities."""
+        return self.k[0] / 2, self.k[1] / 2
+
+    @property
+    def strength(self) -> float:
+        """Length of the amplitude vector [mm]."""
+        return float(np.hypot(*self.amplitude))
+
+
+def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
+    """All maxima of S_xx + S_yy outside the edges' lines, largest first."""
+    xi1, xi2, S_xx, S_yy = spectrum.window(xi_max)
+    S = S_xx + S_yy
+    margin = [min(0.3, EDGE_LINE_WIDTHS * spectrum.pitch / size) for size in spectrum.extent]
+    away1 = np.abs(xi1 - np.round(xi1)) >= margin[0]
+    away2 = (np.abs(xi2 - np.round(xi2)) >= margin[1]) & (xi2 > 0)
+    searched = away2[:, None] & away1[None, :]
+    if not searched.any() or not S.max() > 0:
+        return []
+    median = float(np.median(S[searched]))
+    # Two maxima closer than a main lobe's width, l/L, are one.
+    lobe = spectrum.pitch / max(spectrum.extent)
+    distance = max(1, round(lobe / (xi1[1] - xi1[0])))
+    # Maxima of the whole plane that are searched, so the foot of a line is not one of them.
+    maxima = maximum_filter(S, 2 * distance + 1) == S
+    found = np.vstack([np.argwhere(maxima & searched), _on_lines(S, maxima, xi1, xi2, spectrum)])
+    peaks = [
+        Peak((float(xi1[c]), float(xi2[r])), float(S[r, c]), float(S[r, c]) / median)
+        for r, c in found
+    ]
+    return sorted(peaks, key=lambda p: -p.density)
+
+
+def _on_lines(
+    S: FloatArray, maxima: NDArray[np.bool_], xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
+) -> NDArray[np.intp]:
+    """(n, 2) indices of maxima on one of the edges' lines, not where two cross, that stand out."""
+    lobes = [spectrum.pitch / size for size in spectrum.extent]
+    near = [
+        np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
+        for xi, lobe in zip((xi1, xi2), lobes, strict=True)
+    ]
+    half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1[None, :] > 0.5 * lobes[0])
+    half_plane &= xi2[:, None] > -0.5 * lobes[1]
+    one_line = near[0][None, :] != near[1][:, None]
+    found = []
+    for r, c in np.argwhere(maxima & one_line & half_plane):
+        along, at, xi, lobe = (
+            (S[:, c], r, xi2, lobes[1]) if near[0][c] else (S[r], c, xi1, lobes[0])
+        )
+        away = np.abs(xi - xi[at]) / lobe
+        beside = along[(away >= 1.5) & (away <= 2.5)]
+        if beside.size and S[r, c] >= LINE_CONTRAST * beside.max():
+            found.append((r, c))
+    return np.array(found, dtype=np.intp).reshape(-1, 2)
+
+
+def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[Wave]:
+    """Fit plane waves near some peaks, all at once, wave vectors included.
+
+    Each wave vector stays within half a main lobe, l/2L, of its peak.
+    """
+    weight = _taper(spectrum)
+    start = np.array([p.xi for p in peaks])
+    reach = 0.5 * spectrum.pitch / np.array(spectrum.extent)
+
+    def loss(step: FloatArray) -> float:
+        return -_amplitudes(spectrum, weight, start + reach * step.reshape(-1, 2))[1]
+
+    found = minimize(loss, np.zeros(start.size), method="L-BFGS-B", bounds=[(-1, 1)] * start.size)
+    xi = start + reach * found.x.reshape(-1, 2)
+    z, _ = _amplitudes(spectrum, weight, xi)
+    return [_wave(*pair, spectrum.pitch) for pair in zip(xi, z, strict=True)]
+
+
+def explained(spectrum: Spectrum, waves: Sequence[Wave | Peak]) -> float:
+    """Share of the field's square, under the Hann taper, that waves there describe together [-]."""
+    return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
+
+
+def _wave(xi: FloatArray, z: NDArray[np.complex128], pitch: float) -> Wave:
+    """Split off the common phase of both components, and note what it leaves."""
+    angle = 0.5 * float(np.angle(np.sum(z**2)))
+    turned = z * np.exp(-1j * angle)
+    return Wave(
+        k=(2 * float(xi[0]), 2 * float(xi[1])),
+        amplitude=(float(turned[0].real), float(turned[1].real)),
+        phase=angle / np.pi * pitch,
+        out_of_phase=float(np.linalg.norm(turned.imag) / np.linalg.norm(turned)),
+    )
+
+
+def _taper(spectrum: Spectrum) -> FloatArray:
+    """(q, p) Hann taper over the bounding box of the material."""
+    across, up = (
+        0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(c.size) + 0.5) / c.size)
+        for c in (spectrum.x, spectrum.y)
+    )
+    return np.asarray(np.outer(up, across), dtype=np.float64)
+
+
+def _amplitudes(
+    spectrum: Spectrum, taper: FloatArray, xi: FloatArray
+) -> tuple[NDArray[np.complex128], float]:
+    """Weighted least squares for given wave vectors.
+
+    Returns
+    -------
+    (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of the
+    field's weighted square that they explain.
+    """
+    angle = 2 * np.pi / spectrum.pitch
+    waves = np.stack(
+        [
+            np.exp(1j * angle * b * spectrum.y)[:, None]
+            * np.exp(1j * angle * a * spectrum.x)[None, :]
+            for a, b in xi
+        ]
+    )
+    basis = np.concatenate([waves.imag, waves.real]).reshape(2 * len(xi), -1)
+    weighted = basis * (taper * spectrum.coverage).ravel()
+    right = basis @ (taper[..., None] * spectrum.source).reshape(-1, 2)
+    solution = np.linalg.solve(weighted @ basis.T, right)
+    total = float(np.sum(taper[..., None] * spectrum.source**2))
+    explained = float(np.sum(solution * right)) / total
+    return solution[: len(xi)] + 1j * solution[len(xi) :], explained

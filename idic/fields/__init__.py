@@ -1,0 +1,1 @@
+"""Displacements at points: those of any DIC code, and their spectra."""

@@ -1,0 +1,182 @@
+"""Displacement fields of other DIC codes, read from their files; and fields written as files.
+
+The frame of the project is x right, y up, in mm. What a file uses is said by its columns' names or
+by the caller; a field is never guessed to be in millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.files import atomic
+from modeharvest.idic.fields.columns import ROLES, Column, choose
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.tables import Table, read_table
+from modeharvest.imaging.grid import PixelGrid
+
+FloatArray = NDArray[np.float64]
+
+_WRITTEN = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]", "sd_u [mm]", "sd_v [mm]", "valid")
+
+
+def read_field(
+    path: Path | str,
+    grid: PixelGrid | None = None,
+    *,
+    units: str | None = None,
+    displacement_units: str | None = None,
+    y_axis: str | None = None,
+    first_pixel: int = 0,
+    columns: Mapping[str, str | int] | None = None,
+) -> LocalField:
+    """Read a displacement field of any DIC code.
+
+    Parameters
+    ----------
+    path
+        CSV, TXT, NPZ, HDF5 or MAT with x, y, u and v: points (n,), grids (rows, cols), or x
+        (cols,) and y (rows,) as axes of grids u and v.
+    grid
+        Pixels to millimetres, needed if anything is in pixels.
+    units
+        "px" or "mm", of positions and displacements; None: as the columns' names say.
+    displacement_units
+        Of u and v, if they are not those of x and y.
+    y_axis
+        "up" or "down": where y grows and v is positive; None: as the columns' names say. In
+        pixels, "up" counts from the lowest row.
+    first_pixel
+        What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
+    columns
+        Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma" and
+        "valid", where they can't be known by themselves.
+
+    Returns
+    -------
+    LocalField
+        With the file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC
+        and DICe mark failure) kept as not valid. ``sigma`` in pixels is taken for the standard
+        deviation of both components.
+
+    Raises
+    ------
+    InputError
+        If a column, the units or the axis are not known, or shapes don't agree.
+    """
+    table = read_table(path)
+    chosen = choose(list(table), columns or {}, units, str(path))
+    position = _unit(chosen, ("x", "y"), units, str(path))
+    same = units or ("px" if chosen["x"].of_image_code else None)
+    motion = _unit(chosen, ("u", "v"), displacement_units or same, str(path))
+    down = _axis(chosen, y_axis, str(path)) == "down"
+    if "px" in (position, motion) and grid is None:
+        raise InputError(f"{path}: expected a grid for a field in pixels; give the pixel size")
+    x, y, u, v = _same_shape([table[chosen[role].name] for role in ROLES], chosen, str(path))
+    sign = -1.0 if down else 1.0
+    if position == "px":
+        assert grid is not None  # checked above
+        row = y - first_pixel if down else grid.rows - 1 - (y - first_pixel)
+        x, y = grid.to_mm(row, x - first_pixel)
+    else:
+        y = sign * y
+    scale = grid.pixel_size if motion == "px" and grid is not None else 1.0
+    sd, ok = _quality(table, chosen, x.size, scale, motion == "px", str(path))
+    u = scale * np.column_stack([u, sign * v])
+    return LocalField(x, y, u, ok, sd, source=Path(path).name)
+
+
+def write_field(path: Path | str, field: LocalField) -> None:
+    """Write a field as CSV or NPZ, which :func:`read_field` reads without being told anything."""
+    sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
+    data = np.column_stack([field.x, field.y, field.u, sd, field.good])
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".csv", ".npz"):
+        raise InputError(f"expected a field to be written as .csv or .npz, got {path}")
+    with atomic(path) as part:
+        if suffix == ".npz":
+            with open(part, "wb") as file:
+                np.savez(file, **dict(zip(_WRITTEN, data.T, strict=True)))
+        else:
+            formats = ["%.9g"] * 6 + ["%d"]
+            np.savetxt(part, data, formats, ",", header=",".join(_WRITTEN), comments="")
+
+
+def _unit(
+    chosen: dict[str, Column], roles: tuple[str, ...], declared: str | None, where: str
+) -> str:
+    if declared not in (None, "px", "mm"):
+        raise InputError(f"{where}: expected units 'px' or 'mm', got {declared!r}")
+    named = {chosen[role].unit for role in roles} - {None}
+    if len(named) > 1 or (declared and named and named != {declared}):
+        names = ", ".join(repr(chosen[role].name) for role in roles)
+        raise InputError(
+            f"{where}: expected {names} in {declared or 'one unit'}, but they are named as "
+            f"{' and '.join(sorted(map(str, named)))}; leave units out, or name other columns"
+        )
+    unit = declared or next(iter(named), None)
+    if unit is None:
+        names = " and ".join(repr(chosen[role].name) for role in roles)
+        raise InputError(f"{where}: expected units for {names}, got none; give units='px' or 'mm'")
+    return unit
+
+
+def _axis(chosen: dict[str, Column], declared: str | None, where: str) -> str:
+    if declared not in (None, "up", "down"):
+        raise InputError(f"{where}: expected y_axis 'up' or 'down', got {declared!r}")
+    named = {chosen[role].y_axis for role in ("x", "y", "v")} - {None}
+    if len(named) > 1 or (declared and named and named != {declared}):
+        raise InputError(
+            f"{where}: expected y_axis {declared or 'one way'!r}, but by the columns' names it is "
+            f"{' and '.join(sorted(map(str, named)))}; leave y_axis out, or name other columns"
+        )
+    axis = declared or next(iter(named), None)
+    if axis is None:
+        raise InputError(
+            f"{where}: expected to know where y grows, got nothing; give y_axis='up' or 'down'"
+        )
+    return axis
+
+
+def _same_shape(
+    arrays: list[FloatArray], chosen: dict[str, Column], where: str
+) -> list[FloatArray]:
+    """(n,) each, from points, grids, or axes and grids; a single frame may lead."""
+    x, y, u, v = (np.squeeze(a) for a in arrays)
+    if x.ndim == 1 and y.ndim == 1 and u.ndim == 2 and u.shape == (y.size, x.size):
+        x, y = np.meshgrid(x, y)
+    if not x.shape == y.shape == u.shape == v.shape:
+        got = ", ".join(
+            f"{chosen[r].name} {a.shape}" for r, a in zip(ROLES, (x, y, u, v), strict=True)
+        )
+        raise InputError(f"{where}: expected x, y, u and v of one shape, got {got}")
+    return [a.ravel() for a in (x, y, u, v)]
+
+
+def _quality(
+    table: Table, chosen: dict[str, Column], n: int, scale: float, in_px: bool, where: str
+) -> tuple[FloatArray | None, NDArray[np.bool_]]:
+    """(n, 2) standard deviations [mm] or None, and (n,) what the file itself says is valid."""
+    values = {}
+    for role in ("sd_u", "sd_v", "sigma", "valid"):
+        if role in chosen:
+            values[role] = table[chosen[role].name].ravel()
+            if values[role].size != n:
+                raise InputError(
+                    f"{where}: expected {chosen[role].name} for {n} points, got {values[role].size}"
+                )
+    ok = np.ones(n, dtype=np.bool_)
+    if "valid" in values:
+        ok &= values["valid"] > 0
+    if "sigma" in values:
+        ok &= values["sigma"] >= 0
+    sd = None
+    if "sd_u" in values and "sd_v" in values:
+        sd = scale * np.column_stack([values["sd_u"], values["sd_v"]])
+    elif "sigma" in values and in_px:
+        sd = scale * np.column_stack([values["sigma"]] * 2)
+    return (None if sd is None or not np.isfinite(sd[ok]).any() else sd), ok

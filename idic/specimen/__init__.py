@@ -1,0 +1,1 @@
+"""What a photograph shows of a cellular specimen: material, holes, lattice, region."""

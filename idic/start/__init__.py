@@ -1,0 +1,1 @@
+"""From images to an ansatz and a start, with no number typed."""

@@ -1,0 +1,285 @@
+"""From images to an ansatz and a start, with no number typed.
+
+What the paper does by eye in its Section "Parametrization and Initial Guess of the Patterning
+Modes": a displacement field, its spectral densities, the waves that they show, the family that
+these belong to. The field is a local DIC's where there is one, and otherwise a rough one that the
+images give by themselves (:mod:`modeharvest.idic.fields.coarse_field`).
+
+1. v0: through the motion of hole centres, or of outlines; not needed with a local DIC's field.
+2. A field, rough or measured, and its spectrum over each region.
+3. Modes: the square family with seven parameters, or free waves, or the pattern that the lattice of
+   holes allows, held, where the images show none.
+4. v0 and every v_i, together, by robust least squares through the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.families.pattern import Pattern, read_pattern
+from modeharvest.idic.families.spectrum import Spectrum
+from modeharvest.idic.fields.coarse_field import coarse_field
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.measured_spectrum import measured_spectrum
+from modeharvest.idic.fourier import FourierMode
+from modeharvest.idic.inputs import checked_mask
+from modeharvest.idic.start.fits import RobustFit, fit_unknowns
+from modeharvest.idic.start.modes import (
+    Cells,
+    StartMode,
+    held_square,
+    modes_of,
+    require_cell_size,
+)
+from modeharvest.idic.start.motion import SLOW_DEGREE, first_motion
+from modeharvest.idic.support import Taper
+from modeharvest.imaging.grid import PixelGrid
+
+FloatArray = NDArray[np.float64]
+_Placed = tuple[StartMode, Box]
+"""A mode and its region."""
+
+AMPLITUDE_DEGREE = 2
+"""Total degree of every v_i at the start: strongest in the middle, weaker at clamped edges."""
+HELD_AMPLITUDE = 1.0
+"""v_i where no pattern is seen [mm]; as the paper's start, 40 um with max ||phi|| = 0.04."""
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """What the ansatz is to be able to say.
+
+    Parameters
+    ----------
+    v0_degree, v_degree
+        Total degrees of v0 and of every v_i; the paper's.
+    brightness
+        Whether gain and offset are unknowns.
+    """
+
+    v0_degree: int = 5
+    v_degree: int = 6
+    brightness: Brightness = field(default_factory=Brightness)
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A part of the specimen with a pattern of its own.
+
+    Parameters
+    ----------
+    box
+        Where [mm].
+    spectrum
+        Of the field there.
+    pattern
+        What the spectrum shows.
+    modes
+        Indices of the ansatz's modes that belong to it.
+    """
+
+    box: Box
+    spectrum: Spectrum
+    pattern: Pattern
+    modes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a correlation begins, and why there.
+
+    Parameters
+    ----------
+    ansatz
+        With the modes found.
+    unknowns
+        (size,) for :func:`modeharvest.idic.correlate.correlate`.
+    regions
+        One or more, with their spectra.
+    local
+        The field that the start was read from.
+    held
+        Whether the modes are held because no pattern is seen.
+    sentences
+        What was found, in words.
+    """
+
+    ansatz: Ansatz
+    unknowns: FloatArray
+    regions: tuple[Region, ...]
+    local: LocalField
+    held: bool
+    sentences: tuple[str, ...]
+
+    @property
+    def family(self) -> str:
+        """Names of the modes' families."""
+        return " and ".join(mode.family.name for mode in self.ansatz.modes) or "none"
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """Of the first region."""
+        return self.regions[0].spectrum
+
+    @property
+    def pattern(self) -> Pattern:
+        """Of the first region."""
+        return self.regions[0].pattern
+
+
+def automatic_start(
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    grid: PixelGrid,
+    cell_size: float,
+    cellular: Box | Sequence[Box],
+    mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
+    *,
+    local: LocalField | None = None,
+    holes: tuple[ArrayLike, ArrayLike] | None = None,
+    lattice: ArrayLike | None = None,
+    domain: Box | None = None,
+    options: StartOptions | None = None,
+) -> Start:
+    """Find ansatz and start for a pair of images.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels.
+    grid
+        Their pixels.
+    cell_size
+        l, the distance of neighbouring holes [mm].
+    cellular
+        The part with holes [mm]; or several parts, each with modes of its own.
+    mask, deformed_mask
+        (rows, cols) True on material.
+    local
+        A displacement field of a local DIC; the images are not looked at then.
+    holes
+        (n, 2) hole centres in the reference and (n, 2) their displacements [mm].
+    lattice
+        (2, 2) vectors of the lattice of holes as rows [mm]; by default square, along x and y.
+    domain
+        Of the Chebyshev polynomials [mm]; by default the material's bounding box.
+    options
+        Degrees, brightness.
+
+    Raises
+    ------
+    InputError
+        If the holes or the spectrum contradict the cell size, or the images are no pair.
+    """
+    options = options or StartOptions()
+    inside = checked_mask(mask, "mask", grid)
+    landing = checked_mask(deformed_mask, "deformed mask", grid)
+    boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)
+    domain = domain or _bounding_box(inside, grid)
+    cells = Cells.found(cell_size, lattice, inside, grid, boxes, holes)
+    said: list[str] = []
+    if local is None:
+        known, sentence = first_motion(domain, grid, inside, landing, holes)
+        local = coarse_field(reference, deformed, grid, cell_size, known, inside, landing)
+        said += [sentence, f"Without a local DIC: {local.x.size} points of {local.source}."]
+    else:
+        share = 100 * local.valid_share
+        said.append(f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid.")
+    regions: list[Region] = []
+    modes: list[_Placed] = []
+    for box in boxes:
+        region, found = _read_region(local, box, cells, len(modes), said)
+        regions.append(region)
+        modes += found
+    held = not modes
+    if held:
+        modes = _held_mode(boxes[0], cells, said)
+    ansatz, a = _assembled(modes, cell_size, domain, options)
+    fit = _fitted(ansatz, a, local, held)
+    said.append(_fit_words(ansatz, fit, held))
+    return Start(ansatz, fit.coefficients, tuple(regions), local, held, tuple(said))
+
+
+def _read_region(
+    local: LocalField, box: Box, cells: Cells, first: int, said: list[str]
+) -> tuple[Region, list[_Placed]]:
+    """Read the spectrum of one region, and make its modes."""
+    spectrum = measured_spectrum(local, cells.cell_size, box)
+    pattern = read_pattern(spectrum)
+    said += pattern.sentences
+    if not cells.given:
+        require_cell_size(pattern, cells.cell_size)
+    modes = modes_of(pattern, cells) if pattern.waves else []
+    if len(modes) > 1:
+        said.append(
+            f"The waves share no vector of the reciprocal lattice: {len(modes)} modes, each with "
+            "an amplitude of its own."
+        )
+    numbers = tuple(range(first, first + len(modes)))
+    return Region(box, spectrum, pattern, numbers), [(mode, box) for mode in modes]
+
+
+def _held_mode(box: Box, cells: Cells, said: list[str]) -> list[_Placed]:
+    """The pattern that a square lattice allows; none on others, of which we don't know it."""
+    if not cells.square:
+        said.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
+        return []
+    said.append(
+        "The mode is held at the square pattern that the lattice of holes allows: without a "
+        "pattern, its parameters can't be seen."
+    )
+    return [(StartMode(held_square(cells), 0.0), box)]
+
+
+def _assembled(
+    modes: Sequence[_Placed], cell_size: float, domain: Box, options: StartOptions
+) -> tuple[Ansatz, FloatArray]:
+    """The ansatz, and unknowns in which every v_i is a constant."""
+    fourier = tuple(
+        FourierMode.scaled(mode.family, cell_size, Taper(box, 0.5 * cell_size))
+        for mode, box in modes
+    )
+    ansatz = Ansatz(domain, fourier, options.v0_degree, options.v_degree, options.brightness)
+    a = ansatz.start()
+    for i, (mode, _) in enumerate(modes):
+        a[ansatz.v_slice(i)][0] = mode.amplitude / fourier[i].scale or HELD_AMPLITUDE
+    return ansatz, a
+
+
+def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, held: bool) -> RobustFit:
+    """v0 and every v_i through the field; a mode that can't be seen isn't fitted."""
+    x, y, u = local.valid_points()
+    points = np.column_stack([x, y])
+    slow = min(SLOW_DEGREE, ansatz.v0_degree)
+    if not held:
+        return fit_unknowns(ansatz, a, points, u, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
+    alone = replace(ansatz, modes=(), brightness=Brightness())
+    fit = fit_unknowns(alone, np.zeros(alone.size), points, u, slow, -1)
+    return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
+
+
+def _fit_words(ansatz: Ansatz, fit: RobustFit, held: bool) -> str:
+    modes = () if held else ansatz.modes
+    what = " and ".join(["v0", *(f"v{i + 1}" for i in range(len(modes)))])
+    return (
+        f"{what} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
+        "aside."
+    )
+
+
+def _bounding_box(mask: NDArray[np.bool_] | None, grid: PixelGrid) -> Box:
+    """The outer edges of the pixels that show material."""
+    if mask is None:
+        return Box(*grid.extent)
+    rows, cols = (np.flatnonzero(mask.any(axis=1 - k))[[0, -1]] for k in range(2))
+    x, y = grid.to_mm(rows, cols)
+    h = 0.5 * grid.pixel_size
+    return Box(float(x[0]) - h, float(x[1]) + h, float(y[1]) - h, float(y[0]) + h)

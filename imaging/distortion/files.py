@@ -1,0 +1,172 @@
+"""Distortions from and to files: JSON of our own, OpenCV's storage, DICe's calibration.
+
+Formats that are read: the JSON that :func:`write_distortion` makes; what OpenCV's
+``cv::FileStorage`` writes as YAML, XML or JSON with ``camera_matrix`` (or ``cameraMatrix``, ``K``)
+and ``distortion_coefficients`` (or ``distCoeffs``, ``D``) of 4, 5 or 8 numbers; and DICe's
+``cal.xml`` with ``OPENCV_LENS_DISTORTION``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, write_json
+from modeharvest.imaging.distortion.undistort import (
+    CameraDistortion,
+    PolynomialDistortion,
+    SampledDistortion,
+)
+
+AnyDistortion = PolynomialDistortion | CameraDistortion | SampledDistortion
+
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "M")
+_COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "D1")
+_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+
+
+def write_distortion(path: Path | str, distortion: AnyDistortion) -> None:
+    """Write a distortion as JSON, whole or not at all; every number is kept exactly."""
+    content: dict[str, Any] = {"frame": "px; components along rows (down), columns (right)"}
+    if isinstance(distortion, PolynomialDistortion):
+        content |= {"kind": "polynomial", "shape": list(distortion.shape)}
+        content |= {"coefficients": distortion.coefficients.tolist()}
+    elif isinstance(distortion, CameraDistortion):
+        content |= {"kind": "camera", **asdict(distortion)}
+    else:
+        content |= {"kind": "sampled"}
+        content |= {f.name: getattr(distortion, f.name).tolist() for f in fields(distortion)}
+    write_json(path, content)
+
+
+def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
+    """Read a distortion from any of the formats above.
+
+    Parameters
+    ----------
+    path
+        The file; ``.json``, ``.xml``, ``.yml`` or ``.yaml``.
+    camera
+        Number or CAMERA_ID of the camera in a DICe file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cut short or of another kind.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return _from_json(read_json(path), path)
+    try:
+        text = path.read_text("utf-8")
+        if suffix == ".xml":
+            root = ElementTree.fromstring(text)
+            if root.tag == "ParameterList":
+                return _from_dice(root, camera, path)
+            return _camera({child.tag: _numbers(child) for child in root}, path)
+        if suffix in (".yml", ".yaml"):
+            return _camera(_opencv_yaml(text), path)
+    except (OSError, UnicodeDecodeError, ElementTree.ParseError) as error:
+        raise InputError(f"expected a distortion at {path}, got: {error}") from error
+    raise InputError(f"expected a distortion as .json, .xml, .yml or .yaml, got {path}")
+
+
+def _from_json(content: Any, path: Path) -> AnyDistortion:
+    if not isinstance(content, dict):
+        raise InputError(f"expected a distortion at {path}, got {type(content).__name__}")
+    kinds: dict[str, Any] = {
+        "polynomial": PolynomialDistortion,
+        "camera": CameraDistortion,
+        "sampled": SampledDistortion,
+    }
+    if "kind" not in content:  # OpenCV's storage can be JSON, too
+        entries = {k: v.get("data") for k, v in content.items() if isinstance(v, dict)}
+        return _camera(entries, path)
+    kind = kinds.get(content["kind"])
+    if kind is None:
+        raise InputError(
+            f"expected a distortion of a kind among {list(kinds)} at {path}, "
+            f"got {content['kind']!r}"
+        )
+    try:
+        found: AnyDistortion = kind(
+            **{k: v for k, v in content.items() if k not in ("kind", "frame")}
+        )
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise InputError(f"expected the numbers of a {content['kind']} distortion at {path}, "
+                         f"got: {error}") from error  # fmt: skip
+    return found
+
+
+def _numbers(element: ElementTree.Element) -> list[float]:
+    """Numbers of an OpenCV matrix in XML."""
+    data = element.findtext("data") or ""
+    return [float(number) for number in re.findall(_NUMBER, data)]
+
+
+def _opencv_yaml(text: str) -> dict[str, list[float]]:
+    """Matrices of OpenCV's YAML: ``name: !!opencv-matrix`` with ``data: [ ... ]``."""
+    matrix = r"^(\w+):\s*(?:!!opencv-matrix)?\s*\n(?:\s+\w+:[^\[\n]*\n)*?\s+data:\s*\[([^\]]*)\]"
+    return {
+        name: [float(number) for number in re.findall(_NUMBER, data)]
+        for name, data in re.findall(matrix, text, re.MULTILINE)
+    }
+
+
+def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:
+    """Camera of an OpenCV file's matrices."""
+    matrix, coefficients = (
+        next((np.ravel(entries[name]) for name in names if entries.get(name) is not None), None)
+        for names in (_MATRIX, _COEFFICIENTS)
+    )
+    if matrix is None or coefficients is None or matrix.size != 9:
+        raise InputError(
+            f"expected OpenCV's camera_matrix (3 x 3) and distortion_coefficients at {path}, "
+            f"got the entries {sorted(entries)}"
+        )
+    if coefficients.size > 8 and np.any(coefficients[8:]):
+        raise InputError(
+            f"expected at most 8 distortion coefficients at {path}, got {coefficients.size}: "
+            "thin prisms and tilted sensors are not supported"
+        )
+    fx, _, cx, _, fy, cy, *_ = (float(number) for number in matrix)
+    lens = dict(zip(_ORDER, map(float, coefficients), strict=False))
+    return CameraDistortion(fx, fy, cx, cy, **lens)
+
+
+def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> CameraDistortion:
+    """Camera of a DICe calibration file."""
+    cameras = [
+        {p.get("name", ""): p.get("value", "") for p in item.iter("Parameter")}
+        for item in root.findall("ParameterList")
+        if item.get("name", "").startswith("CAMERA")
+    ]
+    ids = [camera.get("CAMERA_ID", "") for camera in cameras]
+    index = ids.index(wanted) if wanted in ids else wanted
+    if not (isinstance(index, int) and 0 <= index < len(cameras)):
+        raise InputError(f"expected camera {wanted!r} at {path}, got the cameras {ids}")
+    entries = cameras[index]
+    model = entries.get("LENS_DISTORTION_MODEL", "OPENCV_LENS_DISTORTION")
+    if model != "OPENCV_LENS_DISTORTION" or float(entries.get("FS", 0.0)) != 0.0:
+        raise InputError(
+            f"expected OPENCV_LENS_DISTORTION without skew (FS) at {path}, got {model} with FS "
+            f"{entries.get('FS', 0.0)}"
+        )
+    names = ("fx", "fy", "cx", "cy", *_ORDER)
+    try:
+        return CameraDistortion(
+            **{n: float(entries[n.upper()]) for n in names if n.upper() in entries}
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(f"expected FX, FY, CX, CY and K1 ... at {path}, got: {error}") from error

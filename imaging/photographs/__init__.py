@@ -1,0 +1,1 @@
+"""Files of a camera: read, turned to grey, judged."""

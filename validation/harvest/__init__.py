@@ -1,0 +1,1 @@
+"""The report of a harvest: what photographs of a test have shown."""

@@ -1,0 +1,234 @@
+"""Maps of what was found in photographs: the paper's Fig. "real", and how sure it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial import cKDTree
+
+from modeharvest.idic.error_bars import FieldErrors
+from modeharvest.idic.families.pattern import Pattern
+from modeharvest.idic.pyramid import eroded
+from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.validation import plots_fields as fields
+from modeharvest.validation.harvest.atlas import COARSE, FINE, SHAPE, SMOOTH, HarvestAtlas
+from modeharvest.validation.harvest.run import HarvestedFrame
+from modeharvest.validation.plots_fields import Scale
+from modeharvest.validation.plots_path import draw_density, pattern_density
+from modeharvest.validation.sheet import Sheet
+from modeharvest.validation.style import GLOW, GOLD, style
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+UM = 1e3  # micrometres in a millimetre
+Cause = Literal["noise", "leftover"]
+_NO_PATTERN = Pattern((), None, "none", None, 0.0, ())
+_REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
+
+
+def draw_deformed(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
+    """Draw a deformed photograph, and over it the reference's outline moved as measured."""
+    sheet, motion = atlas.sheet(), atlas.motion(frame)
+    moved = sheet.moved_nodes(motion)
+    assert moved is not None
+    everywhere = np.ones(frame.image.shape, dtype=np.bool_)
+    drawn = fields.draw_image(sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, moved)
+    with style():
+        path = sheet.outline.path(moved)
+        axes, bar = drawn.axes
+        axes.add_patch(PathPatch(path, fill=False, ec=GOLD, lw=0.7, rasterized=True, zorder=2))
+        bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in atlas.levels])
+        bar.set_title("levels", fontsize=8, pad=6, loc="left")
+    return drawn
+
+
+def draw_spectrum(atlas: HarvestAtlas, frame: HarvestedFrame, component: int) -> Figure:
+    """Draw S_xx (component 0) or S_yy (1); the colours end at the strongest pattern shown."""
+    assert frame.spectrum is not None
+    pairs = [(f.spectrum, f.pattern) for f in atlas.shown if f.spectrum and f.pattern]
+    end = max((pattern_density(*pair) for pair in pairs), default=0.0)
+    return draw_density(frame.spectrum, frame.pattern or _NO_PATTERN, component, end)
+
+
+def draw_part_spectrum(
+    atlas: HarvestAtlas, frame: HarvestedFrame, part: int, component: int
+) -> Figure:
+    """Draw the same of a part with modes of its own; the colours are that part's."""
+    end = max(pattern_density(f.parts[part].spectrum, f.parts[part].pattern) for f in atlas.shown)
+    own = frame.parts[part]
+    return draw_density(own.spectrum, own.pattern, component, end)
+
+
+def draw_v0(atlas: HarvestAtlas, frame: HarvestedFrame, component: int) -> Figure:
+    """Draw a component of the slow field."""
+    v0 = UM * frame.result.v0(atlas.sheet().grid)[..., component]
+    return fields.draw_field(atlas.sheet(), v0, Scale.signed(atlas.seen(v0), "µm"))
+
+
+def draw_amplitude(atlas: HarvestAtlas, frame: HarvestedFrame, i: int) -> Figure:
+    """Draw v_i where phi_i is not zero; the colours end at the largest value among the holes."""
+    support = _support(atlas, frame, i)
+    v = UM * frame.result.v(i, atlas.sheet().grid)
+    inside = atlas.seen(np.where(support == 1.0, v, np.nan))
+    scale = replace(Scale.signed(inside, "µm"), extend="both")
+    return fields.draw_field(atlas.sheet(), np.where(support > 0.0, v, np.nan), scale)
+
+
+def draw_mode(atlas: HarvestAtlas, frame: HarvestedFrame, i: int) -> Figure:
+    """Draw phi_i as a deformed outline over the undeformed one."""
+    result, scale = frame.result, mode_scale(atlas, frame, i)
+    return fields.draw_shape(
+        atlas.sheet(), lambda x, y: scale * result.ansatz.phi(i, result.unknowns, x, y)
+    )
+
+
+def mode_scale(atlas: HarvestAtlas, frame: HarvestedFrame, i: int) -> float:
+    """By how much phi_i is drawn, for a largest displacement of SHAPE l [mm]."""
+    largest = float(np.linalg.norm(frame.result.phi(i, atlas.sheet().grid), axis=-1).max())
+    return SHAPE * atlas.harvest.pitch / largest if largest > 0 else 1.0
+
+
+def draw_fluctuation(atlas: HarvestAtlas, frame: HarvestedFrame, i: int, component: int) -> Figure:
+    """Draw a component of v_i phi_i in the deformed configuration of this contribution alone."""
+    result = frame.result
+    field = UM * result.fluctuation(i, atlas.sheet().grid)[..., component]
+    return fields.draw_field(
+        atlas.sheet(), field, Scale.signed(atlas.seen(field), "µm"),
+        lambda x, y: result.ansatz.fluctuation(i, result.unknowns, x, y),
+    )  # fmt: skip
+
+
+def draw_residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
+    """Draw f - g(x + u) in the deformed configuration, single pixels."""
+    full = atlas.harvest.full_scale
+    values = np.asarray(_residual(atlas, frame) / (full or 1.0), dtype=np.float64)
+    scale = Scale.signed(values, "–" if full else "levels", 0.99)
+    return fields.draw_field(atlas.sheet(FINE), values, scale, atlas.motion(frame))
+
+
+def draw_w(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
+    """Draw the length of w = local DIC - IDIC in the deformed configuration."""
+    assert frame.local is not None
+    result = frame.result
+    w = frame.local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
+    cells = min(SMOOTH, max(40, int(max(atlas.harvest.grid.shape) * atlas.harvest.grid.pixel_size
+                                    / w.spacing)))  # fmt: skip
+    sheet = atlas.sheet(cells)
+    points = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
+    near, nearest = cKDTree(np.column_stack([w.x, w.y])[w.good]).query(points)
+    reach = _REACH * max(w.spacing, sheet.grid.pixel_size)
+    length = UM * np.linalg.norm(w.u[w.good], axis=1)[nearest]
+    length = np.where(near <= reach, length, np.nan)
+    scale = Scale.size(length, "µm", 0.998)
+    return fields.draw_field(sheet, length, scale, atlas.motion(frame))
+
+
+def draw_error(atlas: HarvestAtlas, frame: HarvestedFrame, field: str, cause: Cause) -> Figure:
+    """Draw the standard deviation of "v0", "v1", ... or "fluc1", ..., lengths of vector fields.
+
+    That of a vector is the root of the sum of both components' variances.
+    """
+    sheet = atlas.sheet(COARSE)
+    errors = frame.by_noise if cause == "noise" else frame.by_leftover
+    assert errors is not None
+    sd = UM * _resampled(frame, _sd(errors, field), sheet)
+    if field != "v0":
+        i = int(field.removeprefix("fluc").removeprefix("v")) - 1
+        sd = np.where(_support(atlas, frame, i, COARSE) > 0.0, sd, np.nan)
+    return fields.draw_field(sheet, sd, Scale.size(atlas.seen(sd, COARSE), "µm", 0.99))
+
+
+def draw_error_against_truth(atlas: HarvestAtlas, frame: HarvestedFrame, part: str) -> Figure:
+    """Draw a part of the error, in the deformed configuration.
+
+    "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
+    """
+    truth = atlas.harvest.truth
+    assert truth is not None
+    known, sheet = truth.frames[frame.name], atlas.sheet()
+    rows, cols = _pixels(sheet)
+    x, y = atlas.harvest.grid.x[cols], atlas.harvest.grid.y[rows]
+    fields_of = {
+        "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),
+        "best": lambda: known.best.ansatz.displacement(known.best.unknowns, x, y),
+        "idic": lambda: frame.result.ansatz.displacement(frame.result.unknowns, x, y),
+    }
+    first, second = {"true_w": ("truth", "idic"), "best": ("truth", "best"),
+                     "loss": ("best", "idic")}[part]  # fmt: skip
+    length = UM * np.linalg.norm(fields_of[first]() - fields_of[second](), axis=-1)
+    length = np.where(atlas.harvest.mask[np.ix_(rows, cols)], length, np.nan)
+    return fields.draw_field(sheet, length, Scale.size(length, "µm", 0.998), atlas.motion(frame))
+
+
+def draw_hero(atlas: HarvestAtlas) -> Figure:
+    """Let the last photograph dissolve into the pattern that was found in it."""
+    frame, sheet = atlas.harvest.frames[-1], atlas.sheet()
+    pattern = frame.result.displacement(sheet.grid)
+    if frame.modes:
+        pattern = pattern - frame.result.v0(sheet.grid)
+    length = UM * np.linalg.norm(pattern, axis=-1)
+    end = Scale.size(atlas.seen(length), "µm")
+    everywhere = np.ones(frame.image.shape, dtype=np.bool_)
+    drawn = fields.draw_blend(
+        sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, length,
+        Scale(GLOW, 0.0, end.high, "µm"), atlas.motion(frame),
+    )  # fmt: skip
+    # The photograph ends where the measured outline does: a mask of it may have ragged edges.
+    axes = drawn.axes[0]
+    axes.images[0].set_clip_path(axes.patches[0])
+    return drawn
+
+
+def _support(atlas: HarvestAtlas, frame: HarvestedFrame, i: int, cells: int = SMOOTH) -> FloatArray:
+    """Taper of mode i on a sheet [-]."""
+    taper, grid = frame.result.ansatz.modes[i].taper, atlas.sheet(cells).grid
+    return np.asarray(taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :])
+
+
+def _pixels(sheet: Sheet) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the images' pixels that the middles of a sheet's cells show."""
+    n = sheet.factor
+    rows, cols = (n // 2 + n * np.arange(size) for size in sheet.grid.shape)
+    return rows, cols
+
+
+def _residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> FloatArray:
+    """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
+    harvest, ansatz, a = atlas.harvest, frame.result.ansatz, frame.result.unknowns
+    rows, cols = _pixels(atlas.sheet(FINE))
+    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
+    u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
+    spline = SplineImage.of(np.asarray(frame.image), harvest.order)
+    value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
+    gain, offset = ansatz.gain_and_offset(a, x, y)
+    picked = np.ix_(rows, cols)
+    residual = harvest.reference[picked] - gain * value - offset
+    return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
+
+
+def _sd(errors: FieldErrors, field: str) -> FloatArray:
+    """(q, p) standard deviation of a field [mm]."""
+    if field == "v0":
+        return np.asarray(np.linalg.norm(errors.v0, axis=-1))
+    if field.startswith("fluc"):
+        return np.asarray(np.linalg.norm(errors.fluctuation[int(field[4:]) - 1], axis=-1))
+    return np.asarray(errors.v[int(field[1:]) - 1])
+
+
+def _resampled(frame: HarvestedFrame, sd: FloatArray, sheet: Sheet) -> FloatArray:
+    """Error bars on the cells of a sheet, linear between the axes' values; NaN if infinite."""
+    along_y, along_x = np.argsort(frame.error_y), np.argsort(frame.error_x)
+    between = RegularGridInterpolator(
+        (frame.error_y[along_y], frame.error_x[along_x]),
+        np.where(np.isfinite(sd), sd, np.nan)[np.ix_(along_y, along_x)],
+        bounds_error=False, fill_value=None,
+    )  # fmt: skip
+    y, x = np.meshgrid(sheet.grid.y, sheet.grid.x, indexing="ij")
+    return np.asarray(np.maximum(between((y, x)), 0.0))
