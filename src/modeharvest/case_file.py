@@ -154,7 +154,8 @@ def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[s
     """The keys that the table at this place of a case may have."""
     place = model
     for part in table:
-        place = _table_type(place, str(part))
+        if not isinstance(part, int):  # a place in a list of tables
+            place = _table_type(place, part)
     if place is None:
         return []
     return [f.name for f in fields(place)] if is_dataclass(place) else list(place.model_fields)
