@@ -24,12 +24,11 @@ import numpy as np
 from modeharvest.case import read_case, shipped_solution
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.fields.files import write_field
 from modeharvest.idic.fields.local_field import sampled_field
 from modeharvest.idic.fields.subsets import WHERE, SubsetOptions, subset_field
-from modeharvest.idic.start.automatic import automatic_start
+from modeharvest.idic.setup import Identification
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.scoring import grade, make_benchmark, print_grading, truth_folder
@@ -51,7 +50,7 @@ class Task:
     deformed: np.ndarray
     mask: np.ndarray
     grid: PixelGrid
-    cell: float
+    strain: float
 
     @classmethod
     def read(cls, public: Path, strain: float) -> Task:
@@ -64,7 +63,7 @@ class Task:
         f, g = (255.0 * read_image(public / name)
                 for name in (info["reference"]["camera_image"], entry["camera_image"]))  # fmt: skip
         mask = read_mask(public / info["reference"]["mask"])
-        return cls(public, entry["camera_image"], f, g, mask, grid, info["unit_cell_mm"])
+        return cls(public, entry["camera_image"], f, g, mask, grid, strain)
 
     @property
     def deformed_mask(self) -> np.ndarray:
@@ -73,12 +72,13 @@ class Task:
 
 
 def idic(task: Task, field: Path, codes: str) -> None:
-    """Micromorphic IDIC; all it is told besides is which part of the specimen has holes."""
-    box = Box.centred(*(2.0 * half for half in Specimen().cellular_half_size))
-    images = task.reference, task.deformed, task.grid
-    masks = task.mask, task.deformed_mask
-    start = automatic_start(*images, task.cell, box, *masks)
-    found = correlate(*images, start.ansatz, start.unknowns, *masks)
+    """Micromorphic IDIC with the paper's ansatz and start: it knows where the holes are."""
+    how = Identification()
+    ansatz = how.ansatz(Specimen())
+    found = correlate(
+        task.reference, task.deformed, task.grid, ansatz, how.start(ansatz, task.strain),
+        task.mask, task.deformed_mask, how.options(),
+    )  # fmt: skip
     write_field(field, sampled_field(found.displacement(), task.grid, task.mask, STEP_PX))
 
 
