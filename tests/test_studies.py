@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,6 +24,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.studies.case import StudyCase, read_study, shipped_studies
 from modeharvest.studies.pipeline import StudyPipeline
+from modeharvest.validation import campaign
 from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.studies import robustness_findings as told
 from modeharvest.validation.studies.factors import FACTORS, Setting
@@ -343,6 +346,21 @@ def test_a_study_from_the_command_line(
     assert "Stored results of modeharvest 0.0.0, 1 in number" in (out / "report.html").read_text()
 
 
+def threads(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
+    """A case that tells how many threads its kernels have."""
+    return {"threads": numba.get_num_threads()}
+
+
+def test_a_case_has_one_thread(tmp_path: Path) -> None:
+    before = numba.get_num_threads()
+    try:
+        campaign._work("test_studies:threads", {}, str(tmp_path))
+        (path,) = (tmp_path / "cases").iterdir()
+        assert read_json(path)["result"] == {"threads": 1}
+    finally:
+        numba.set_num_threads(before)
+
+
 def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which one of two starts failed, and none is left to be run."""
     assert PAPER is not None
@@ -350,16 +368,16 @@ def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
     pipeline = StudyPipeline(case, tmp_path, solution=PAPER)
     cases = case.study.prepare(pipeline.subject(), tmp_path)
-    campaign = Campaign(case.study.function, cases, tmp_path)
+    plan = Campaign(case.study.function, cases, tmp_path)
     result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
     traceback = "Traceback …\nMemoryError: too large"
     for one, error in zip(cases, ("", traceback), strict=True):
         record = {"version": __version__, "seconds": 1.0, "error": error}
-        write_json(campaign.path(one), {**record, "result": None if error else result})
+        write_json(plan.path(one), {**record, "result": None if error else result})
     monkeypatch.setattr(Campaign, "missing", lambda self: ())
     summary = pipeline.all()
     (failure,) = summary["failed"]
-    assert failure == {"file": campaign.path(cases[1]).name, "error": "MemoryError: too large"}
+    assert failure == {"file": plan.path(cases[1]).name, "error": "MemoryError: too large"}
     assert "1 of 2 cases failed" in (tmp_path / "report.html").read_text()
     monkeypatch.setattr(Campaign, "table", lambda self: starts_table([1.0]).assign(error="No"))
     with pytest.raises(InputError, match="all 1 cases failed; the first: No"):

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numba
 import pandas as pd
 
 from modeharvest import __version__
@@ -35,8 +36,10 @@ CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
 
 _PATIENCE_S = 10.0
 """How long to wait for a scheduler that does not answer."""
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""A worker has one thread: cores are shared out by cases."""
+_LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+_ENVIRONMENT = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
+"""A worker has one thread: cores are shared out by cases. Said before it starts: a script that
+imports numba is imported again by each worker, before anything else could be said."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +219,7 @@ def named(function: str) -> CaseFunction:
 
 def _work(function: str, case: Case, folder: str) -> None:
     """Run one case in a worker and store what becomes of it."""
+    numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
     begin = time.perf_counter()
     result, error = None, ""
     try:
@@ -274,7 +278,7 @@ def _client(workers: Workers) -> Iterator[Any]:
             yield client
         return
     with (
-        dask.config.set({"distributed.nanny.environ": _ENVIRONMENT}),
+        dask.config.set({"distributed.nanny.pre-spawn-environ": _ENVIRONMENT}),
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=workers.count,
             threads_per_worker=1,
