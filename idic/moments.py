@@ -22,7 +22,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from modeharvest.idic.pixel_blocks import (
     BLOCK,
@@ -105,11 +104,12 @@ def _add_row(pairs: Any, row_moments: Any, eta_T: Any, moments: Any) -> None:
                 moments[p, a, b] += value * eta_T[b]
 
 
-@compiled(parallel=True, relaxed=True)
+@compiled(relaxed=True)
 def accumulate(
-    target: Any, runs: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any
-) -> None:
-    """Sum the moments of pairs of base fields over the pixels.
+    target: Any, runs: Any, tables: Any, pairs: Any, fields: int, moments: Any, left: Any,
+    first: int, every: int,
+) -> None:  # fmt: skip
+    """Sum the moments of pairs of base fields over the pixels of some bands of rows.
 
     Parameters
     ----------
@@ -123,9 +123,11 @@ def accumulate(
         (bands, pairs, K + 1, K + 1), zero on entry: the sums of each band of rows.
     left
         (bands,), zero on entry: how many pixels are mapped outside the image.
+    first, every
+        The bands to look at: each ``every``-th from ``first`` on.
     """
     rows, bands = runs.row_start.size - 1, moments.shape[0]
-    for band in prange(bands):
+    for band in range(first, bands, every):
         block = new_block(tables, max(1, moments.shape[2] - 1), fields)
         product = np.empty(BLOCK)
         row_moments = np.zeros((pairs.shape[0], moments.shape[2]))

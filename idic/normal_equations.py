@@ -8,7 +8,6 @@ mode families then make from it the matrix of the unknowns.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -24,6 +23,7 @@ from modeharvest.idic.fourier import PER_WAVE
 from modeharvest.idic.moments import accumulate
 from modeharvest.idic.pixel_blocks import Target
 from modeharvest.idic.tables import Runs, runs_of, tables_of
+from modeharvest.imaging.compiled import side_by_side
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -204,8 +204,7 @@ class Assembly:
         moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
-        kernel: Callable[..., None] = accumulate
-        kernel(target, runs, tables, pairs, len(degrees), moments, left)
+        side_by_side(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
         off, pixels = int(left.sum()), int((runs.stop - runs.first).sum())
         return self._from_moments(pairs, moments.sum(axis=0), pixels - off, off)
 

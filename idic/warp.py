@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.idic.normal_equations import BANDS, Assembly
@@ -24,7 +22,7 @@ from modeharvest.idic.pixel_blocks import (
     take_block,
 )
 from modeharvest.idic.tables import tables_of
-from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.compiled import compiled, side_by_side
 from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]
@@ -84,20 +82,19 @@ def _run(
     tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    kernel: Callable[..., None] = _pass
-    kernel(target, assembly.runs, tables, degree, BANDS, allowed, kept, left)
+    side_by_side(_pass, target, assembly.runs, tables, degree, BANDS, allowed, kept, left)
 
 
-@compiled(parallel=True, relaxed=True)
+@compiled(relaxed=True)
 def _pass(
-    target: Any, runs: Any, tables: Any, degree: int, bands: int, allowed: Any, kept: Any, left: Any
-) -> None:
+    target: Any, runs: Any, tables: Any, degree: int, bands: int, allowed: Any, kept: Any,
+    left: Any, first: int, every: int,
+) -> None:  # fmt: skip
     """Fill ``kept`` from ``allowed``, or else ``left``: one pass, so that it is compiled once."""
     rows, per_px = runs.row_start.size - 1, 1.0 / target.pixel_size
-    for band in prange(bands):
+    for band in range(first, bands, every):
         block = new_block(tables, degree, 3)
         own, remains = block.own, block.E[2]
-        # Rows of an inner range are signed, as in the other pass: prange's own are not.
         for row in range(band * rows // bands, (band + 1) * rows // bands):
             run, begin = start_row(runs, tables, row, block)
             while run < runs.row_start[row + 1]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar, cast
 
 import numba
@@ -28,7 +29,25 @@ def compiled(
         Let the compiler reorder sums and divide as numpy does; by default floating-point
         arithmetic is strict, and division by zero an error.
     """
-    options: dict[str, Any] = {"cache": True, "parallel": parallel, "forceinline": inline}
+    options: dict[str, Any] = {
+        "cache": True, "parallel": parallel, "forceinline": inline, "nogil": True,
+    }  # fmt: skip
     if relaxed:
         options |= {"fastmath": _RELAXED, "error_model": "numpy"}
     return cast(Callable[[F], F], cast(Any, numba.njit)(**options))
+
+
+def side_by_side(kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call ``kernel(*arguments, k, count)``, k = 0 ... count - 1, on as many threads as numba has.
+
+    For kernels that share out their work themselves, every count-th part to one thread. Those
+    with ``prange`` are simpler, and take three times as long to compile.
+    """
+    count = numba.get_num_threads()
+    if count == 1:
+        kernel(*arguments, 0, 1)
+        return
+    with ThreadPoolExecutor(count) as threads:
+        # The first call compiles, once; the others wait for it.
+        for done in [threads.submit(kernel, *arguments, k, count) for k in range(count)]:
+            done.result()
