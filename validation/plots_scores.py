@@ -169,5 +169,8 @@ def _look(n: int, graded: Score) -> dict[str, Any]:
 
 
 def _legend(axes: Axes) -> None:
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(frameon=False, fontsize=7.5)
+    """Names above the picture, where no curve is."""
+    count = len(axes.get_legend_handles_labels()[0])
+    if count:
+        axes.legend(frameon=False, fontsize=7.5, ncols=min(count, 4), loc="lower right",
+                    bbox_to_anchor=(1.0, 0.985), borderaxespad=0.0)  # fmt: skip
