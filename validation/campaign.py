@@ -36,10 +36,10 @@ CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
 
 _PATIENCE_S = 10.0
 """How long to wait for a scheduler that does not answer."""
-_LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+_LIBRARIES = ("OMP", "MKL", "OPENBLAS")
 _ENVIRONMENT = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
-"""A worker has one thread: cores are shared out by cases. Said before it starts: a script that
-imports numba is imported again by each worker, before anything else could be said."""
+"""A worker has one thread: cores are shared out by cases. numba is told in each case, because dask
+says this in the parent's own environment, where numba must not change its mind."""
 
 
 @dataclass(frozen=True)
