@@ -69,7 +69,7 @@ BoolArray = NDArray[np.bool_]
 __all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
 
 FORMAT = "modeharvest-images-1"
-PIXELS = 2
+PIXELS = 3
 """Counts the changes of the code that changed a pixel, if only by rounding."""
 SIDECAR = "images.json"
 _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
