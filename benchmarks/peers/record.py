@@ -15,7 +15,7 @@ from typing import Any
 from modeharvest.files import write_json
 
 PACKAGES = ("riley-raster", "pyxel-dic", "numpy", "scipy", "numba", "finufft")
-CODE = ("fem/field.py", "imaging/*.py", "idic/*.py", "benchmarks/peers/*.py")
+CODE = ("fem/field.py", "imaging/**/*.py", "idic/**/*.py", "benchmarks/peers/*.py")
 
 
 def stamp(project: Path) -> dict[str, Any]:
