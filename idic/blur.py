@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.compiled import compiled, readable
 
 BoolArray = NDArray[np.bool_]
 Float32Image = NDArray[np.float32]
@@ -42,7 +42,7 @@ def binned(
     weight = np.ones(image.shape, dtype=np.bool_) if weight is None else weight
     shape = image.shape[0] // factor, image.shape[1] // factor
     mean, share = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    _bin(np.ascontiguousarray(image), np.ascontiguousarray(weight), factor, mean, share)
+    _bin(readable(image), readable(weight), factor, mean, share)
     return mean, share
 
 
@@ -62,7 +62,7 @@ def blurred(image: Float32Image, sigma: float) -> Float32Image:
     weights = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
     weights /= weights[0] + 2.0 * weights[1:].sum()
     out = np.empty_like(image)
-    _blur(np.ascontiguousarray(image), weights.astype(np.float32), out)
+    _blur(readable(image), weights.astype(np.float32), out)
     return out
 
 

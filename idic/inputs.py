@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.imaging.compiled import readable
 from modeharvest.imaging.grid import PixelGrid
 
 BoolArray = NDArray[np.bool_]
@@ -74,7 +75,7 @@ def seen(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
 
 
 def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
-    """The image as float32; raises InputError unless it has the grid's shape and is finite."""
+    """The image as read-only float32; raises InputError unless finite and of the grid's shape."""
     pixels = np.asarray(image)
     if pixels.shape != grid.shape:
         raise InputError(
@@ -88,11 +89,11 @@ def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
             f"expected finite grey levels in the {what} image, got NaN or infinity in "
             f"{where(bad)}; fill or crop them"
         )
-    return pixels
+    return readable(pixels)
 
 
 def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
-    """The mask as booleans; raises InputError unless it has the grid's shape and some material."""
+    """The mask, read-only; raises InputError unless it has the grid's shape and some material."""
     if mask is None:
         return None
     inside = np.ascontiguousarray(mask, dtype=np.bool_)
@@ -103,7 +104,7 @@ def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArra
         )
     if not inside.any():
         raise InputError(f"expected material in the {what}, got one that is False everywhere")
-    return inside
+    return readable(inside)
 
 
 def require_contrast(grey: NDArray[Any], what: str) -> None:

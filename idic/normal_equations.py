@@ -187,14 +187,10 @@ class Assembly:
         with_matrix
             Whether the matrix is wanted.
         """
-        nothing = np.zeros((0, 0), dtype=np.float32)
 
         def along(component: int) -> NormalEquations:
-            known = np.ascontiguousarray(target[..., component], dtype=np.float64)
-            pixel_size = self.grid.pixel_size
-            return self._assemble(
-                a, Target(component, nothing, nothing, 5, known, pixel_size), with_matrix
-            )
+            known = np.asarray(target[..., component], dtype=np.float64)
+            return self._assemble(a, Target.along(component, known, self.grid), with_matrix)
 
         return along(0) + along(1)
 

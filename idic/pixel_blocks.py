@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.compiled import compiled, readable
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage, sample_points
 
@@ -55,8 +55,15 @@ class Target(NamedTuple):
     @classmethod
     def images(cls, reference: NDArray[Any], deformed: SplineImage, grid: PixelGrid) -> Target:
         """A pair of images."""
-        f, nothing = np.ascontiguousarray(reference), np.zeros((0, 0))
+        f, nothing = readable(reference), readable(np.zeros((0, 0)))
         return cls(IMAGES, f, deformed.coefficients, deformed.order, nothing, grid.pixel_size)
+
+    @classmethod
+    def along(cls, component: int, displacement: NDArray[Any], grid: PixelGrid) -> Target:
+        """One component of a displacement (rows, cols) [mm]: 0 for u_x, 1 for u_y."""
+        nothing = np.zeros((0, 0), dtype=np.float32)
+        u = readable(displacement)
+        return cls(component, readable(nothing), nothing, 5, u, grid.pixel_size)
 
 
 IMAGES = -1

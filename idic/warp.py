@@ -22,7 +22,7 @@ from modeharvest.idic.pixel_blocks import (
     take_block,
 )
 from modeharvest.idic.tables import tables_of
-from modeharvest.imaging.compiled import compiled, side_by_side
+from modeharvest.imaging.compiled import compiled, readable, side_by_side
 from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]
@@ -82,7 +82,7 @@ def _run(
     tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    side_by_side(_pass, target, assembly.runs, tables, degree, BANDS, allowed, kept, left)
+    side_by_side(_pass, target, assembly.runs, tables, degree, BANDS, readable(allowed), kept, left)
 
 
 @compiled(relaxed=True)

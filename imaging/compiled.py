@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -35,6 +37,17 @@ def compiled(
     if relaxed:
         options |= {"fastmath": _RELAXED, "error_model": "numpy"}
     return cast(Callable[[F], F], cast(Any, numba.njit)(**options))
+
+
+def readable(values: NDArray[Any]) -> NDArray[Any]:
+    """Show an array to kernels: contiguous, aligned and read-only, copied only where it isn't.
+
+    Kernels are compiled for the types of their arguments, and layout and writability belong to
+    an array's type. Everybody's arrays can be made read-only, so that one compilation serves all.
+    """
+    view = np.require(values, requirements=["C_CONTIGUOUS", "ALIGNED"]).view()
+    view.flags.writeable = False
+    return view
 
 
 def side_by_side(kernel: Callable[..., None], *arguments: Any) -> None:

@@ -69,7 +69,7 @@ class SplineImage:
             If the image isn't two-dimensional or smaller than 2 x 2 px, or the order is
             neither 3 nor 5.
         """
-        pixels = np.ascontiguousarray(image, dtype=np.dtype(dtype))
+        pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
             raise InputError(f"expected an image of at least 2 x 2 px, got shape {pixels.shape}")
         if order not in (3, 5):

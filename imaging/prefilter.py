@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.compiled import compiled, readable
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     Parameters
     ----------
     image
-        (rows, cols) grey levels, float32 or float64, contiguous, at least 2 x 2; mirrored about
+        (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about
         its outermost pixels.
     order
         3 or 5.
@@ -52,7 +52,7 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     inner = padded[pad : pad + rows, pad : pad + cols]
     poles = np.array(_POLES[order])
     gain = float(np.prod((1.0 - poles) * (1.0 - 1.0 / poles)))
-    _filter_columns(image, poles, _mirrored(poles, rows), gain, inner)
+    _filter_columns(readable(image), poles, _mirrored(poles, rows), gain, inner)
     _filter_rows(poles, _mirrored(poles, cols), gain, inner)
     _pad_mirrored(padded, pad)
     return padded
