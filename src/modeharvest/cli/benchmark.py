@@ -1,0 +1,76 @@
+"""Commands of a benchmark for any DIC code: make its images, grade what comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modeharvest.cli.arguments import CaseName, OutFolder, SolutionFile
+from modeharvest.cli.messages import bars
+
+
+def make(
+    case: CaseName,
+    out: Annotated[Path, typer.Option("--out", help="The public folder.", metavar="DIR")],
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="Folder for the truth [DIR-truth].", metavar="DIR"),
+    ] = None,
+    solution: SolutionFile = None,
+) -> None:
+    """Make a public set of images, and apart from it the truth to score fields with.
+
+    The public folder holds reference.tif, deformed_*.tif, mask.tif, benchmark.json and README.md,
+    and nothing that gives the displacements away.
+    """
+    from modeharvest.case import read_case
+
+    checked = read_case(case)
+    from modeharvest.scoring import make_benchmark, truth_folder
+
+    with bars() as progress:
+        info = make_benchmark(checked, out, truth, solution, progress)
+    print(f"benchmark {info['id']}: {len(info['deformed'])} deformed images in {out}")
+    print(f"truth, not to be given away: {truth or truth_folder(out)}")
+
+
+def score(
+    fields: Annotated[
+        list[Path],
+        typer.Argument(metavar="FIELD...", help="CSV, NPZ, HDF5, MAT or VTK files of any code."),
+    ],
+    truth: Annotated[Path, typer.Option("--truth", help="The truth's folder.", metavar="DIR")],
+    strain: Annotated[float, typer.Option("--strain", help="Of the image that was measured.")],
+    out: OutFolder,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option("--unit", help="px or mm; 'file': as its columns' names say.", metavar="UNIT"),
+    ] = None,
+    y_axis: Annotated[
+        list[str] | None,
+        typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
+    ] = None,
+    first_pixel: Annotated[
+        list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
+    ] = None,
+) -> None:
+    """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
+
+    --unit, --y-axis and --first-pixel count for all fields, or are given once for each, in order.
+    Leaves report.html, scores.json and scores.csv in DIR.
+    """
+    from modeharvest import scoring
+
+    declared = scoring.declarations(fields, name, unit, y_axis, first_pixel, column)
+    with bars() as progress:
+        done = scoring.grade(declared, truth, strain, out, progress=progress)
+    scoring.print_grading(done, out)

@@ -1,0 +1,57 @@
+"""A virtual experiment's ``summary.json`` as a short table on the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+_ROWS = {
+    "negative pivots of the tangent": "negative_pivots",
+    "pattern amplitude [px]": "pattern_amplitude_px",
+    "w = truth - IDIC, rms [px]": "rms_w_px",
+    "best possible fit, rms [px]": "rms_best_fit_px",
+    "IDIC - best fit, rms [px]": "rms_idic_to_best_fit_px",
+    "grey-level residual, rms": "rms_residual",
+    "iterations": "iterations",
+    "outcome": "outcome",
+}
+
+
+def print_experiment(summary: dict[str, Any], out: Path) -> None:
+    """Print what was measured and how wrong it was, the file of the report last."""
+    console = Console(highlight=False)
+    console.print(_snapshots(summary))
+    console.print("rms: per component, over all material pixels")
+    console.print(critical_line(summary["critical_strain"]))
+    for warning in summary["warnings"]:
+        console.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
+    if summary["expected"]:
+        missed = [row["quantity"] for row in summary["expected"] if not row["ok"]]
+        console.print(f"expected values missed: {', '.join(missed) or 'none'}")
+    console.print(f"report: {out / 'report.html'}")
+
+
+def critical_line(strain: float | None) -> str:
+    """A sentence on the critical strain [-], None if the path has no bifurcation."""
+    if strain is None:
+        return "no bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
+    return f"critical strain {100 * strain:.4f} %"
+
+
+def _snapshots(summary: dict[str, Any]) -> Table:
+    """What was found at each strain, a column each."""
+    table = Table(title=str(summary.get("title", "")), title_justify="left")
+    table.add_column("quantity")
+    for s in summary["snapshots"]:
+        table.add_column(f"{100 * s['nominal_strain']:.2f} %", justify="right")
+    for label, key in _ROWS.items():
+        table.add_row(escape(label), *(_cell(s.get(key)) for s in summary["snapshots"]))
+    return table
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
