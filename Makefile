@@ -12,11 +12,11 @@ help: ## Show this list
 	  while IFS='|' read -r name what; do printf '  make %-10s %s\n' "$$name" "$$what"; done
 
 demo: ## Reproduce the paper's virtual experiment in out/demo (open report.html)
-	$(ENV) python -m modeharvest run paper-virtual --out $(OUT)
+	$(ENV) modeharvest run paper-virtual --out $(OUT)
 
 lattices: ## Analyse the infinite lattices that are shipped in out/lattices (minutes)
 	for case in square-lattice hexagonal-lattice chiral-lattice mode-study; do \
-	  $(ENV) python -m modeharvest modes $$case --out out/lattices/$$case || exit; done
+	  $(ENV) modeharvest modes $$case --out out/lattices/$$case || exit; done
 
 test: lint ## Lint, type-check and run the tests: all that must pass before a commit
 	$(ENV) python -m pytest
@@ -37,7 +37,7 @@ peers: ## Measure beside riley-raster and pyxel-dic, in an environment of their 
 	benchmarks/peers/run
 
 shipped: ## Make the solution anew that ships with the package
-	$(ENV) python -m modeharvest fem paper-virtual --out out/shipped
+	$(ENV) modeharvest fem paper-virtual --out out/shipped
 	cp out/shipped/solution.h5 src/modeharvest/cases/paper-virtual.h5
 
 clean: ## Remove what the other commands leave in this folder (not the cache, not out/)
