@@ -6,8 +6,8 @@ Two questions, each answered by whole campaigns, their workers' start included a
   one worker and by two;
 * overhead: cases that sleep for a second, on two workers: what the campaign takes beyond that.
 
-A worker's start (a new process that imports numpy, scipy and numba) takes seconds, once for a
-campaign; it is told apart. The machine should have two idle cores.
+The workers' start (dask, and a server process that imports what they need and that they are forks
+of) takes a second, once for a campaign; it is told apart. The machine should have two idle cores.
 
 Run: scripts/env python benchmarks/campaign.py [--starts 24] [--sleeps 60] [--pixel 0.02]
 """
@@ -22,12 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from modeharvest.case import shipped_solution
-from modeharvest.fem.field import Solution
-from modeharvest.studies.case import StudyCase
 from modeharvest.validation.campaign import Campaign, Case, Workers, grid
-from modeharvest.validation.studies.robustness import Robustness
-from modeharvest.validation.studies.subject import Subject
 
 SLEEP_S = 1.0
 
@@ -75,6 +70,12 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> T
 
 def speedup(starts: int, pixel: float, folder: Path) -> None:
     """One worker against two."""
+    from modeharvest.case import shipped_solution  # here: workers import this file, too
+    from modeharvest.fem.field import Solution
+    from modeharvest.studies.case import StudyCase
+    from modeharvest.validation.studies.robustness import Robustness
+    from modeharvest.validation.studies.subject import Subject
+
     path, case = shipped_solution("paper-virtual"), StudyCase()
     assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)

@@ -25,3 +25,10 @@ def dies_once(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return {"x_again": case["x"]}
+
+
+def dies(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
+    """Kill its own worker, -9, when x is 4."""
+    if case["x"] == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"x_again": case["x"]}

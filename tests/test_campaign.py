@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
+from modeharvest.validation import workers
 from modeharvest.validation.campaign import Campaign, Workers, grid
 
 BASE = {"x": 0, "wait": 0.0, "bad": -1}
@@ -52,9 +57,73 @@ def test_bad_campaigns_are_one_line(tmp_path: Path) -> None:
         Campaign("campaign_cases:square", (), tmp_path)
 
 
+def greet(server: socket.socket) -> None:
+    """Answer once as a mail server would."""
+    connection, _ = server.accept()
+    with connection:
+        connection.sendall(b"220 mail\r\n" * 9)
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a dask scheduler at"):
-        squares(tmp_path, x=[1]).run(Workers(scheduler="no-scheme-at-all://nowhere"))
+    with socket.socket() as other:  # a server that says something else
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        other.settimeout(20.0)
+        answer = threading.Thread(target=greet, args=(other,))
+        answer.start()
+        no_scheduler = f"tcp://127.0.0.1:{other.getsockname()[1]}"
+        for address in ("no-scheme-at-all://nowhere", no_scheduler):
+            with pytest.raises(InputError, match="expected a dask scheduler at"):
+                squares(tmp_path, x=[1]).run(Workers(scheduler=address))
+        answer.join()
+
+
+@pytest.fixture
+def scheduler() -> Iterator[str]:
+    """The address of a scheduler with a worker, both in a process of their own."""
+    program = textwrap.dedent(f"""
+        import sys, time
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from distributed import LocalCluster
+        with LocalCluster(1, processes=False, protocol="tcp", dashboard_address=None) as cluster:
+            print(cluster.scheduler_address, flush=True)
+            sys.stdin.read()
+    """)
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-c", program]
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+    assert process.stdout is not None
+    yield process.stdout.readline().strip()
+    process.communicate()
+
+
+def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = Workers(scheduler=scheduler)
+    elsewhere.get_ready("campaign_cases:square", tmp_path)
+    table = squares(tmp_path, x=[1, 2, 3], bad=[3]).run(elsewhere)
+    assert list(table["square"].dropna()) == [1, 4]
+    assert os.getpid() not in set(table["process"].dropna())
+    with pytest.raises(InputError, match=r"no_such:f, but the one at tcp.* says .*install"):
+        elsewhere.get_ready("no_such:f", tmp_path)
+
+    # Of another version, or where the folder is not.
+    for said, message in (
+        (("0.0.1", True), r"expected modeharvest .*, got 0\.0\.1 on the one at tcp"),
+        ((__version__, False), "expected workers that can write to the folder"),
+    ):
+        monkeypatch.setattr(workers, "introduce", lambda function, mark, said=said: said)
+        with pytest.raises(InputError, match=message):
+            elsewhere.get_ready("campaign_cases:square", tmp_path)
+    monkeypatch.undo()
+
+    # It dies in the fifth of eight cases.
+    monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
+    campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=list(range(8))), tmp_path)
+    with pytest.raises(InputError, match="went away; 4 of 8 are done and kept"):
+        campaign.run(elsewhere)
+    assert len(campaign.missing()) == 4
 
 
 def test_failures_are_recorded_and_only_what_is_missing_is_run_again(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
 from modeharvest.studies.case import StudyCase, read_study, shipped_studies
 from modeharvest.studies.pipeline import StudyPipeline
-from modeharvest.validation import campaign
 from modeharvest.validation.campaign import Campaign
+from modeharvest.validation.case_run import run_case
 from modeharvest.validation.studies import robustness_findings as told
 from modeharvest.validation.studies.factors import FACTORS, Setting
 from modeharvest.validation.studies.noise import Noise, one_realisation
@@ -340,7 +340,7 @@ def test_a_study_from_the_command_line(
     # Again: nothing is run twice, it needs no workers at all, and other results are named.
     write_json(out / "cases" / "old.json", {"version": "0.0.0", "error": "", "result": {}})
     before = {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()}
-    monkeypatch.setattr("modeharvest.validation.campaign._client", None)
+    monkeypatch.setattr("modeharvest.validation.workers.Workers.client", None)
     assert called(monkeypatch, *arguments) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()} == before
     assert "Stored results of modeharvest 0.0.0, 1 in number" in (out / "report.html").read_text()
@@ -354,7 +354,7 @@ def threads(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
 def test_a_case_has_one_thread(tmp_path: Path) -> None:
     before = numba.get_num_threads()
     try:
-        campaign._work("test_studies:threads", {}, str(tmp_path))
+        run_case("test_studies:threads", {}, str(tmp_path), __version__)
         (path,) = (tmp_path / "cases").iterdir()
         assert read_json(path)["result"] == {"threads": 1}
     finally:

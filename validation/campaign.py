@@ -12,66 +12,29 @@ Workers are processes of dask.distributed: of this machine, or of any scheduler 
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
-import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import pandas as pd
 
 from modeharvest import __version__
 from modeharvest.errors import InputError
-from modeharvest.files import atomic, read_json, require_writable, write_json
+from modeharvest.files import atomic, require_writable
 from modeharvest.progress import Progress, silent
-from modeharvest.stages import digest
+from modeharvest.validation.case_run import (
+    Case,
+    named,
+    read_result,
+    result_path,
+    run_case,
+    store,
+)
+from modeharvest.validation.workers import Workers
 
-Case = Mapping[str, Any]
-CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
-
-_PATIENCE_S = 10.0
-"""How long to wait for a scheduler that does not answer."""
-_LIBRARIES = ("OMP", "MKL", "OPENBLAS")
-_ENVIRONMENT = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
-"""A worker has one thread: cores are shared out by cases. numba is told in each case, because dask
-says this in the parent's own environment, where numba must not change its mind."""
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Who does the work.
-
-    Parameters
-    ----------
-    count
-        Processes on this machine.
-    memory
-        Most that each may take, e.g. "4GiB"; one that takes more is stopped and its case fails.
-    scheduler
-        Address of a running dask scheduler instead, e.g. "tcp://host:8786". Its workers must see
-        the campaign's folder.
-    """
-
-    count: int = 2
-    memory: str = "4GiB"
-    scheduler: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise InputError(f"expected at least 1 worker, got {self.count}")
-        from dask.utils import parse_bytes
-
-        try:
-            parse_bytes(self.memory)
-        except (ValueError, TypeError) as error:
-            raise InputError(
-                f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}"
-            ) from error
+__all__ = ["Campaign", "Case", "Workers", "grid"]
 
 
 @dataclass(frozen=True)
@@ -109,17 +72,16 @@ class Campaign:
 
     def path(self, case: Case) -> Path:
         """Where the result of a case is stored."""
-        key = digest([self.function, dict(case), __version__])[:24]
-        return self.folder / "cases" / f"{key}.json"
+        return result_path(self.function, case, self.folder)
 
     def missing(self) -> tuple[Case, ...]:
         """The cases that have no result yet, or failed."""
-        return tuple(case for case in self.cases if not _is_done(self.path(case)))
+        return tuple(case for case in self.cases if read_result(self.path(case)).get("error") != "")
 
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``.
 
-        And, where pyarrow is there, as ``table.parquet``. Lists are left in the cases' files.
+        Lists are left in the cases' files.
 
         Parameters
         ----------
@@ -131,14 +93,15 @@ class Campaign:
         Raises
         ------
         InputError
-            If the folder can't be written to, or the scheduler is not there.
+            If the folder can't be written to, the scheduler is not there or goes away, or its
+            workers can't do the work.
         """
         require_writable(self.folder)
         missing = self.missing()
         done = len(self.cases) - len(missing)
         progress(done, len(self.cases), "campaign")
         if missing:
-            with _client(workers or Workers()) as client:
+            with (workers or Workers()).client(self.function, self.folder) as client:
                 for _ in self._finished(client, missing):
                     done += 1
                     progress(done, len(self.cases), "campaign")
@@ -156,12 +119,12 @@ class Campaign:
         counts: dict[str, int] = {}
         for path in sorted((self.folder / "cases").glob("*.json")):
             if path not in wanted:
-                version = str(_record(path).get("version", "unknown"))
+                version = str(read_result(path).get("version", "unknown"))
                 counts[version] = counts.get(version, 0) + 1
         return counts
 
     def _row(self, case: Case) -> dict[str, Any]:
-        record = _record(self.path(case))
+        record = read_result(self.path(case))
         error = record.get("error", "not run") if record else "not run"
         last = error.strip().splitlines()[-1] if error else ""
         found = record.get("result") or {}
@@ -171,15 +134,24 @@ class Campaign:
         """The cases as they get done; one whose worker dies again and again is stored as failed."""
         from distributed import as_completed
 
+        folder = str(self.folder.resolve())  # workers elsewhere have another current one
         futures = {
-            client.submit(_work, self.function, case, str(self.folder), pure=False): case
+            client.submit(run_case, self.function, case, folder, __version__, pure=False): case
             for case in missing
         }
         for future in as_completed(futures):  # type: ignore[no-untyped-call]
+            case = futures[future]
             if future.status == "error":
                 failure = f"{type(future.exception()).__name__}: {future.exception()}"
-                _store(self.path(futures[future]), futures[future], None, failure, 0.0)
-            yield futures[future]
+                store(self.path(case), case, None, failure, 0.0)
+            elif future.status != "finished":
+                done = len(self.cases) - len(self.missing())
+                raise InputError(
+                    f"expected the dask scheduler to stay until all cases are done, but it went "
+                    f"away; {done} of {len(self.cases)} are done and kept: start it anew and run "
+                    "the same again"
+                )
+            yield case
 
 
 def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
@@ -207,84 +179,9 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)
 
 
-def named(function: str) -> CaseFunction:
-    """The function that "package.module:name" stands for; InputError if there is none."""
-    module, _, name = function.partition(":")
-    try:
-        found: CaseFunction = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"expected a function 'package.module:name', got {function!r}") from error
-    return found
-
-
-def _work(function: str, case: Case, folder: str) -> None:
-    """Run one case in a worker and store what becomes of it."""
-    numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
-    begin = time.perf_counter()
-    result, error = None, ""
-    try:
-        result = dict(named(function)(case, Path(folder)))
-    except Exception:  # a case may fail in any way: that is its result
-        error = traceback.format_exc()
-    path = Campaign(function, (case,), Path(folder)).path(case)
-    _store(path, case, result, error, time.perf_counter() - begin)
-
-
-def _store(
-    path: Path, case: Case, result: Mapping[str, Any] | None, error: str, seconds: float
-) -> None:
-    content = {"version": __version__, "case": dict(case), "seconds": seconds, "error": error}
-    write_json(path, {**content, "result": result})
-
-
 def _write(table: pd.DataFrame, folder: Path) -> None:
     """Leave the table for others to read."""
     lists = [name for name in table if table[name].map(lambda v: isinstance(v, list)).any()]
     plain = table.drop(columns=lists)
     with atomic(folder / "table.csv") as temporary:
         plain.to_csv(temporary, index=False)
-    if importlib.util.find_spec("pyarrow"):
-        with atomic(folder / "table.parquet") as temporary:
-            plain.to_parquet(temporary, index=False)
-
-
-def _record(path: Path) -> dict[str, Any]:
-    """What is stored of a case; empty if nothing, or damaged."""
-    try:
-        return dict(read_json(path))
-    except (InputError, TypeError, ValueError):
-        return {}
-
-
-def _is_done(path: Path) -> bool:
-    return _record(path).get("error") == ""
-
-
-@contextmanager
-def _client(workers: Workers) -> Iterator[Any]:
-    """A client of the scheduler, or of processes that end with it."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    if workers.scheduler is not None:
-        try:
-            client = Client(workers.scheduler, timeout=_PATIENCE_S)  # type: ignore[no-untyped-call]
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"expected a dask scheduler at {workers.scheduler}, got no answer; start one "
-                "with 'dask scheduler', or leave the address out"
-            ) from error
-        with client:
-            yield client
-        return
-    with (
-        dask.config.set({"distributed.nanny.pre-spawn-environ": _ENVIRONMENT}),
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=workers.count,
-            threads_per_worker=1,
-            memory_limit=workers.memory,
-            dashboard_address=":0",  # any free port: campaigns may run side by side
-        ) as cluster,
-        Client(cluster) as client,  # type: ignore[no-untyped-call]
-    ):
-        yield client

@@ -5,7 +5,7 @@
     solution.h5              the exact displacements of the subject
     subjects/ images/        pairs of images, and how they are correlated
     cases/KEY.json           one file for each case, written when it is done
-    table.csv                one row for each case (table.parquet, too, where pyarrow is there)
+    table.csv                one row for each case
     *.csv                    the report's tables
     summary.json report.html what it tells
 """
@@ -76,10 +76,12 @@ class StudyPipeline:
         Raises
         ------
         InputError
-            If no case succeeded, the folder can't be written to, or a scheduler is not there.
+            If no case succeeded, the folder can't be written to, a scheduler is not there, or its
+            workers can't do the work.
         """
         folder, study = self.folder.resolve(), self.case.study
         require_writable(folder)
+        self.workers.get_ready(study.function, folder)
         clock = _Clock()
         subject = self.subject()
         clock.lap("solution")

@@ -1,0 +1,90 @@
+"""What a worker does with one case of a campaign: run it and store what becomes of it.
+
+Workers import this module and the case's function, nothing else of a campaign: they must start
+fast.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from modeharvest import __version__
+from modeharvest.errors import InputError
+from modeharvest.files import read_json, write_json
+from modeharvest.stages import digest
+
+Case = Mapping[str, Any]
+"""Plain values, the seed among them."""
+CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
+"""Takes a case and the campaign's folder, returns plain values: the row of the table."""
+
+
+def named(function: str) -> CaseFunction:
+    """The function that "package.module:name" stands for; InputError if there is none."""
+    module, _, name = function.partition(":")
+    try:
+        found: CaseFunction = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"expected a function 'package.module:name', got {function!r}") from error
+    return found
+
+
+def result_path(function: str, case: Case, folder: Path) -> Path:
+    """Where the result of a case is stored: under a digest of all that it depends on."""
+    key = digest([function, dict(case), __version__])[:24]
+    return folder / "cases" / f"{key}.json"
+
+
+def run_case(function: str, case: Case, folder: str, version: str) -> None:
+    """Run one case in a worker and store what becomes of it.
+
+    Parameters
+    ----------
+    function
+        "package.module:name".
+    case
+        What to run it with.
+    folder
+        The campaign's, absolute: a worker elsewhere has another current one.
+    version
+        Of modeharvest where the campaign was begun.
+
+    Raises
+    ------
+    InputError
+        If this worker has another version: it came after the campaign had begun.
+    """
+    if version != __version__:
+        raise InputError(f"expected a worker with modeharvest {version}, got {__version__}")
+    numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
+    begin = time.perf_counter()
+    result, error = None, ""
+    try:
+        result = dict(named(function)(case, Path(folder)))
+    except Exception:  # a case may fail in any way: that is its result
+        error = traceback.format_exc()
+    path = result_path(function, case, Path(folder))
+    store(path, case, result, error, time.perf_counter() - begin)
+
+
+def store(
+    path: Path, case: Case, result: Mapping[str, Any] | None, error: str, seconds: float
+) -> None:
+    """Write what became of a case: its result, or the traceback of its failure."""
+    content = {"version": __version__, "case": dict(case), "seconds": seconds, "error": error}
+    write_json(path, {**content, "result": result})
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """What is stored of a case, its ``error`` empty if it succeeded; empty if none, or damaged."""
+    try:
+        return dict(read_json(path))
+    except (InputError, TypeError, ValueError):
+        return {}
