@@ -74,3 +74,72 @@ def score(
     with bars() as progress:
         done = scoring.grade(declared, truth, strain, out, progress=progress)
     scoring.print_grading(done, out)
+
+
+def star(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the set.", metavar="DIR")],
+    noise: Annotated[
+        list[float] | None,
+        typer.Option("--noise", help="Share of full scale [0.01]; once for each level."),
+    ] = None,
+    bits: Annotated[int, typer.Option("--bits", help="Of the noisy images.")] = 8,
+    seed: Annotated[int, typer.Option("--seed", help="Of speckle and noise.")] = 0,
+    rows: Annotated[int, typer.Option("--rows", help="Of the images, odd.")] = 501,
+    cols: Annotated[int, typer.Option("--cols", help="Of the images.")] = 4000,
+) -> None:
+    """Make the star images of DIC Challenge 2.0: a wave whose period grows along the image.
+
+    Exact ones, and for each level of noise three as a camera's: before, the same without motion,
+    after. Its displacement is a formula, in README.md and star.json beside them.
+    """
+    from modeharvest.validation.resolution.star import Star, fine_speckle
+    from modeharvest.validation.resolution.star_set import StarSpec, make_star_set
+
+    levels = tuple(noise) if noise else (0.01,)
+    spec = StarSpec(Star(rows, cols), fine_speckle(seed), levels, bits, seed)
+    with bars() as progress:
+        made = make_star_set(spec, out, progress)
+    residual = made.info["law"]["residual_of_inversion_px"]
+    print(f"star {made.id}: {len(made.info['files'])} images of {rows} x {cols} px in {out}")
+    print(f"largest residual of the inverse mapping {residual:.1e} px")
+
+
+def resolution(
+    fields: Annotated[
+        list[Path],
+        typer.Argument(metavar="FIELD...", help="Measured on the deformed image, by any code."),
+    ],
+    folder: Annotated[Path, typer.Option("--set", help="The star's folder.", metavar="DIR")],
+    out: OutFolder,
+    still: Annotated[
+        list[Path] | None,
+        typer.Option("--still", help="Measured without motion; once for each FIELD, in order."),
+    ] = None,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
+    ] = None,
+    y_axis: Annotated[
+        list[str] | None,
+        typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
+    ] = None,
+    first_pixel: Annotated[
+        list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
+    ] = None,
+) -> None:
+    """Grade fields measured on the star: finest period, noise floor, metrological efficiency.
+
+    All in px. --y-axis and --first-pixel count for all fields, or are given once for each FIELD;
+    its --still has the same. Leaves report.html, resolution.json and resolution.csv in DIR.
+    """
+    from modeharvest.scoring import declarations
+    from modeharvest.validation.resolution.graded import grade_star, print_star_grading
+
+    declared = declarations(fields, name, None, y_axis, first_pixel, column)
+    quiet = declarations(still, name, None, y_axis, first_pixel, column) if still else {}
+    with bars() as progress:
+        done = grade_star(declared, quiet, folder, out, progress)
+    print_star_grading(done, out)

@@ -50,7 +50,8 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
 for family, commands in _FAMILIES.items():
     for command in commands:
         app.command(rich_help_panel=family)(command)
-benchmark_app.command()(benchmark.make)
+for command in (benchmark.make, benchmark.star, benchmark.resolution):
+    benchmark_app.command()(command)
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 
 

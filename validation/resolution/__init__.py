@@ -1,0 +1,1 @@
+"""Resolution: how fine a structure a measurement still shows, and what noise that costs."""
