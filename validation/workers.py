@@ -10,11 +10,12 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -121,6 +122,16 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
         os.environ.update(before)
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Processes begun in here never hear Ctrl-C, which is for this one; it hears it afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start_server(function: str) -> None:
     """Start the process that workers are forks of; it goes on importing what they need."""
     if not _FORKS:
@@ -129,7 +140,8 @@ def _start_server(function: str) -> None:
     if "mpi4py.MPI" not in sys.modules:  # of this process, so the function's module has no MPI:
         modules.append(function.partition(":")[0])  # once begun, it can't be forked
     multiprocessing.get_context("forkserver").set_forkserver_preload(modules)
-    with _environment(_ONE_THREAD):
+    resource_tracker.ensure_running()  # which the server needs and which lets interrupts through
+    with _environment(_ONE_THREAD), _interrupts_held():
         forkserver.ensure_running()
 
 
@@ -152,6 +164,7 @@ def _processes(function: str, count: int, memory: str) -> Iterator[Any]:
             threads_per_worker=1,
             memory_limit=memory,
             dashboard_address=None,
+            silence_logs=logging.ERROR,
         ) as cluster,
         Client(cluster) as client,  # type: ignore[no-untyped-call]
     ):
