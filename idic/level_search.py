@@ -135,13 +135,23 @@ class LevelSearch:
             partial(self._equations, assembly),
             step_length(self.ansatz, assembly.grid, assembly.mask, self.factor),
             start,
-            self.options,
+            self._limits(assembly),
             tolerance,
             self.factor,
             self.on_iteration,
             curvature,
             self.least,
         )
+
+    def _limits(self, assembly: Assembly) -> GaussNewtonOptions:
+        """The options, whose share of pixels that may leave is one of the whole material.
+
+        Those left out at g's border and at its holes are not to weigh as if they had left.
+        """
+        rows = assembly.mask.any(axis=1)
+        kept = assembly.mask.sum() / max(1, self.pair.mask[rows].sum())
+        most = min(1.0, self.options.max_left / kept) if kept > 0 else self.options.max_left
+        return replace(self.options, max_left=most)
 
     def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
         return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)

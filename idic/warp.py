@@ -112,7 +112,8 @@ def _pass(
 
 @compiled(relaxed=True)
 def _land(n: int, own: Any, allowed: Any, kept: Any) -> None:
+    last_row, last_col = allowed.shape[0] - 1, allowed.shape[1] - 1
     for m in range(n):
-        i, j = int(np.rint(own[AT_ROW, m])), int(np.rint(own[AT_COL, m]))
-        if 0 <= i < allowed.shape[0] and 0 <= j < allowed.shape[1]:
-            kept[int(own[COLUMN, m])] = allowed[i, j]
+        row, col = own[AT_ROW, m], own[AT_COL, m]
+        if 0 <= row <= last_row and 0 <= col <= last_col:
+            kept[int(own[COLUMN, m])] = allowed[int(np.rint(row)), int(np.rint(col))]

@@ -29,6 +29,22 @@ _LINES = 16
 _NEGLIGIBLE = 1e-18
 
 
+def border_reach(order: int, share: float) -> int:
+    """How far from an image's border what lies beyond it is felt by more than a share [px].
+
+    A spline passes through every pixel whatever continues the image, but between the pixels the
+    continuation is felt: by a factor of the largest pole, 0.43 or 0.27, less with every pixel.
+
+    Parameters
+    ----------
+    order
+        3 or 5.
+    share
+        Of what is felt at the border itself [-].
+    """
+    return int(np.ceil(np.log(share) / np.log(max(abs(pole) for pole in _POLES[order]))))
+
+
 def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[Any]:
     """Coefficients of the spline of order 3 or 5 that passes through every pixel.
 

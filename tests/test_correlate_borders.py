@@ -76,17 +76,19 @@ def test_without_those_that_land_at_the_border_the_error_is_that_of_float_images
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_strip_that_leaves_the_image_does_not_pull(seed: int) -> None:
-    """Without any mask; what leaves is counted, and what stays has no bias worth a hundredth px.
+    """Without any mask: what leaves is counted, and what lands at the border takes no part.
 
-    Not the error of float images: pixels that land within 10 px of the border are sampled from
-    a spline that continues the image by its mirror image there.
+    Pixels that land within 8 px of the border would be sampled from a spline that feels the
+    mirror image beyond it: with them the displacement was off by 4e-3 to 5e-3 px.
     """
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.start(STRAIN))
+    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.start(STRAIN), options=TIGHT)
     assert found.outcome is Outcome.CONVERGED
-    assert 0.05 * GRID.rows * GRID.cols < (landing() < 0).sum()
-    assert found.left_image == pytest.approx((landing() < 0).sum(), abs=3)
-    assert found.left_image + found.pixels == GRID.rows * GRID.cols
-    assert error_px(found.displacement(), landing() >= 0) < 0.01
+    left, at_border = landing() < 0, (landing() >= 0) & (landing() < 7.5)
+    assert 0.05 * GRID.rows * GRID.cols < left.sum()
+    assert found.left_image == pytest.approx(left.sum(), abs=3)
+    assert found.pixels == pytest.approx((~left & ~at_border).sum(), rel=1e-3)
+    # By then the border's pull has fallen to 0.43^7.5 = 0.002 of those 5e-3 px.
+    assert error_px(found.displacement(), ~left) < 1e-5
 
 
 @pytest.mark.parametrize("seed", SEEDS)
