@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.errors import InputError
 from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.prefilter import spline_coefficients
+from modeharvest.imaging.taps import quintic_at
 
 FloatArray = NDArray[np.float64]
 
@@ -118,42 +119,9 @@ def cubic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @compiled(inline=True, relaxed=True)
-def quintic_weights(t: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Weights of the 6 taps -2 ... 3 and their derivatives, at the fraction 0 <= t <= 1."""
-    s = 1.0 - t
-    t2, s2 = t * t, s * s
-    t4, s4 = t2 * t2, s2 * s2
-    n, m = 1.0 / 120.0, 1.0 / 24.0
-    w = (
-        n * s4 * s,
-        n * (26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))),
-        n * (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))),
-        n * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))),
-        n * (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))),
-        n * t4 * t,
-    )
-    d = (
-        -m * s4,
-        m * (-10.0 + t * (8.0 + t * (12.0 + t * (-16.0 + 5.0 * t)))),
-        m * t * (-24.0 + t2 * (24.0 - 10.0 * t)),
-        -m * s * (-24.0 + s2 * (24.0 - 10.0 * s)),
-        -m * (-10.0 + s * (8.0 + s * (12.0 + s * (-16.0 + 5.0 * s)))),
-        m * t4,
-    )
-    return w, d
-
-
-@compiled(inline=True, relaxed=True)
 def _dot4(c: Any, i: int, j: int, w: Any) -> float:
     total: float = w[0] * c[i, j] + w[1] * c[i + 1, j] + w[2] * c[i + 2, j] + w[3] * c[i + 3, j]
     return total
-
-
-@compiled(inline=True, relaxed=True)
-def _dot6(c: Any, i: int, j: int, w: Any) -> float:
-    low: float = w[0] * c[i, j] + w[1] * c[i + 1, j] + w[2] * c[i + 2, j]
-    high: float = w[3] * c[i + 3, j] + w[4] * c[i + 4, j] + w[5] * c[i + 5, j]
-    return low + high
 
 
 @compiled(inline=True, relaxed=True)
@@ -178,18 +146,8 @@ def sample_cubic(c: Any, row: float, col: float) -> tuple[float, float, float]:
 def sample_quintic(c: Any, row: float, col: float) -> tuple[float, float, float]:
     """(value, d_row, d_col) at a position inside the image [px]."""
     i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
-    wr, dr = quintic_weights(row - i)
-    wc, dc = quintic_weights(col - j)
-    i, j = i + PAD - 2, j + PAD - 2
-    a0, a1, a2 = _dot6(c, i, j, wr), _dot6(c, i, j + 1, wr), _dot6(c, i, j + 2, wr)
-    a3, a4, a5 = _dot6(c, i, j + 3, wr), _dot6(c, i, j + 4, wr), _dot6(c, i, j + 5, wr)
-    b0, b1, b2 = _dot6(c, i, j, dr), _dot6(c, i, j + 1, dr), _dot6(c, i, j + 2, dr)
-    b3, b4, b5 = _dot6(c, i, j + 3, dr), _dot6(c, i, j + 4, dr), _dot6(c, i, j + 5, dr)
-    return (
-        a0 * wc[0] + a1 * wc[1] + a2 * wc[2] + a3 * wc[3] + a4 * wc[4] + a5 * wc[5],
-        b0 * wc[0] + b1 * wc[1] + b2 * wc[2] + b3 * wc[3] + b4 * wc[4] + b5 * wc[5],
-        a0 * dc[0] + a1 * dc[1] + a2 * dc[2] + a3 * dc[3] + a4 * dc[4] + a5 * dc[5],
-    )
+    found: tuple[float, float, float] = quintic_at(c, i + PAD - 2, j + PAD - 2, row - i, col - j)
+    return found
 
 
 @compiled(relaxed=True)

@@ -7,16 +7,18 @@ import pytest
 from scipy import ndimage
 
 from modeharvest.errors import InputError
-from modeharvest.imaging.interpolation import (
-    SplineImage,
-    cubic_weights,
-    quintic_weights,
-)
+from modeharvest.imaging.interpolation import SplineImage, cubic_weights
+from modeharvest.imaging.taps import SLOPES, WEIGHTS
 
 
 @pytest.fixture(scope="module")
 def noise() -> np.ndarray:
     return np.random.default_rng(0).normal(size=(30, 41))
+
+
+def quintic_weights(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Their polynomials; the last two lanes are no taps."""
+    return t ** np.arange(6) @ WEIGHTS, t ** np.arange(5) @ SLOPES
 
 
 @pytest.mark.parametrize(("weights", "first"), [(cubic_weights, -1), (quintic_weights, -2)])
