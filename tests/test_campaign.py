@@ -85,7 +85,8 @@ def scheduler() -> Iterator[str]:
         import sys, time
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from distributed import LocalCluster
-        with LocalCluster(1, processes=False, protocol="tcp", dashboard_address=None) as cluster:
+        options = dict(processes=False, protocol="tcp", dashboard_address=None)
+        with LocalCluster(n_workers=1, threads_per_worker=1, **options) as cluster:
             print(cluster.scheduler_address, flush=True)
             sys.stdin.read()
     """)
@@ -119,7 +120,7 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
     monkeypatch.undo()
 
     # It dies in the fifth of eight cases.
-    monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(workers, "_PATIENCE_S", 2.0)  # to see that it is gone
     campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=list(range(8))), tmp_path)
     with pytest.raises(InputError, match="went away; 4 of 8 are done and kept"):
         campaign.run(elsewhere)
