@@ -174,7 +174,7 @@ def _fluctuation(component: int) -> Callable[[Atlas, int], Figure]:
 def _residual(atlas: Atlas, k: int) -> Figure:
     sheet = atlas.fine_sheet
     residual = sheet.sample(atlas.comparisons[k].residual)
-    return fields.draw_field(sheet, residual, Scale.signed(residual, "–", 0.99), total(atlas, k))
+    return fields.draw_field(sheet, residual, Scale.signed(residual, "", 0.99), total(atlas, k))
 
 
 def _length_of(name: str) -> Callable[[Atlas, int], Figure]:

@@ -24,6 +24,7 @@ from modeharvest.validation.style import (
     MUTED,
     SIGNED,
     SIZE,
+    draw_path,
     figure,
     scale_bar,
     style,
@@ -48,7 +49,7 @@ class Scale:
     low, high
         Its ends, in ``unit``.
     unit
-        As written on the colour bar.
+        As written above the colour bar; "" for a number without one.
     extend
         Whether values lie beyond the ends: "neither", "min", "max" or "both".
     """
@@ -56,7 +57,7 @@ class Scale:
     colours: Colormap
     low: float
     high: float
-    unit: str
+    unit: str = ""
     extend: str = "neither"
 
     @classmethod
@@ -95,8 +96,7 @@ def draw_field(
     """
     with style():
         drawn, axes = _map(sheet)
-        edge = _edge(sheet, motion)
-        axes.add_patch(edge)
+        edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
         X, Y = sheet.moved_corners(motion)
         quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
                                 norm=scale.normalise, rasterized=True)  # fmt: skip
@@ -128,8 +128,8 @@ def draw_image(
     with style():
         drawn, axes = _map(sheet)
         _show_grey(axes, sheet, image, material, grid)
-        axes.add_patch(_outlined(sheet.outline.path(displacement)))
-        colour_bar(drawn, axes, Scale(GREY, 0.0, 1.0, "–"))
+        _draw_edge(axes, sheet.outline.path(displacement))
+        colour_bar(drawn, axes, Scale(GREY, 0.0, 1.0))
     return drawn
 
 
@@ -137,11 +137,11 @@ def draw_shape(sheet: Sheet, motion: Motion) -> Figure:
     """Draw the specimen's outline deformed over the undeformed one; no colour bar."""
     with style():
         drawn, axes = _map(sheet)
-        axes.add_patch(PathPatch(sheet.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
-                                 clip_on=False))  # fmt: skip
+        draw_path(axes, sheet.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
+                  clip_on=False)  # fmt: skip
         deformed = sheet.outline.path(sheet.moved_nodes(motion))
-        axes.add_patch(PathPatch(deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False))
-        axes.add_patch(PathPatch(deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False))
+        draw_path(axes, deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False)
+        draw_path(axes, deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False)
     return drawn
 
 
@@ -159,8 +159,7 @@ def draw_blend(
         drawn, axes = _map(sheet, width=3.2)
         # Gone where the field is opaque, or slivers of it would show along the holes.
         _show_grey(axes, sheet, image, material, grid, dissolve=True)
-        edge = _edge(sheet, motion)
-        axes.add_patch(edge)
+        edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
         X, Y = sheet.moved_corners(motion)
         colours = scale.colours(scale.normalise(values))
         colours[..., 3] *= _ramp(values.shape)
@@ -184,12 +183,9 @@ def _map(sheet: Sheet, width: float = WIDTH) -> tuple[Figure, Axes]:
     return drawn, axes
 
 
-def _edge(sheet: Sheet, motion: Motion | None) -> PathPatch:
-    return _outlined(sheet.outline.path(sheet.moved_nodes(motion)))
-
-
-def _outlined(path: Path) -> PathPatch:
-    return PathPatch(path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False, zorder=1.5)
+def _draw_edge(axes: Axes, path: Path) -> PathPatch:
+    return draw_path(axes, path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False,
+                     zorder=1.5)  # fmt: skip
 
 
 def colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:

@@ -101,7 +101,8 @@ def write_report(
         ],
         numbers=words.number_rows(summary),
         modes=words.mode_rows(summary),
-        notes=words.notes(summary),
+        reservations=words.notes(summary),
+        timings={k: v for k, v in summary["timings_s"].items() if k != "validate"},
     )  # fmt: skip
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")

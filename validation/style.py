@@ -21,6 +21,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -114,6 +116,17 @@ SIZE = mpl.colormaps["viridis"]
 DENSITY = mpl.colormaps["magma"]
 GLOW = mpl.colormaps["inferno"]
 GREY = mpl.colormaps["gray"]
+
+
+def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:
+    """Draw a path into axes whose limits are set by other means; returns its patch.
+
+    Unlike ``Axes.add_patch`` it does not seek the extent of every curved piece: on a specimen's
+    outline that takes longer than drawing it.
+    """
+    patch = PathPatch(path, **looks)
+    axes.add_artist(patch)
+    return patch
 
 
 def scale_bar(axes: Axes, length: float, text: str) -> None:

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
@@ -22,7 +21,7 @@ from modeharvest.validation.harvest.run import HarvestedFrame
 from modeharvest.validation.plots_fields import Scale
 from modeharvest.validation.plots_path import draw_density, pattern_density
 from modeharvest.validation.sheet import Sheet
-from modeharvest.validation.style import GLOW, GOLD, style
+from modeharvest.validation.style import GLOW, GOLD, draw_path, style
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -43,7 +42,7 @@ def draw_deformed(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
     with style():
         path = sheet.outline.path(moved)
         axes, bar = drawn.axes
-        axes.add_patch(PathPatch(path, fill=False, ec=GOLD, lw=0.7, rasterized=True, zorder=2))
+        draw_path(axes, path, fill=False, ec=GOLD, lw=0.7, rasterized=True, zorder=2)
         bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in atlas.levels])
         bar.set_title("levels", fontsize=8, pad=6, loc="left")
     return drawn
@@ -109,7 +108,7 @@ def draw_residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
     """Draw f - g(x + u) in the deformed configuration, single pixels."""
     full = atlas.harvest.full_scale
     values = np.asarray(_residual(atlas, frame) / (full or 1.0), dtype=np.float64)
-    scale = Scale.signed(values, "–" if full else "levels", 0.99)
+    scale = Scale.signed(values, "" if full else "levels", 0.99)
     return fields.draw_field(atlas.sheet(FINE), values, scale, atlas.motion(frame))
 
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from modeharvest.idic.calibration.result import Calibration
@@ -18,7 +18,18 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.harvest.atlas import HarvestAtlas
 from modeharvest.validation.harvest.run import HarvestedFrame
 from modeharvest.validation.plots_fields import WIDTH, Scale, colour_bar
-from modeharvest.validation.style import BLUE, GOLD, GREEN, GREY, INK, RED, SIZE, figure, style
+from modeharvest.validation.style import (
+    BLUE,
+    GOLD,
+    GREEN,
+    GREY,
+    INK,
+    RED,
+    SIZE,
+    draw_path,
+    figure,
+    style,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -44,8 +55,7 @@ def draw_reference(atlas: HarvestAtlas) -> Figure:
         axes.imshow(joined, extent=cells.extent, cmap=GREY, vmin=0.0, vmax=1.0,
                     interpolation="antialiased", rasterized=True, aspect="auto")  # fmt: skip
         axes.set(xlim=harvest.grid.extent[:2], ylim=harvest.grid.extent[2:])
-        axes.add_patch(PathPatch(atlas.outline.path(), fill=False, ec=GOLD, lw=0.9,
-                                 rasterized=True))  # fmt: skip
+        draw_path(axes, atlas.outline.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
         shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
         if harvest.lattice is not None:
             shown += _draw_lattice(axes, harvest.lattice, harvest.grid)
@@ -77,7 +87,7 @@ def draw_closeup(atlas: HarvestAtlas, frame: HarvestedFrame) -> Figure:
         axes.imshow(part, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, rasterized=True,
                     interpolation="antialiased", aspect="auto")  # fmt: skip
         path = atlas.outline.path(atlas.sheet().moved_nodes(motion))
-        axes.add_patch(PathPatch(path, fill=False, ec=GOLD, lw=1.1, rasterized=True))
+        draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
         axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return drawn
 

@@ -30,7 +30,7 @@ from modeharvest.validation.style import to_svg
 
 __all__ = ["Harvest", "HarvestedFrame", "harvest_summary", "write_harvest_report"]
 
-TEMPLATE = "harvest_report.html"
+TEMPLATE = "harvest/report.html"
 
 
 def write_harvest_report(

@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Polygon
-from matplotlib.path import Path
+from matplotlib.patches import Polygon
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
@@ -18,7 +17,17 @@ from modeharvest.fem.field import Mesh
 from modeharvest.validation.lattice.patch import Patch
 from modeharvest.validation.outline import Outline
 from modeharvest.validation.plots_fields import Scale, colour_bar
-from modeharvest.validation.style import BLUE, GLOW, INK, MUTED, RED, figure, scale_bar, style
+from modeharvest.validation.style import (
+    BLUE,
+    GLOW,
+    INK,
+    MUTED,
+    RED,
+    draw_path,
+    figure,
+    scale_bar,
+    style,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -53,7 +62,9 @@ def draw_lattice(
     F = np.eye(2) if gradient is None else np.asarray(gradient)
     with style():
         drawn, axes = _window(patch, pitch)
-        _fill(axes, patch.outline.path(moved))
+        outline = patch.outline.path(moved)
+        draw_path(axes, outline, fc=BLUE, ec="none", alpha=0.28)
+        draw_path(axes, outline, fill=False, ec=BLUE, lw=0.7)
         corners = (patch.cell_corners - patch.centre) @ F.T + patch.centre
         axes.add_patch(Polygon(corners, fill=False, ec=RED, lw=1.3, ls=(0, (4, 2)), zorder=3))
     return drawn
@@ -90,8 +101,7 @@ def draw_growth(patch: Patch, shape: FloatArray, amplitude: float, pitch: float)
         net = Triangulation(nodes[:, 0], nodes[:, 1], triangles)
         shading = axes.tripcolor(net, length / pitch, shading="gouraud", cmap=scale.colours,
                                  norm=scale.normalise, rasterized=True)  # fmt: skip
-        edge = PathPatch(path, fill=False, ec="none", rasterized=True)
-        axes.add_patch(edge)
+        edge = draw_path(axes, path, fill=False, ec="none", rasterized=True)
         shading.set_clip_path(edge)
         colour_bar(drawn, axes, scale)
     return drawn
@@ -121,9 +131,9 @@ def draw_overlay(
     with style():
         drawn, axes = _frame(high - low)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.add_patch(PathPatch(grey, fc=MUTED, ec="none", alpha=0.45, clip_on=False))
-        axes.add_patch(PathPatch(black, fc=INK, ec="none", alpha=0.14, clip_on=False))
-        axes.add_patch(PathPatch(black, fill=False, ec=INK, lw=1.1, clip_on=False))
+        draw_path(axes, grey, fc=MUTED, ec="none", alpha=0.45, clip_on=False)
+        draw_path(axes, black, fc=INK, ec="none", alpha=0.14, clip_on=False)
+        draw_path(axes, black, fill=False, ec=INK, lw=1.1, clip_on=False)
         scale_bar(axes, 0.5 * pitch, "l/2")
     return drawn
 
@@ -147,8 +157,3 @@ def _frame(size: FloatArray, width: float = WIDTH, share: float = 0.98) -> tuple
     axes = drawn.add_axes((0.01, _MARGIN / height, share, tall / height))
     axes.set_axis_off()
     return drawn, axes
-
-
-def _fill(axes: Axes, path: Path) -> None:
-    axes.add_patch(PathPatch(path, fc=BLUE, ec="none", alpha=0.28))
-    axes.add_patch(PathPatch(path, fill=False, ec=BLUE, lw=0.7))

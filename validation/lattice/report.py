@@ -37,7 +37,7 @@ from modeharvest.validation.style import to_svg
 
 __all__ = ["CriticalPoint", "FoundPattern", "LatticeRun", "write_lattice_report"]
 
-TEMPLATE = "lattice_report.html"
+TEMPLATE = "lattice/report.html"
 CELLS = 4
 """Unit cells along the side of a picture's window."""
 VISIBLE = 0.12
