@@ -26,6 +26,7 @@ from modeharvest.studies.case import StudyCase, read_study, shipped_studies
 from modeharvest.studies.pipeline import StudyPipeline
 from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.case_run import run_case
+from modeharvest.validation.studies import noise_causes
 from modeharvest.validation.studies import robustness_findings as told
 from modeharvest.validation.studies.factors import FACTORS, Setting
 from modeharvest.validation.studies.noise import Noise, one_realisation
@@ -187,7 +188,28 @@ def test_what_no_noise_moves_does_not_count() -> None:
     assert np.isnan(more.covered[3:]).all()
 
 
-def test_noise_study_on_tiny_images(subject: Subject, folder: Path) -> None:
+def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
+    subject: Subject, folder: Path
+) -> None:
+    """And softer with one, if only a little where w is short against a speckle."""
+    scene = Scene.open(folder, subject.describe(folder, 0.128))
+    result = scene.correlate()
+    seen = noise_causes.Seen.of(scene, result, scene.pair())
+    # Chosen at the end itself, not a step before it.
+    assert seen.used.sum() == pytest.approx(result.pixels, rel=0.01)
+    explained = seen.explained(result)
+    left = result.residual(explained.reference, explained.deformed)[seen.used]
+    assert np.abs(left).max() < 1e-6  # float32
+    stiff, soft = (np.sqrt(np.diag(s.softness(result))) for s in (explained, seen))
+    gauss_newton = np.sqrt(np.diag(result.inverse))
+    assert stiff == pytest.approx(gauss_newton, rel=0.05)  # other pixels, at the edges
+    assert (soft > stiff).mean() > 0.9
+
+
+def test_noise_study_on_tiny_images(
+    subject: Subject, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noise_causes, "EXAMPLES", 3)
     study = Noise(levels=(0.002,), pairs=2)
     cases = study.prepare(subject, folder)
     assert len(cases) == 5
@@ -199,7 +221,8 @@ def test_noise_study_on_tiny_images(subject: Subject, folder: Path) -> None:
     assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
     assert 0.6 < summary.loc["u", "rms error / bound"] < 1.6
     assert len(found.attachments["Each unknown"]) == 77
-    assert {"ratio", "bias", "coverage", "unknowns", "maps"} == {p.name for p in found.plots}
+    plots = {"causes", "ratio", "bias", "coverage", "unknowns", "maps"}
+    assert plots == {p.name for p in found.plots}
     # n and -n push the other way: what is common to them is of second order.
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
     assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)

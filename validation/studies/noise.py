@@ -19,7 +19,8 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies import noise_findings as told
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.noise_fields import Points
+from modeharvest.validation.studies.noise_causes import LADDER, Seen, covariances
+from modeharvest.validation.studies.noise_fields import PARTS, Points
 from modeharvest.validation.studies.study import Findings, require_different
 from modeharvest.validation.studies.subject import Images, Scene, Subject
 
@@ -131,24 +132,40 @@ def one_realisation(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     -------
     dict
         ``unknowns``; ``told``, their standard deviations by the result's own covariance given
-        the noise, and ``told_fields``, the same of the fields at
-        :class:`~modeharvest.validation.studies.noise_fields.Points`. Without noise they are the
-        Cramér–Rao bound for noise of 1, and what the truth says is there, too.
+        the noise, followed by those of the fields at
+        :class:`~modeharvest.validation.studies.noise_fields.Points`. Without noise a list of
+        them for each of the ``LADDER``, for noise of 1, and what the truth says. ``give_mm``, how
+        far the displacement gives way by the cost's own curvature, without noise and in the first
+        realisation of each level.
     """
     scene, level = Scene.open(folder, case["subject"]), float(case["level"])
-    result = scene.correlate(pair=_noisy(scene, case) if level else None)
-    # Of exact images: 2 s^2 M^-1 without the corrections that noise in M asks for.
-    covariance = result.covariance(level) if level else 2.0 * result.inverse
-    extra = {} if level else against_truth(scene, result)
-    return {
+    images = _noisy(scene, case) if level else scene.pair()
+    result = scene.correlate(pair=images)
+    found = {
         "outcome": result.outcome.value,
         "iterations": result.iterations,
         "residual": result.residual_rms,
-        **extra,
         "unknowns": result.unknowns.tolist(),
-        "told": _shortened(np.sqrt(np.diag(covariance))),
-        "told_fields": _shortened(_told_fields(scene, result, covariance)),
     }
+    if not level:
+        return found | against_truth(scene, result) | _without_noise(scene, result, case["seed"])
+    if case["pair"] == 0 and case["sign"] == 1:
+        found["give_mm"] = _give(scene, result, images)
+    return found | {"told": _told(scene, result, result.covariance(level))}
+
+
+def _without_noise(scene: Scene, result: Result, seed: int) -> dict[str, Any]:
+    found = covariances(scene, result, seed)
+    return {
+        "told": [_told(scene, result, found[name]) for name in LADDER],
+        "give_mm": _give(scene, result, scene.pair()),
+    }
+
+
+def _give(scene: Scene, result: Result, images: Images) -> float:
+    """Rms over the points of u's standard deviation by the covariance H⁻¹ [mm]."""
+    soft = Seen.of(scene, result, images).softness(result)
+    return float(np.sqrt((_told_fields(scene, result, soft)[:, PARTS["u"]] ** 2).mean()))
 
 
 def _noisy(scene: Scene, case: Mapping[str, Any]) -> Images:
@@ -159,14 +176,19 @@ def _noisy(scene: Scene, case: Mapping[str, Any]) -> Images:
     return f + sign * n_f, g + sign * n_g
 
 
+def _told(scene: Scene, result: Result, covariance: FloatArray) -> list[float]:
+    """Standard deviations of the unknowns and of the fields, in the order of ``Points``.
+
+    Five digits are enough, and a third of the file.
+    """
+    fields = _told_fields(scene, result, covariance)
+    both = np.concatenate([np.sqrt(np.diag(covariance)), fields.ravel()])
+    return [float(f"{value:.5g}") for value in both]
+
+
 def _told_fields(scene: Scene, result: Result, covariance: FloatArray) -> FloatArray:
-    """In the order of ``Points``."""
+    """(points, 7)."""
     points = Points.of(scene)
     errors = field_errors(result, points.x[:, None], points.y[:, None], covariance)
     parts = (errors.displacement, errors.v0, errors.v[0][..., None], errors.fluctuation[0])
     return np.concatenate([part[:, 0] for part in parts], axis=-1)
-
-
-def _shortened(values: FloatArray) -> list[float]:
-    """Five digits are enough for a standard deviation, and a third of the file."""
-    return [float(f"{value:.5g}") for value in values.ravel()]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -17,7 +20,43 @@ from modeharvest.validation.style import BLUE, GOLD, GREEN, MUTED, RED, SIGNED, 
 FloatArray = NDArray[np.float64]
 
 LABELS = {"u": "u", "v0": "v₀", "v1": "v₁", "v1 phi1": "v₁φ₁"}
+SERIES: dict[str, dict[str, Any]] = {
+    "u": {"color": BLUE, "marker": "o"},
+    "v0": {"color": GREEN, "marker": "s"},
+    "v1": {"color": GOLD, "marker": "^"},
+    "v1 phi1": {"color": RED, "marker": "D"},
+}
 _TARGETS = {"ratio": 1.0, "bias": 0.0, "coverage": 0.95}
+
+
+def draw_causes(causes: pd.DataFrame, made: str) -> Plot:
+    """Draw rms over bound: what one cause after another predicts, and what is measured."""
+    place = np.arange(len(causes))
+    predicted = causes["what"].str.startswith("measured").argmax()
+    with style():
+        drawn = figure(9.6, 3.0)
+        axes = drawn.add_subplot()
+        axes.axvspan(predicted - 0.5, place[-1] + 0.5, color=MUTED, alpha=0.08, linewidth=0)
+        for n, name in enumerate(PARTS):
+            axes.plot(place + 0.09 * (n - 1.5), causes[name], linestyle="none", markersize=5,
+                      label=LABELS[name], **SERIES[name])  # fmt: skip
+        axes.axhline(1.0, color=MUTED, linestyle=":", linewidth=1)
+        axes.axhline(causes["u"][predicted - 1], color=BLUE, linestyle=":", linewidth=1)
+        axes.set_xticks(place, [_wrapped(what) for what in causes["what"]])
+        axes.set(xlim=(-0.5, place[-1] + 0.5), ylabel="rms / bound [-]")
+        axes.legend(frameon=False, fontsize=7.5, ncols=4, loc="upper left")
+        drawn.tight_layout()
+    caption = (
+        f"Over the Cramér–Rao bound: to the left what is predicted from exact images, one cause "
+        f"after another; shaded, what is measured; {made}. Dotted: the bound, and the least that "
+        "this estimator can do for u."
+    )
+    return Plot("causes", "What each cause adds", drawn, caption, wide=True)
+
+
+def _wrapped(words: str) -> str:
+    """On lines of a few words."""
+    return textwrap.fill(words, 15)
 
 
 def draw_levels(
@@ -29,12 +68,12 @@ def draw_levels(
         drawn = figure(4.6, 2.7)
         axes = drawn.add_subplot()
         axes.axhline(_TARGETS[what], color=MUTED, linestyle=":", linewidth=1)
-        for n, (name, colour) in enumerate(zip(PARTS, (BLUE, GREEN, GOLD, RED), strict=True)):
+        for n, name in enumerate(PARTS):
             shares: list[Share] = [getattr(levels[level][name], what) for level in at]
             value, error = np.array([(s.value, s.error) for s in shares]).T
             beside = 1.0 + 0.02 * (n - 1.5)
-            axes.errorbar(100.0 * at * beside, value, error, color=colour, marker="o",
-                          markersize=3, capsize=2, linewidth=1, label=LABELS[name])  # fmt: skip
+            axes.errorbar(100.0 * at * beside, value, error, markersize=4, capsize=2,
+                          linewidth=1, label=LABELS[name], **SERIES[name])  # fmt: skip
         axes.set(xscale="log", xlabel="noise [% of full scale]", ylabel=label)
         ticks = [f"{100 * level:g}" for level in at]
         axes.set_xticks(100.0 * at, ticks)
@@ -55,12 +94,12 @@ def draw_unknowns(pairs: Pairs, names: Sequence[str], level: float, made: str) -
         scatter = 1.0 / np.sqrt(2.0 * count)
         above.axhspan(1 - 2 * scatter, 1 + 2 * scatter, color=BLUE, alpha=0.12, linewidth=0)
         above.plot(place, pairs.ratios, ".", color=BLUE)
-        above.set_ylabel("rms error / bound")
+        above.set_ylabel("rms error / least [-]")
         spread = np.sqrt(0.95 * 0.05 / count)
         below.axhspan(0.95 - 2 * spread, min(1.0, 0.95 + 2 * spread), color=GREEN, alpha=0.15,
                       linewidth=0)  # fmt: skip
         below.plot(place, pairs.covered, ".", color=GREEN)
-        below.set_ylabel("intervals that hold")
+        below.set_ylabel("intervals that hold [-]")
         _name_families(below, names)
         drawn.tight_layout()
     caption = (
@@ -80,17 +119,18 @@ def draw_maps(parts: Mapping[str, Pairs], points: Points, level: float, made: st
         for column, name in enumerate(PARTS):
             pairs = parts[name]
             ratio = np.sqrt((pairs.ratios**2).mean(axis=-1))
-            rows = ((ratio, (0.6, 1.4), "rms error / bound"),
-                    (pairs.covered.mean(axis=-1), (0.88, 1.02), "intervals that hold"))  # fmt: skip
+            hold = pairs.covered.mean(axis=-1)
+            rows = ((ratio, (0.6, 1.4), "rms error / least [-]"),
+                    (hold, (0.88, 1.02), "intervals that hold [-]"))  # fmt: skip
             for axes, (values, limits, label) in zip(grid[:, column], rows, strict=True):
                 image = _map(axes, points.map(values), extent, limits)
                 axes.set_title(f"{LABELS[name]}", fontsize=8)
                 if column == len(PARTS) - 1:
                     _bar(drawn, image, axes, label)
     caption = (
-        f"At {100 * level:g} % of noise; {made}. Above: rms error over bound, 1 is white; below: "
-        "share of the 95 % intervals that hold, 0.95 is white. Both components of a vector "
-        "together."
+        f"At {100 * level:g} % of noise; {made}. Above: rms error over the least that this "
+        "estimator can do, 1 is white; below: share of the 95 % intervals that hold, "
+        "0.95 is white. Both components of a vector together."
     )
     return Plot("maps", "Maps over the material", drawn, caption, wide=True)
 

@@ -68,6 +68,10 @@ class Pairs:
         """Some of the quantities: those where ``part``, of the bound's shape, is True."""
         return Pairs(self.errors[:, :, part], self.told[:, :, part], self.bound[part])
 
+    def against(self, factor: FloatArray) -> Pairs:
+        """The same errors, bound and error bars ``factor`` (...) as large."""
+        return Pairs(self.errors, factor * self.told, factor * self.bound)
+
     # -- each quantity by itself; NaN for what does not count ---------------------------------
 
     @property

@@ -181,14 +181,18 @@ class Scene:
     def correlate(self, start: FloatArray | None = None, pair: Images | None = None) -> Result:
         """Correlate the pair, or a noisy one, from the standard start or another."""
         f, g = self.pair() if pair is None else pair
-        mask, deformed_mask = _masks(self.images.folder, self.strain)
+        mask, deformed_mask = self.masks()
         begin = self.start() if start is None else start
         grid, options = self.images.grid, self.how.options()
         return correlate(f, g, grid, self.ansatz, begin, mask, deformed_mask, options)
 
+    def masks(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(rows, cols) True on material, of the reference and of the deformed image."""
+        return _masks(self.images.folder, self.strain)
+
     def mask(self) -> NDArray[np.bool_]:
         """(rows, cols) True on material of the reference."""
-        return _masks(self.images.folder, self.strain)[0]
+        return self.masks()[0]
 
 
 def _description(folder: Path, name: str) -> dict[str, Any]:

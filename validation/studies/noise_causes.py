@@ -1,0 +1,154 @@
+"""Why noise scatters a measurement by more than the Cramér–Rao bound, one cause after another.
+
+A measurement ends where the gradient of the cost vanishes. Noise pushes that gradient, with a
+covariance V, and the unknowns give way by the inverse of the cost's curvature H: their covariance
+is H⁻¹VH⁻¹. With noise s in both images, to first order in s:
+
+===============  ================  ==========================================================
+name             covariance / s²   what it takes into account
+===============  ================  ==========================================================
+bound            2 M⁻¹             M = JᵀJ: the ansatz describes everything, and nothing shrinks
+det F            M⁻¹ V₀ M⁻¹        and where the material has shrunk, pixels share the noise of g
+curvature        H⁻¹ V₀ H⁻¹        and what the ansatz leaves over makes the cost softer
+least            H⁻¹ V H⁻¹         and the gradient of g's noise pushes there, too
+===============  ================  ==========================================================
+
+The last is the least that this estimator can do. Further up, noise is not weak any more: the
+gradient of g's own noise is no longer small against the speckle's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.error_bars import noise_covariance, softness
+from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.pyramid import Level, prepare
+from modeharvest.idic.result import Result
+from modeharvest.idic.warp import landed
+from modeharvest.validation.studies.subject import Images, Scene
+
+FloatArray = NDArray[np.float64]
+
+CAUSES = ("bound", "det F", "curvature", "least")
+"""Each with all that stand before it."""
+SOFTENED = "softened"
+"""2 H⁻¹MH⁻¹, the curvature only: what :func:`modeharvest.idic.error_bars.softened` knows of."""
+LADDER = (*CAUSES, SOFTENED)
+EXAMPLES = 24
+"""Of the noise, for V; each counts as many times as there are unit cells."""
+_WEAK = 0.01
+"""Noise of the examples [fraction of full scale]; only its linear effect is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a result was found with.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) f, and g continued into its holes [grey levels].
+    used
+        (rows, cols) True on the pixels that count.
+    order
+        Of the spline.
+    """
+
+    reference: NDArray[np.float32]
+    deformed: NDArray[np.float32]
+    used: NDArray[np.bool_]
+    order: int
+
+    @classmethod
+    def of(cls, scene: Scene, result: Result, images: Images) -> Seen:
+        """What a correlation of images of this scene compared at its end."""
+        options, grid = scene.how.options(), result.grid
+        full = Level(1, 0.0)
+        pair = prepare(*images, grid, *scene.masks(), full, options.edge_px, options.order)
+        used, everything = pair.mask, Assembly(result.ansatz, grid, pair.mask)
+        if pair.allowed is not None:
+            a = result.unknowns
+            used = landed(everything, a, pair.reference, pair.deformed, pair.allowed)
+        row, col = np.indices(grid.shape, dtype=np.float64)
+        deformed = pair.deformed.sample(row, col)[0].astype(np.float32)
+        return cls(pair.reference, deformed, used, options.order)
+
+    def explained(self, result: Result) -> Seen:
+        """The same without a residual: f is what g says that it is."""
+        left = result.residual(self.reference, self.deformed, self.order)
+        f = np.where(self.used, self.reference - left, self.reference).astype(np.float32)
+        return replace(self, reference=f)
+
+    def softness(self, result: Result) -> FloatArray:
+        """(n, n) H⁻¹."""
+        return softness(result, self.reference, self.deformed, self.used, self.order)
+
+    def by_noise_of_g(self, result: Result, cell: float, seed: int) -> FloatArray:
+        """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone.
+
+        Parameters
+        ----------
+        result
+            Of these images.
+        cell
+            Edge of the blocks that are pushed independently [mm].
+        seed
+            Of the examples.
+        """
+        found = noise_covariance(
+            result, self.reference, self.deformed, self._noises(seed), self.used, cell,
+            self.order, result.inverse,
+        )  # fmt: skip
+        return np.asarray(found / _WEAK**2, dtype=np.float64)
+
+    def _noises(self, seed: int) -> Iterator[Images]:
+        rng = np.random.default_rng([seed, EXAMPLES])
+        none = np.zeros_like(self.reference)
+        for _ in range(EXAMPLES):
+            noise = rng.standard_normal(none.shape, dtype=np.float32)
+            yield none, np.float32(_WEAK) * noise
+
+
+def covariances(scene: Scene, result: Result, seed: int) -> dict[str, FloatArray]:
+    """The (n, n) covariances of the unknowns for noise of 1 in both images, by their causes.
+
+    Parameters
+    ----------
+    scene, result
+        A pair of exact images, and what was found of it.
+    seed
+        Of the examples of noise.
+
+    Returns
+    -------
+    dict
+        For each of ``CAUSES`` and ``SOFTENED``; infinite on the diagonal where the images say
+        nothing.
+    """
+    seen, cell = Seen.of(scene, result, scene.pair()), scene.specimen.pitch
+    lost = np.isinf(np.diag(result.inverse))
+    at = np.ix_(~lost, ~lost)
+    inverse, soft = result.inverse[at], seen.softness(result)[at]
+    M = np.linalg.inv(inverse)
+    # Noise in f pushes by s²M, noise in g by what its examples do.
+    V0, V = (
+        M + M @ images.by_noise_of_g(result, cell, seed)[at] @ M
+        for images in (seen.explained(result), seen)
+    )
+    known = {
+        "bound": 2.0 * inverse,
+        "det F": inverse @ V0 @ inverse,
+        "curvature": soft @ V0 @ soft,
+        "least": soft @ V @ soft,
+        SOFTENED: 2.0 * soft @ M @ soft,
+    }
+    found = {}
+    for name, covariance in known.items():
+        found[name] = np.diag(np.where(lost, np.inf, 0.0))
+        found[name][at] = covariance
+    return found
