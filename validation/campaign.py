@@ -142,8 +142,7 @@ class Campaign:
         for future in as_completed(futures):  # type: ignore[no-untyped-call]
             case = futures[future]
             if future.status == "error":
-                failure = f"{type(future.exception()).__name__}: {future.exception()}"
-                store(self.path(case), case, None, failure, 0.0)
+                store(self.path(case), case, None, _said(future.exception()), 0.0)
             elif future.status != "finished":
                 done = len(self.cases) - len(self.missing())
                 raise InputError(
@@ -177,6 +176,15 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
             raise InputError(f"expected different values of {name!r}, got {list(values)}")
     combinations = itertools.product(*axes.values())
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)
+
+
+def _said(failure: BaseException) -> str:
+    """Why a case could not even fail by itself."""
+    from distributed import KilledWorker
+
+    if isinstance(failure, KilledWorker):
+        return "KilledWorker: its workers died; it may need more memory than they are given"
+    return f"{type(failure).__name__}: {failure}"
 
 
 def _write(table: pd.DataFrame, folder: Path) -> None:

@@ -164,7 +164,7 @@ def _processes(function: str, count: int, memory: str) -> Iterator[Any]:
             threads_per_worker=1,
             memory_limit=memory,
             dashboard_address=None,
-            silence_logs=logging.ERROR,
+            silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,  # type: ignore[no-untyped-call]
     ):
