@@ -14,14 +14,9 @@ what makes the set anew:
 
 ``noise``
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
-    full scale, squared]; in each image's entry ``noise_sd`` is its root mean over the material.
-``saturated_px``, ``doubly_covered_px``
-    In each image's entry: material pixels at the highest level, and pixels inside more than one
-    element, where the specimen overlaps.
-``light``
-    In each image's entry, if the light flickers: the factor on its irradiance.
-``quadrature``
-    In each image's entry, if the sensor averages: points a pixel and their error's bound.
+    full scale, squared].
+``reference``, ``snapshots``
+    Of each image what :mod:`modeharvest.imaging.exposure` tells.
 ``warnings``
     Sentences about what makes the images other than what a camera would show.
 
@@ -33,8 +28,6 @@ For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -49,15 +42,15 @@ import modeharvest
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
-from modeharvest.imaging.distorted import Positions, render_seen, seen_points
-from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.undistort import CameraDistortion
+from modeharvest.imaging.exposure import Camera
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.integrate import Scene, integrate
-from modeharvest.imaging.io import read_image, read_mask, write_image
+from modeharvest.imaging.integrate import Scene
+from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.imaging.isoparametric import Located, locate
-from modeharvest.imaging.render import Rendering, Truth, render_deformed, render_reference
+from modeharvest.imaging.render import Truth, render_deformed, render_reference
 from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.set_key import FORMAT, image_key, sha256_of
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
 from modeharvest.imaging.truth import read_truth, write_truth
@@ -68,9 +61,6 @@ BoolArray = NDArray[np.bool_]
 
 __all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
 
-FORMAT = "modeharvest-images-1"
-PIXELS = 3
-"""Counts the changes of the code that changed a pixel, if only by rounding."""
 SIDECAR = "images.json"
 _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
 
@@ -177,22 +167,6 @@ class ImageSet:
         )
 
 
-def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
-    """Digest everything that the images depend on, hexadecimal."""
-    digest = hashlib.sha256()
-    wanted = {"format": FORMAT, "pixels": PIXELS, "spec": asdict(spec),
-              "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
-    digest.update(json.dumps(wanted, sort_keys=True).encode())
-    if isinstance(spec.distortion, str):
-        read_distortion(spec.distortion)  # says what is wrong with it
-        digest.update(_sha256(Path(spec.distortion)).encode())
-    for array in (solution.mesh.nodes, solution.mesh.cells):
-        digest.update(array.tobytes())
-    for strain in strains:
-        digest.update(np.ascontiguousarray(solution.at(strain).displacement).tobytes())
-    return digest.hexdigest()
-
-
 def is_complete(folder: Path | str, key: str, *, verify: bool = False) -> bool:
     """Whether ``folder`` holds a finished set of that key, with all files of the listed sizes.
 
@@ -206,7 +180,7 @@ def is_complete(folder: Path | str, key: str, *, verify: bool = False) -> bool:
         for name, entry in info["files"].items():
             if (folder / name).stat().st_size != entry["bytes"]:
                 return False
-            if verify and _sha256(folder / name) != entry["sha256"]:
+            if verify and sha256_of(folder / name) != entry["sha256"]:
                 return False
     except (InputError, OSError, KeyError, TypeError):
         return False
@@ -243,16 +217,16 @@ def make_images(
         file name, or the disk refuses.
     """
     folder = Path(folder)
-    labels = [_label(s) for s in strains]
-    if not labels or len(set(labels)) < len(labels):
+    labels = {_label(s) for s in strains}
+    if not labels or len(labels) < len(strains):
         raise InputError(f"expected strains that differ by 0.01 % or more, got {list(strains)}")
     key = image_key(solution, strains, spec)
     if is_complete(folder, key):
         return ImageSet.read(folder)
     _discard(folder)
-    info = _write_set(solution, list(zip(strains, labels, strict=True)), spec, folder, progress)
+    info = _write_set(solution, strains, spec, folder, progress)
     names = [n for e in (info["reference"], *info["snapshots"]) for n in _file_names(e)]
-    files = {n: {"bytes": (folder / n).stat().st_size, "sha256": _sha256(folder / n)}
+    files = {n: {"bytes": (folder / n).stat().st_size, "sha256": sha256_of(folder / n)}
              for n in names}  # fmt: skip
     write_json(folder / SIDECAR, {"format": FORMAT, "key": key, **info, "files": files})
     progress(1, 1, "images")
@@ -261,30 +235,28 @@ def make_images(
 
 def _write_set(
     solution: Solution,
-    wanted: list[tuple[float, str]],
+    strains: Sequence[float],
     spec: ImagingSpec,
     folder: Path,
     progress: Progress,
 ) -> dict[str, Any]:
     """Write all files but the sidecar, and return the sidecar's content."""
-    steps = 1 + len(wanted)
+    steps = 1 + len(strains)
     progress(0, steps, "images: reference")
     mesh = solution.mesh
-    grid = choose_grid(solution, [strain for strain, _ in wanted], spec)
+    grid = choose_grid(solution, strains, spec)
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
     scene = Scene(mesh, None, grid, speckle, spec.background, "undeformed mesh")
-    lens = spec.lens(grid.shape)
-    points = None if lens is None else seen_points(lens, grid.shape)
+    camera = Camera.of(spec, grid.shape, folder)
     ideal = render_reference(located, speckle, spec.background)
-    shown = _through_lens(ideal, scene, points)
-    reference = _write_rendering(folder, "reference", "mask.tif", shown, scene, spec)
+    reference = camera.expose(ideal, scene, "reference", "mask.tif")
     snapshots = []
-    for k, (strain, label) in enumerate(wanted):
+    for k, strain in enumerate(strains):
         progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         where = f"snapshot at strain {strain:.4f}"
         moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
-        entry = _write_snapshot(moved, strain, label, located, points, spec, folder)
+        entry = _write_snapshot(camera, moved, strain, located)
         snapshots.append({"branch": solution.at(strain).branch, **entry})
     residuals = [s["inverse_map_max_residual_px"] for s in snapshots]
     constant, slope = spec.sensor.noise_model(spec.bits)
@@ -303,13 +275,7 @@ def _write_set(
 
 
 def _write_snapshot(
-    scene: Scene,
-    strain: float,
-    label: str,
-    located_reference: Located,
-    points: Positions | None,
-    spec: ImagingSpec,
-    folder: Path,
+    camera: Camera, scene: Scene, strain: float, located_reference: Located
 ) -> dict[str, Any]:
     """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
     assert scene.displacement is not None
@@ -317,55 +283,14 @@ def _write_snapshot(
         scene.mesh, scene.displacement, located_reference, scene.grid, scene.speckle,
         scene.background, scene.where,
     )  # fmt: skip
-    name, truth_name = f"deformed_{label}", f"truth_{label}.h5"
-    shown = _through_lens(ideal, scene, points)
-    images = _write_rendering(folder, name, f"{name}_mask.tif", shown, scene, spec)
-    write_truth(folder / truth_name, truth, strain, scene.grid)
+    name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
+    images = camera.expose(ideal, scene, name, f"{name}_mask.tif")
+    write_truth(camera.folder / truth_name, truth, strain, scene.grid)
     return {
         "nominal_strain": float(strain),
         **images,
         "truth": truth_name,
         "inverse_map_max_residual_px": float(np.nanmax(truth.residual_px)),
-    }
-
-
-def _through_lens(ideal: Rendering, scene: Scene, points: Positions | None) -> Rendering:
-    """What a lens shows that sees ``points`` at its pixels; None is a perfect lens."""
-    if points is None:
-        return ideal
-    shown = render_seen(
-        scene.mesh, scene.displacement, scene.grid, points, scene.speckle, scene.background,
-        scene.where,
-    )  # fmt: skip
-    return replace(shown, doubly_covered=ideal.doubly_covered)
-
-
-def _write_rendering(
-    folder: Path, name: str, mask_name: str, seen: Rendering, scene: Scene, spec: ImagingSpec
-) -> dict[str, Any]:
-    """Write what the sensor makes of an image; return the entry in the sidecar."""
-    sensor, mask, irradiance = spec.sensor, seen.mask, seen.image
-    entry: dict[str, Any] = {}
-    if not sensor.aperture.is_point:
-        averaged, quadrature = integrate(scene, sensor.aperture, mask)
-        irradiance = averaged.astype(np.float32)
-        entry["quadrature"] = asdict(quadrature)
-    if sensor.flicker > 0.0:
-        irradiance = np.float32(sensor.light(name)) * irradiance
-        entry["light"] = sensor.light(name)
-    mean, levels = sensor.mean(irradiance), sensor.expose(irradiance, spec.bits, name)
-    camera_name = f"{name}_{spec.bits}bit.tif"
-    write_image(folder / f"{name}.tif", mean)
-    write_image(folder / camera_name, levels)
-    write_image(folder / mask_name, mask)
-    variance = sensor.noise_variance(mean[mask], spec.bits)
-    return entry | {
-        "image": f"{name}.tif",
-        "camera_image": camera_name,
-        "mask": mask_name,
-        "noise_sd": float(np.sqrt(variance.mean())),
-        "saturated_px": sensor.saturated(levels[mask], spec.bits),
-        "doubly_covered_px": seen.doubly_covered,
     }
 
 
@@ -393,11 +318,6 @@ def _discard(folder: Path) -> None:
 
 def _label(strain: float) -> str:
     return f"{round(1e4 * strain):04d}"
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions() -> dict[str, str]:

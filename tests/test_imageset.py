@@ -11,7 +11,7 @@ import pytest
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.imaging import imageset
+from modeharvest.imaging import set_key
 from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
@@ -134,7 +134,7 @@ def test_key_depends_on_the_sensor_and_on_the_code_that_makes_pixels(
 ) -> None:
     keys = {image_key(plate(), STRAINS, SPEC)}
     keys.add(image_key(plate(), STRAINS, replace(SPEC, sensor=Sensor(read_noise=0.01))))
-    monkeypatch.setattr(imageset, "PIXELS", imageset.PIXELS + 1)
+    monkeypatch.setattr(set_key, "PIXELS", set_key.PIXELS + 1)
     keys.add(image_key(plate(), STRAINS, SPEC))
     assert len(keys) == 3
 
