@@ -16,14 +16,8 @@ from scipy import ndimage
 
 from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.fields.subsets import (
-    WHERE,
-    SubsetOptions,
-    predicted_sd,
-    pyvale_python,
-    speckle_area,
-    subset_field,
-)
+from modeharvest.idic.fields.subset_sd import predicted_sd, speckle_area
+from modeharvest.idic.fields.subsets import WHERE, SubsetOptions, pyvale_python, subset_field
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -111,7 +105,7 @@ def test_predicted_errors_are_those_of_white_noise_in_ideal_subsets() -> None:
     x, y = GRID.to_mm(*np.array(centres * 40).T.astype(float))
     field = LocalField(x, y, np.zeros((len(x), 2)))
     mask = np.ones(GRID.shape, dtype=bool)
-    sd = predicted_sd(f, mask, GRID, field, np.array(correlations), SubsetOptions(subset_px=n))
+    sd = predicted_sd(f, mask, GRID, field, np.array(correlations), n)
     # White noise has one value a pixel, not one a speckle: that factor apart, 3 % of 960 values.
     white = np.sqrt(np.mean(sd**2, axis=0) / speckle_area(f - f.mean(), mask))
     np.testing.assert_allclose(white, scatter, rtol=0.08)

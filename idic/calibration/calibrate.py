@@ -21,10 +21,11 @@ from scipy import ndimage
 from skimage.registration import phase_cross_correlation
 
 from modeharvest.errors import InputError
-from modeharvest.idic.calibration.fit import Fit, Pose, View, fit_views, lit_alike, with_poses
+from modeharvest.idic.calibration.fit import Fit, fit_views
 from modeharvest.idic.calibration.model import PolynomialModel
 from modeharvest.idic.calibration.noise import sampled_noise
 from modeharvest.idic.calibration.result import Calibration, DegreeTrial, calibration_of
+from modeharvest.idic.calibration.views import Pose, View, lit_alike, with_poses
 from modeharvest.idic.inputs import require_contrast
 from modeharvest.imaging.interpolation import SplineImage
 from modeharvest.progress import Progress, silent

@@ -15,9 +15,10 @@ from scipy import ndimage
 from scipy.optimize import least_squares
 
 from modeharvest.errors import InputError
-from modeharvest.idic.calibration.fit import Fit, Pose, View, fit_views, lit_alike
+from modeharvest.idic.calibration.fit import Fit, fit_views
 from modeharvest.idic.calibration.model import CameraModel, DistortionModel, PolynomialModel
 from modeharvest.idic.calibration.noise import sampled_noise
+from modeharvest.idic.calibration.views import Pose, View, lit_alike
 from modeharvest.idic.inputs import require_contrast
 from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.distortion.undistort import CameraDistortion

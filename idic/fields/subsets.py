@@ -29,6 +29,7 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.fields.coarse_field import CELL_PX, coarse_field
 from modeharvest.idic.fields.files import read_field
 from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.subset_sd import predicted_sd
 from modeharvest.idic.fields.tables import read_table
 from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen
 from modeharvest.idic.start.motion import first_motion
@@ -142,7 +143,7 @@ def subset_field(
     -------
     LocalField
         Subsets below the threshold are kept as not valid. The standard deviations are those of
-        :func:`predicted_sd`.
+        :func:`modeharvest.idic.fields.subset_sd.predicted_sd`.
 
     Raises
     ------
@@ -171,7 +172,7 @@ def subset_field(
             if results:
                 field = read_field(results[0], grid)
                 correlation = read_table(results[0])["cost_zncc"]
-                sd = predicted_sd(f, inside, grid, field, correlation, options)
+                sd = predicted_sd(f, inside, grid, field, correlation, options.subset_px)
                 return replace(field, sd=sd, source=f"pyvale, subsets of {options.subset_px} px")
     raise InputError(f"subset DIC: expected a result of pyvale, got none: {reason}")
 
@@ -185,69 +186,6 @@ def _largest_motion(
     rough = coarse_field(f, g, grid, cell, known, mask, landing)
     most = float(np.quantile(np.abs(rough.u).max(axis=1), _MOST)) / grid.pixel_size
     return int(np.ceil(_MARGIN * most)) + 4
-
-
-def predicted_sd(
-    reference: NDArray[Any],
-    mask: BoolArray,
-    grid: PixelGrid,
-    field: LocalField,
-    correlation: FloatArray,
-    options: SubsetOptions,
-) -> FloatArray:
-    """Standard deviations that the grey levels left over predict, (n, 2) [mm].
-
-    The zero-normalised correlation C of a subset tells what is left between its two images,
-    2 (1 − C) of their variance. Were it white noise, the displacement's covariance would be that
-    times (Σ ∇f ∇fᵀ)⁻¹ over the subset. Much of it is not white: it is what an affine subset can't
-    follow, and is alike over a speckle. It is counted as one independent value per
-    ``speckle_area`` pixels, the area of f's autocorrelation.
-
-    Parameters
-    ----------
-    reference
-        (rows, cols) f.
-    mask
-        (rows, cols) True on material.
-    grid
-        The pixels.
-    field
-        The subsets' centres.
-    correlation
-        (n,) C of each [-]; NaN where lost.
-    options
-        Size of the subsets.
-    """
-    f = np.where(mask, np.asarray(reference, np.float64) - float(reference[mask].mean()), 0.0)
-    n = options.subset_px
-
-    def summed(image: FloatArray) -> FloatArray:
-        return np.asarray(ndimage.uniform_filter(image, n, mode="constant")) * n**2
-
-    down, right = np.gradient(f)
-    down, right = np.where(mask, down, 0.0), np.where(mask, right, 0.0)
-    row, col = (np.rint(i).astype(int) for i in grid.to_px(field.x, field.y))
-    xx, xy, yy, count, one, two = (
-        summed(i)[row, col] for i in (right**2, right * down, down**2, mask.astype(float), f, f**2)
-    )
-    variance = np.maximum(two / count - (one / count) ** 2, 0.0)
-    left = 2.0 * np.clip(1.0 - correlation, 0.0, None) * variance * speckle_area(f, mask)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = xx * yy - xy**2
-        cov = left[:, None] * np.column_stack([yy, xx]) / determinant[:, None]
-        return np.asarray(grid.pixel_size * np.sqrt(cov))
-
-
-def speckle_area(image: FloatArray, mask: BoolArray) -> float:
-    """Area of the autocorrelation of a mean-free image over a mask, to its half height [px]."""
-    size = 32
-    product = np.zeros(size)
-    for k in range(size):
-        both = mask[:, k:] & mask[:, : mask.shape[1] - k]
-        product[k] = float(np.mean((image[:, k:] * image[:, : image.shape[1] - k])[both]))
-    below = np.flatnonzero(product < 0.5 * product[0])
-    radius = float(below[0]) if len(below) else float(size)
-    return float(max(1.0, np.pi * radius**2))
 
 
 def _seeds(mask: BoolArray, subset_px: int) -> list[tuple[int, int]]:

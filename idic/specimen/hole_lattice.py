@@ -1,8 +1,7 @@
 """The lattice on which the holes of a cellular specimen lie, found from their centres.
 
-Neighbours repeat: the vectors from hole to hole gather around the lattice's own. Two of them,
-the shortest that are not parallel, span it. Walking from each hole to its neighbours then counts
-every hole, (i, j), also where the lattice is bent or holes are missing.
+Two vectors span it (:mod:`modeharvest.idic.specimen.lattice_basis`). Walking from each hole to its
+neighbours then counts every hole, (i, j), also where the lattice is bent or holes are missing.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from scipy.spatial import Delaunay, KDTree
 
 from modeharvest.errors import InputError
 from modeharvest.idic.specimen.holes import Holes, find_holes
+from modeharvest.idic.specimen.lattice_basis import spanning_vectors
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -130,7 +130,9 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
             "border don't count): a mask with no lattice in it; give the cellular region instead"
         )
     spots = holes.centres * _FLIP
-    vectors = _spanning(spots)
+    vectors = spanning_vectors(spots)
+    if vectors is None:
+        raise _no_lattice(len(holes), "they lie in one row")
     index, known = _counted(spots, vectors)
     if known.mean() < _MOST or known.sum() < 4 or np.ptp(index[known], axis=0).min() == 0:
         raise _no_lattice(len(holes), f"only {known.sum()} are where neighbours say")
@@ -165,60 +167,6 @@ def require_cell_size(lattice: HoleLattice, cell_px: float) -> None:
             f"the image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or the "
             "pixel size"
         )
-
-
-def _spanning(spots: FloatArray) -> FloatArray:
-    """(2, 2) the shortest lattice vectors, (up, right), to the right and upwards."""
-    tree = KDTree(spots)
-    distance, neighbour = tree.query(spots, k=min(9, len(spots)))
-    nearest = float(np.median(distance[:, 1]))
-    steps = (spots[neighbour] - spots[:, None])[(distance > 0) & (distance < 1.7 * nearest)]
-    steps = np.concatenate([steps, -steps])
-    gathered = KDTree(steps)
-    near = gathered.query_ball_point(steps, _NEAR * nearest)
-    crowd = np.array([len(k) for k in near])
-    # Of two equally frequent steps, the shorter one.
-    order = np.lexsort([np.linalg.norm(steps, axis=1).round(6), -crowd])
-    first = steps[near[order[0]]].mean(axis=0)
-    for k in order:
-        second = steps[near[k]].mean(axis=0)
-        if _sine(first, second) > 0.5:
-            return _oriented(_reduced(first, second))
-    raise _no_lattice(len(spots), "they lie in one row")
-
-
-def _sine(a: FloatArray, b: FloatArray) -> float:
-    return abs(float(_cross(a, b))) / float(np.linalg.norm(a) * np.linalg.norm(b))
-
-
-def _cross(a: FloatArray, b: FloatArray) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
-
-
-def _reduced(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lagrange's reduction: the shortest two vectors that span the same lattice."""
-    while True:
-        if a @ a > b @ b:
-            a, b = b, a
-        turns = np.round((a @ b) / (a @ a))
-        if turns == 0.0:
-            return a, b
-        b = b - turns * a
-
-
-def _oriented(basis: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Choose i to the right and j upwards; of three directions 60 degrees apart, the best two."""
-    a, b = basis
-    third = a - b if a @ b > 0 else a + b
-    candidates = [a, b]
-    if np.linalg.norm(third) < 1.2 * np.linalg.norm(b):
-        candidates.append(third)
-    candidates += [-v for v in candidates]
-    unit = [v / np.linalg.norm(v) for v in candidates]
-    # A slight preference for the upper one settles ties.
-    i = int(np.argmax([u[1] + 1e-3 * u[0] for u in unit]))
-    j = int(np.argmax([u[0] + 1e-3 * u[1] if _sine(u, unit[i]) > 0.5 else -1.0 for u in unit]))
-    return np.stack([candidates[i], candidates[j]])
 
 
 def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
