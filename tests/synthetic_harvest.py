@@ -10,7 +10,6 @@ import numpy as np
 from manufactured import image_pair, reference_points, speckle
 from numpy.typing import NDArray
 
-from modeharvest.harvest.timeline import Moment, find_buckling
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.calibration.result import Calibration, DegreeTrial
 from modeharvest.idic.chebyshev import Box
@@ -32,6 +31,7 @@ from modeharvest.validation.harvest.run import (
     HarvestTruth,
     TruthRow,
 )
+from modeharvest.validation.harvest.timeline import Moment, find_buckling
 
 FloatArray = NDArray[np.float64]
 

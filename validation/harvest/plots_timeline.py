@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from modeharvest.idic.identifiability import OBSERVABLE
-from modeharvest.validation.harvest.run import BucklingPoint, TimePoint
+from modeharvest.validation.harvest.timeline import Buckling, Moment
 from modeharvest.validation.plots_path import curve, say
 from modeharvest.validation.style import BLUE, GOLD, GREEN, INK, MUTED, RED, style
 
@@ -22,7 +22,7 @@ _COLOURS = (BLUE, RED, GREEN, GOLD)
 _DASHES = (0, (3, 2))
 
 
-def draw_timeline(moments: Sequence[TimePoint], buckling: BucklingPoint | None) -> Figure:
+def draw_timeline(moments: Sequence[Moment], buckling: Buckling | None) -> Figure:
     """Draw the pattern's amplitude over the strain, above what it has to stand out of.
 
     Parameters
@@ -120,7 +120,7 @@ def _band(axes: Axes, strain: FloatArray, top: FloatArray, colour: str, name: st
     axes.plot(strain, top, color=colour, lw=0.8)
 
 
-def _mark(axes: Axes, buckling: BucklingPoint, strain: FloatArray, size: FloatArray, top: float
+def _mark(axes: Axes, buckling: Buckling, strain: FloatArray, size: FloatArray, top: float
           ) -> None:  # fmt: skip
     """The strains between which the pattern appears, and where its growth points back to."""
     if np.isfinite(buckling.before) and np.isfinite(buckling.after):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,58 +22,11 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.specimen.hole_lattice import HoleLattice
 from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation.harvest.timeline import Buckling, Moment
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
-
-
-class TimePoint(Protocol):
-    """One image of a test, as :class:`modeharvest.harvest.timeline.Moment`."""
-
-    @property
-    def name(self) -> str:
-        """Of the image."""
-
-    @property
-    def strain(self) -> float:
-        """Mean nominal compression of the cellular part [-]."""
-
-    @property
-    def amplitude_px(self) -> float:
-        """Rms of v1 phi1 per component [px]."""
-
-    @property
-    def leftover_px(self) -> float:
-        """What the ansatz leaves over, rms per component [px]."""
-
-    @property
-    def noise_px(self) -> float:
-        """Standard deviation of v1 phi1 by the images' noise, rms per component [px]."""
-
-    @property
-    def has_pattern(self) -> bool:
-        """Whether the pattern stands out of both."""
-
-
-class BucklingPoint(Protocol):
-    """When the pattern appears, as :class:`modeharvest.harvest.timeline.Buckling`."""
-
-    @property
-    def before(self) -> float:
-        """Strain of the last image without a pattern [-]; NaN if there is none."""
-
-    @property
-    def after(self) -> float:
-        """Strain of the first image with one [-]; NaN if there is none."""
-
-    @property
-    def estimate(self) -> float:
-        """Strain that the pattern's growth points back to [-]; NaN if not known."""
-
-    @property
-    def sentence(self) -> str:
-        """That in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +227,8 @@ class Harvest:
     noise_source: str
     lattice: HoleLattice | None = None
     skipped: tuple[tuple[str, str], ...] = ()
-    timeline: Sequence[TimePoint] = ()
-    buckling: BucklingPoint | None = None
+    timeline: Sequence[Moment] = ()
+    buckling: Buckling | None = None
     calibration: Calibration | None = None
     distortion: Distortion | None = None
     full_scale: float | None = None

@@ -16,7 +16,6 @@ from modeharvest.harvest.measure import Measured
 from modeharvest.harvest.optics import Optics
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import Prepared
-from modeharvest.harvest.timeline import Moment, find_buckling, mean_strain
 from modeharvest.idic.agreement import Agreement, autocorrelation
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.error_bars import (
@@ -35,6 +34,7 @@ from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.pyramid import eroded
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.harvest.run import Harvest, HarvestedFrame, HarvestTruth, PartSpectrum
+from modeharvest.validation.harvest.timeline import Moment, find_buckling, mean_strain
 
 FloatArray = NDArray[np.float64]
 
