@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +96,7 @@ class LevelSearch:
             history += rough.history
             if rough.outcome is Outcome.CONVERGED:
                 start = rough.unknowns
-                curvature = rough.curvature * (assembly.mask.sum() / some.mask.sum())
+                curvature = rough.curvature * (assembly.pixels / some.pixels)
         for _ in range(_ROUNDS):
             found = self._minimise(assembly, start, self.tolerance_px, curvature)
             history += found.history
@@ -104,7 +104,7 @@ class LevelSearch:
             if self.pair.allowed is None:
                 break
             assembly = self._landed(start)
-            if (assembly.mask != used.mask).sum() <= _SETTLED * assembly.mask.sum():
+            if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
                 break
         return replace(found, history=history), used
 
@@ -120,9 +120,14 @@ class LevelSearch:
     def _everything(self) -> Assembly:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
 
+    @cached_property
+    def _material(self) -> NDArray[np.int64]:
+        """(rows,) pixels of the level's mask."""
+        return np.asarray(np.count_nonzero(self.pair.mask, axis=1))
+
     def _thinned(self, assembly: Assembly) -> Assembly:
         """One row of a few, if that leaves plenty of pixels."""
-        if assembly.mask.sum() < _STRIDE * _PLENTY * self.ansatz.size:
+        if assembly.pixels < _STRIDE * _PLENTY * self.ansatz.size:
             return assembly
         rows = np.zeros_like(assembly.mask)
         rows[_STRIDE // 2 :: _STRIDE] = assembly.mask[_STRIDE // 2 :: _STRIDE]
@@ -148,8 +153,8 @@ class LevelSearch:
 
         Those left out at g's border and at its holes are not to weigh as if they had left.
         """
-        rows = assembly.mask.any(axis=1)
-        kept = assembly.mask.sum() / max(1, self.pair.mask[rows].sum())
+        rows = np.diff(assembly.runs.row_start) > 0
+        kept = assembly.pixels / max(1, self._material[rows].sum())
         most = min(1.0, self.options.max_left / kept) if kept > 0 else self.options.max_left
         return replace(self.options, max_left=most)
 
@@ -174,8 +179,13 @@ def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -
     some, x, y = mask[np.ix_(rows, cols)], grid.x[cols], grid.y[rows]
     per_px = factor / grid.pixel_size
 
+    @lru_cache(maxsize=2)
+    def displacement(a: bytes) -> FloatArray:
+        """Where one step ends the next one begins."""
+        return ansatz.displacement(np.frombuffer(a), x, y)
+
     def length(a: FloatArray, b: FloatArray) -> float:
-        change = ansatz.displacement(b, x, y) - ansatz.displacement(a, x, y)
+        change = displacement(b.tobytes()) - displacement(a.tobytes())
         squares = (change[some] ** 2).sum(axis=-1)
         return float(np.sqrt(squares.mean()) * per_px) if squares.size else 0.0
 

@@ -9,7 +9,7 @@ mode families then make from it the matrix of the unknowns.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -101,6 +101,11 @@ class Assembly:
     def runs(self) -> Runs:
         """Where the pixels that count are."""
         return runs_of(self.mask)
+
+    @cached_property
+    def pixels(self) -> int:
+        """How many pixels count."""
+        return int((self.runs.stop - self.runs.first).sum())
 
     @cached_property
     def _degrees(self) -> list[int]:
@@ -201,8 +206,8 @@ class Assembly:
         left = np.zeros(BANDS, dtype=np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
         side_by_side(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
-        off, pixels = int(left.sum()), int((runs.stop - runs.first).sum())
-        return self._from_moments(pairs, moments.sum(axis=0), pixels - off, off)
+        off = int(left.sum())
+        return self._from_moments(pairs, moments.sum(axis=0), self.pixels - off, off)
 
     def _from_moments(
         self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int
@@ -220,7 +225,13 @@ class Assembly:
 
 def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
     """Sum e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
+    a, b, c, d = _sums_and_differences(degree, other)
+    return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
+
+
+@cache
+def _sums_and_differences(degree: int, other: int) -> tuple[NDArray[np.int64], ...]:
+    """Give i + k, |i - k|, j + l and |j - l| for all (i, j) and (k, l)."""
     i, j = np.array(orders(degree)).T[:, :, None]
     k, m = np.array(orders(other)).T[:, None, :]
-    a, b, c, d = i + k, abs(i - k), j + m, abs(j - m)
-    return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
+    return i + k, abs(i - k), j + m, abs(j - m)

@@ -110,7 +110,7 @@ def new_block(tables: Any, degree: int, fields: int) -> Block:
     """Make room for a block, with Chebyshev polynomials up to a degree of at least 1."""
     n, w = tables.v.shape[0], tables.waves.shape[0]
     return Block(
-        np.empty((12, BLOCK)), np.empty((tables.along_x.shape[0], BLOCK)),
+        np.zeros((12, BLOCK)), np.empty((tables.along_x.shape[0], BLOCK)),
         np.empty((degree + 1, BLOCK)), np.empty(degree + 1),
         np.empty((n, 3, BLOCK)), np.empty((w, 2, BLOCK)), np.empty((fields, BLOCK)),
     )  # fmt: skip
@@ -175,7 +175,8 @@ def displace_block(row: int, n: int, tables: Any, block: Any) -> None:
     _chebyshev_block(block.along_x[0], n, T)
     for k in range(2):
         _series_block(tables.v0[k], eta_T, T, n, own[U_X + k])
-        _series_block(tables.brightness[k], eta_T, T, n, own[GAIN + k])
+        if tables.gain_field or tables.offset_field:
+            _series_block(tables.brightness[k], eta_T, T, n, own[GAIN + k])
     for i in range(modes.shape[0]):
         _series_block(tables.v[i], eta_T, T, n, modes[i, 2])
     _modes_block(row, n, tables, block.along_x, modes, block.waves)
@@ -204,12 +205,28 @@ def _series_block(C: Any, eta_T: Any, T: Any, n: int, out: Any) -> None:
     degree = C.shape[0] - 1
     for m in range(n):
         out[m] = 0.0
-    for a in range(degree + 1):
-        along = 0.0
-        for b in range(degree - a + 1):
-            along += C[a, b] * eta_T[b]
+    a = 0
+    while a + 2 <= degree:  # three terms a time: less to read and write
+        T0, T1, T2 = T[a], T[a + 1], T[a + 2]
+        c0, c1 = _along(C[a], eta_T, degree - a), _along(C[a + 1], eta_T, degree - a - 1)
+        c2 = _along(C[a + 2], eta_T, degree - a - 2)
         for m in range(n):
-            out[m] += along * T[a, m]
+            out[m] += c0 * T0[m] + c1 * T1[m] + c2 * T2[m]
+        a += 3
+    while a <= degree:
+        T0, c0 = T[a], _along(C[a], eta_T, degree - a)
+        for m in range(n):
+            out[m] += c0 * T0[m]
+        a += 1
+
+
+@compiled(inline=True, relaxed=True)
+def _along(C: Any, eta_T: Any, degree: int) -> float:
+    """Sum C[b] T_b(eta) of the row."""
+    total = 0.0
+    for b in range(degree + 1):
+        total += C[b] * eta_T[b]
+    return total
 
 
 @compiled(relaxed=True)
@@ -271,14 +288,20 @@ def sample_block(target: Any, row: int, n: int, block: Any) -> int:
     map_block(row, n, per_px, own)
     sample_points(target.coefficients, target.order, at_row, at_col, n, g, d_row, d_col)
     b, c = own[GAIN], own[OFFSET]
-    off = 0
+    # Short loops without branches, with few arrays each: those become vectors.
+    inside = 0.0
     for m in range(n):
-        if np.isnan(g[m]):
-            off += 1
-            g_x[m] = g_y[m] = residual[m] = g[m] = weight[m] = 0.0
-        else:
-            weight[m], gain = 1.0, 1.0 + b[m]
-            g_x[m] = gain * d_col[m] * per_px
-            g_y[m] = -gain * d_row[m] * per_px
-            residual[m] = known[m] - gain * g[m] - c[m]
+        weight[m] = 0.0 if np.isnan(g[m]) else 1.0
+        inside += weight[m]
+    off = n - int(inside)
+    if off > 0:
+        for m in range(n):
+            if weight[m] == 0.0:
+                g[m] = d_row[m] = d_col[m] = 0.0
+    for m in range(n):
+        g_x[m] = (per_px + per_px * b[m]) * d_col[m]
+    for m in range(n):
+        g_y[m] = -(per_px + per_px * b[m]) * d_row[m]
+    for m in range(n):
+        residual[m] = (known[m] - c[m]) * weight[m] - (1.0 + b[m]) * g[m]
     return off

@@ -73,7 +73,8 @@ def runs_of(mask: BoolArray) -> Runs:
     edges = np.zeros((mask.shape[0], mask.shape[1] + 1), dtype=np.bool_)
     edges[:, 1:-1] = mask[:, 1:] != mask[:, :-1]
     edges[:, 0], edges[:, -1] = mask[:, 0], mask[:, -1]
-    row, column = np.nonzero(edges)  # where runs begin and end, in turns
+    # Where runs begin and end, in turns; of a flat array numpy tells several times faster.
+    row, column = np.divmod(np.flatnonzero(edges), edges.shape[1])
     per_row = np.bincount(row[::2], minlength=len(mask))
     limits = column.astype(np.int32)
     return Runs(limits[::2], limits[1::2], np.concatenate([[0], np.cumsum(per_row)]))
