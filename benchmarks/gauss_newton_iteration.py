@@ -1,9 +1,10 @@
 """What a Gauss-Newton iteration costs, in samplings of the same pixels, and in images of memory.
 
 The paper's image size and 77 unknowns, on one thread in one process; every lap runs all
-contestants in turn and the medians are compared, so that the ratios mean something on a busy
-machine. The design's bound: 5 bicubic samplings of value and gradient. An iteration samples
-value and gradient, assembles and solves the normal equations.
+contestants in turn and the medians of the processor's seconds are compared, so that the ratios
+mean something on a busy machine. The bound: 3 bicubic samplings of value and gradient by this
+package, tap after tap, which is the unit. An iteration samples value and gradient, assembles and
+solves the normal equations.
 
 Run: scripts/env python benchmarks/gauss_newton_iteration.py
 """
@@ -35,14 +36,14 @@ Work = Callable[[], object]
 
 
 def medians(contestants: dict[str, Work]) -> dict[str, float]:
-    """Seconds of each, the median of some laps in turn after one that compiles."""
+    """The processor's seconds of each, the median of some laps in turn after one that compiles."""
     laps: dict[str, list[float]] = {name: [] for name in contestants}
     for repeat in range(REPEATS + 1):
         for name, work in contestants.items():
-            begin = time.perf_counter()
+            begin = time.thread_time()
             work()
             if repeat > 0:
-                laps[name].append(time.perf_counter() - begin)
+                laps[name].append(time.thread_time() - begin)
     return {name: statistics.median(seconds) for name, seconds in laps.items()}
 
 

@@ -94,6 +94,8 @@ class LevelSearch:
         if some is not assembly:
             rough = self._minimise(some, start, self.rough_px, None)
             history += rough.history
+            if rough.outcome is Outcome.CONVERGED and self._only_leads:
+                return rough, some
             if rough.outcome is Outcome.CONVERGED:
                 start = rough.unknowns
                 curvature = rough.curvature * (assembly.pixels / some.pixels)
@@ -115,6 +117,11 @@ class LevelSearch:
             return self._everything
         kept = landed(self._everything, a, pair.reference, pair.deformed, pair.allowed)
         return replace(self._everything, mask=kept)
+
+    @property
+    def _only_leads(self) -> bool:
+        """Whether this is a coarse level: the next one has to be reached, and no more."""
+        return self.least > 0.0
 
     @cached_property
     def _everything(self) -> Assembly:

@@ -65,6 +65,17 @@ def test_few_rows_lead_to_the_minimum_of_all_pixels(monkeypatch: pytest.MonkeyPa
     assert led.outcome is plain.outcome is Outcome.CONVERGED
 
 
+def test_on_coarse_levels_few_rows_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = found()
+    monkeypatch.setattr(level_search, "_PLENTY", 100)
+    led = found()
+    most = {k: max(step.pixels for step in led.history if step.factor == k) for k in (2, 1)}
+    assert most[2] < 0.3 * most[1] / 4
+    assert led.pixels == led.history[-1].pixels == plain.pixels
+    # Both stop within their last step, of less than 1e-4 px, of one minimum.
+    assert rms_px(led.displacement(), plain.displacement()) < 1e-4
+
+
 def test_a_whole_correlation_does_not_depend_on_the_number_of_threads(threads: int) -> None:
     if threads < 2:
         pytest.skip("needs two threads; one core here")
