@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import matplotlib as mpl
@@ -70,31 +71,47 @@ class ErrorMaps:
         high = max(high, 2.0 * low)
         return cls(Sheet.of(mesh, grid, _CELLS), LogScale(SIZE, low, high, "px", "both"))
 
-    def spread(self, graded: Score, values: FloatArray) -> FloatArray:
-        """(rows, cols) of the sheet: of the nearest point, NaN farther off than a spacing."""
-        grid = self.sheet.grid
-        reach = max(graded.spacing_px * grid.pixel_size / self.sheet.factor, grid.pixel_size)
-        X, Y = np.meshgrid(grid.x, grid.y)
-        tree = cKDTree(np.column_stack([graded.x, graded.y]))
-        _, nearest = tree.query(np.column_stack([X.ravel(), Y.ravel()]), distance_upper_bound=reach)
-        return np.asarray(np.append(values, np.nan)[nearest].reshape(grid.shape))
 
+@dataclass(frozen=True, eq=False)
+class FieldMaps:
+    """The maps of one code's errors.
 
-def draw_length(maps: ErrorMaps, graded: Score) -> Figure:
-    """Draw a map of the error's length; blank where nothing was measured."""
-    if not len(graded.error_px):
-        return draw_field(maps.sheet, np.full(maps.sheet.grid.shape, np.nan), maps.lengths)
-    length = np.maximum(_length(graded), 1e-3 * maps.lengths.low)  # zero has no logarithm
-    return draw_field(maps.sheet, maps.spread(graded, length), maps.lengths)
+    Parameters
+    ----------
+    maps
+        What they share with those of the others.
+    graded
+        The field.
+    """
 
+    maps: ErrorMaps
+    graded: Score
 
-def draw_component(maps: ErrorMaps, graded: Score, component: int) -> Figure:
-    """Draw a map of the error along x (0) or y (1), on a scale of its own."""
-    values = graded.error_px[:, component]
-    scale = Scale.signed(graded.error_px, "px", 0.98)
-    if not len(values):
-        return draw_field(maps.sheet, np.full(maps.sheet.grid.shape, np.nan), scale)
-    return draw_field(maps.sheet, maps.spread(graded, values), scale)
+    @cached_property
+    def _nearest(self) -> NDArray[np.intp]:
+        """(rows, cols) of the sheet: number of the nearest point, the count of all if too far."""
+        graded, sheet = self.graded, self.maps.sheet
+        if not len(graded.x):
+            return np.zeros(sheet.grid.shape, dtype=np.intp)
+        reach = max(graded.spacing_px * sheet.grid.pixel_size / sheet.factor, sheet.grid.pixel_size)
+        points = np.column_stack([graded.x, graded.y])
+        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        pixels = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
+        return np.asarray(tree.query(pixels, distance_upper_bound=reach)[1])
+
+    def _draw(self, values: FloatArray, scale: Scale) -> Figure:
+        """A map; blank where nothing was measured."""
+        return draw_field(self.maps.sheet, np.append(values, np.nan)[self._nearest], scale)
+
+    def draw_length(self) -> Figure:
+        """Draw the error's length, on the scale of all codes."""
+        scale = self.maps.lengths
+        return self._draw(np.maximum(_length(self.graded), 1e-3 * scale.low), scale)  # 0 has no log
+
+    def draw_component(self, component: int) -> Figure:
+        """Draw the error along x (0) or y (1), on a scale of its own."""
+        error = self.graded.error_px
+        return self._draw(error[:, component], Scale.signed(error, "px", 0.98))
 
 
 def draw_distribution(scores: Sequence[Score]) -> Figure:

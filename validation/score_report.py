@@ -17,10 +17,9 @@ from modeharvest.validation.benchmark_set import BenchmarkTruth
 from modeharvest.validation.page import render
 from modeharvest.validation.plots_scores import (
     ErrorMaps,
-    draw_component,
+    FieldMaps,
     draw_distribution,
     draw_histogram,
-    draw_length,
     draw_regions,
     draw_spectra,
 )
@@ -165,7 +164,8 @@ def _lines(grading: Grading) -> Iterator[str]:
 
 def page(grading: Grading) -> str:
     """The report, HTML."""
-    maps = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, grading.scores)
+    shared = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, grading.scores)
+    maps = [FieldMaps(shared, graded) for graded in grading.scores]
     curves = [
         _picture("histogram", "Histogram of errors", draw_histogram(grading.scores)),
         _picture("distribution", "Share of points with a larger error",
@@ -179,23 +179,23 @@ def page(grading: Grading) -> str:
         TEMPLATE,
         title=f"Benchmark {grading.truth.id} at {100 * grading.strain:g} %",
         grading=grading,
-        hero=to_svg(draw_length(maps, grading.scores[0]), "best", "Length of the best one's error"),
+        hero=to_svg(maps[0].draw_length(), "best", "Length of the best one's error"),
         everywhere=EVERYWHERE,
         common=COMMON,
         percentiles=PERCENTILES,
         curves=curves,
-        fields=[_field(maps, graded, n) for n, graded in enumerate(grading.scores)],
+        fields=[_field(of_field, n) for n, of_field in enumerate(maps)],
     )
 
 
-def _field(maps: ErrorMaps, graded: Score, n: int) -> dict[str, Any]:
+def _field(maps: FieldMaps, n: int) -> dict[str, Any]:
     """A field's maps."""
     return {
-        "score": graded,
+        "score": maps.graded,
         "pictures": [
-            _picture(f"length-{n}", "Length of the error", draw_length(maps, graded)),
-            _picture(f"x-{n}", "Error along x", draw_component(maps, graded, 0)),
-            _picture(f"y-{n}", "Error along y", draw_component(maps, graded, 1)),
+            _picture(f"length-{n}", "Length of the error", maps.draw_length()),
+            _picture(f"x-{n}", "Error along x", maps.draw_component(0)),
+            _picture(f"y-{n}", "Error along y", maps.draw_component(1)),
         ],
     }
 

@@ -46,11 +46,9 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     Gaps, at holes and where points were lost, count as zero error: what the pattern of gaps does
     to a wave is spread over its neighbours.
     """
-    error = graded.error_px * grid.pixel_size
     try:
-        u, points, mask = gridded(LocalField(graded.x, graded.y, error, source=graded.source))
-        factor = -(-max(points.shape) // _MOST)
-        unit = 10.0 * factor * points.pixel_size  # any: wavelengths are told in px
+        u, points, mask = gridded(_averaged(graded, grid))
+        unit = 10.0 * points.pixel_size  # any: wavelengths are told in px
         spectrum = spectral_density(u, points, mask, unit, bins_per_cell=10, padding=1)
     except InputError:
         return None
@@ -66,8 +64,30 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     middle = 2.0 ** ((low + np.arange(square_mm.size)) / BANDS_AN_OCTAVE)
     there = np.bincount(band - low) > 0
     rms = np.sqrt(square_mm) / grid.pixel_size
-    x, y = graded.x, graded.y
-    plane = np.column_stack([np.ones_like(x), x, y]) @ spectrum.affine.T
     return ErrorSpectrum(
-        middle[there], rms[there], float(np.sqrt(np.mean(plane**2))) / grid.pixel_size
+        middle[there], rms[there], _affine_rms(graded, spectrum.affine) / grid.pixel_size
     )
+
+
+def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
+    """The error as a field [mm], its points averaged over squares where there are too many."""
+    x, y, error = graded.x, graded.y, graded.error_px * grid.pixel_size
+    step = graded.spacing_px * grid.pixel_size
+    many = int(np.ceil(max(np.ptp(x), np.ptp(y)) / (step * _MOST)))
+    if many > 1:
+        side = many * step
+        col, row = (((at - at.min()) / side).astype(int) for at in (x, y))
+        cols = int(col.max()) + 1
+        square = row * cols + col
+        count = np.bincount(square)
+        there = np.flatnonzero(count)
+        error = np.column_stack([np.bincount(square, e)[there] / count[there] for e in error.T])
+        x = x.min() + side * (there % cols + 0.5)
+        y = y.min() + side * (there // cols + 0.5)
+    return LocalField(x, y, error, source=graded.source)
+
+
+def _affine_rms(graded: Score, affine: FloatArray) -> float:
+    """Rms of an affine field at the points, per component [mm]."""
+    points = np.stack([np.ones_like(graded.x), graded.x, graded.y])
+    return float(np.sqrt(np.mean((affine @ points) ** 2)))

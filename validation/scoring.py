@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from modeharvest.errors import InputError
 from modeharvest.idic.fields.local_field import LocalField
@@ -19,6 +20,8 @@ BoolArray = NDArray[np.bool_]
 
 _OTHER_UNIT = 0.05
 """A ratio of measured to true displacement this near to the pixel size is one of units."""
+_ENOUGH_POINTS = 20_000
+"""For a median or a share."""
 PERCENTILES = (50, 90, 95, 99)
 ENOUGH_COVERED = 0.5
 """Share of the material that a field has to cover to be ranked by its error alone [-]."""
@@ -140,13 +143,13 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
     InputError
         If no point lies on the material, or the displacements are in another unit than declared.
     """
-    here = _labels_at(field, labels, grid)
+    here = _labels_at(field.x, field.y, labels, grid)
     _require_on_specimen(field, labels, grid)
     on_material = (here >= 0) & np.isfinite(truth).all(axis=1)
     used = on_material & field.good
     _require_unit(field, truth, used, grid)
     error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
-    spacing_px = max(1.0, field.spacing / grid.pixel_size)
+    spacing_px = max(1.0, _spacing_px(field, grid))
     near = _near(field, used, spacing_px, grid) & (labels >= 0)
     return Score(
         source=field.source,
@@ -167,30 +170,33 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
     )
 
 
-def _labels_at(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> NDArray[np.int8]:
-    """(n,) labels of the pixels nearest to the field's points; -1 off the image."""
-    row, col = grid.to_px(field.x, field.y)
+def _labels_at(
+    x: FloatArray, y: FloatArray, labels: NDArray[np.int8], grid: PixelGrid
+) -> NDArray[np.int8]:
+    """(n,) labels of the pixels nearest to positions [mm]; -1 off the image."""
+    row, col = grid.to_px(x, y)
     inside = (np.abs(row - 0.5 * (grid.rows - 1)) <= 0.5 * grid.rows - 0.5) & (
         np.abs(col - 0.5 * (grid.cols - 1)) <= 0.5 * grid.cols - 0.5
     )
-    found = np.full(field.x.size, -1, dtype=np.int8)
+    found = np.full(x.size, -1, dtype=np.int8)
     found[inside] = labels[np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)]
     return found
 
 
 def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> None:
     """Recognise positions in another unit, or beside the specimen."""
-    there = float((_labels_at(field, labels, grid) >= 0).mean())
-    row, col = grid.to_px(field.x, field.y)
+    some = slice(None, None, -(-field.x.size // _ENOUGH_POINTS))
+    own_x, own_y = field.x[some], field.y[some]
+    there = float((_labels_at(own_x, own_y, labels, grid) >= 0).mean())
+    row, col = grid.to_px(own_x, own_y)
     last, px, mm = grid.rows - 1, "pixels declared as mm", "mm declared as pixels"
     for (x, y), words in (
-        (grid.to_mm(-field.y, field.x), px),  # rows down
-        (grid.to_mm(last - field.y, field.x), px),
+        (grid.to_mm(-own_y, own_x), px),  # rows down
+        (grid.to_mm(last - own_y, own_x), px),
         ((col, -row), mm),
         ((col, last - row), mm),
     ):
-        other = LocalField(x, y, field.u, field.good)
-        share = float((_labels_at(other, labels, grid) >= 0).mean())
+        share = float((_labels_at(x, y, labels, grid) >= 0).mean())
         if share > 0.1 and there < 0.2 * share:
             raise InputError(
                 f"{field.source}: expected positions in the declared unit, got {100 * there:.0f} % "
@@ -220,6 +226,17 @@ def _require_unit(field: LocalField, truth: FloatArray, used: BoolArray, grid: P
                 f"times the true ones, like {words} (a pixel is {grid.pixel_size} mm); declare "
                 "the unit that the file is in"
             )
+
+
+def _spacing_px(field: LocalField, grid: PixelGrid) -> float:
+    """Median distance of a point from its nearest neighbour [px]; infinite for one point."""
+    points = np.column_stack(grid.to_px(field.x, field.y))
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 2:
+        return float("inf")
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    some = points[:: -(-len(points) // _ENOUGH_POINTS)]
+    return float(np.median(tree.query(some, k=2)[0][:, 1]))
 
 
 def _near(field: LocalField, used: BoolArray, spacing_px: float, grid: PixelGrid) -> BoolArray:

@@ -232,8 +232,8 @@ def _column(text: str) -> tuple[str, str | int]:
 def print_grading(grading: Grading, out: Path | str) -> None:
     """Print the ranked table, what is to be kept in mind, and where the report is."""
     console = Console(highlight=False)
-    title = f"benchmark {grading.truth.id} at {100 * grading.strain:g} %, the best first"
-    table = Table(title=title, title_justify="left")
+    console.print(f"benchmark {grading.truth.id} at {100 * grading.strain:g} %, the best first")
+    table = Table()
     table.add_column("errors in px")
     for rank, graded in enumerate(grading.scores, start=1):
         table.add_column(escape(f"{rank}. {graded.source}"), justify="right")
