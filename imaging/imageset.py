@@ -28,17 +28,14 @@ For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import modeharvest
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json, write_json
@@ -55,6 +52,7 @@ from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
 from modeharvest.imaging.truth import read_truth, write_truth
 from modeharvest.progress import Progress, silent
+from modeharvest.versions import versions
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -62,6 +60,8 @@ BoolArray = NDArray[np.bool_]
 __all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
 
 SIDECAR = "images.json"
+_LIBRARIES = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
+"""What the pixels depend on."""
 _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
 
 
@@ -270,7 +270,7 @@ def _write_set(
         "snapshots": snapshots,
         "warnings": _warnings(reference, *snapshots),
         "solution": dict(solution.info),
-        "versions": _versions(),
+        "versions": versions(*_LIBRARIES),
     }
 
 
@@ -318,9 +318,3 @@ def _discard(folder: Path) -> None:
 
 def _label(strain: float) -> str:
     return f"{round(1e4 * strain):04d}"
-
-
-def _versions() -> dict[str, str]:
-    libraries = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
-    own = {"modeharvest": modeharvest.__version__, "python": platform.python_version()}
-    return own | {name: version(name) for name in libraries}

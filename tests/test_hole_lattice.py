@@ -22,7 +22,7 @@ BoolArray = NDArray[np.bool_]
 
 def holes_at(centres: FloatArray, area: float = 7000.0) -> Holes:
     n = len(centres)
-    return Holes(centres, np.full(n, area), np.ones(n), too_small=0, at_border=1)
+    return Holes(centres, np.full(n, area), too_small=0, at_border=1)
 
 
 def lattice_points(vectors: FloatArray, counts: tuple[int, int]) -> FloatArray:

@@ -27,17 +27,12 @@ def test_lost_points_are_counted_and_left_out() -> None:
     assert np.isfinite(field.rms)
 
 
-def test_regions_are_cut_out_by_box_and_by_mask() -> None:
+def test_regions_are_cut_out_by_box() -> None:
     field = LocalField(X, Y, U, sd=np.full((20, 2), 0.01))
     part = field.within(Box(0.5, 2.5, -0.5, 1.5))
     assert sorted(zip(part.x, part.y, strict=True)) == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert part.sd is not None
     assert part.sd.shape == (4, 2)
-    grid = PixelGrid(4, 5, 1.0, 0.0, 3.0)
-    mask = np.zeros((4, 5), dtype=bool)
-    mask[0, 4] = True  # row 0 is at y = 3
-    corner = field.within_mask(mask, grid)
-    assert (corner.x[0], corner.y[0]) == (4.0, 3.0)
     with pytest.raises(InputError, match="got none"):
         field.within(Box(10, 11, 0, 1))
 

@@ -124,18 +124,6 @@ class LocalField:
         inside &= (self.y >= region.y_min) & (self.y <= region.y_max)
         return self.selected(inside, "the box")
 
-    def within_mask(self, mask: ArrayLike, grid: PixelGrid) -> LocalField:
-        """The part of the field at pixels where a mask (rows, cols) is True."""
-        inside = np.asarray(mask, dtype=np.bool_)
-        if inside.shape != grid.shape:
-            raise InputError(
-                f"expected a mask of {grid.shape} px like the grid, got {inside.shape}"
-            )
-        row, col = (np.rint(np.nan_to_num(i, nan=-1.0)) for i in grid.to_px(self.x, self.y))
-        on = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
-        on[on] = inside[row[on].astype(int), col[on].astype(int)]
-        return self.selected(on, "the mask")
-
     def selected(self, keep: BoolArray, what: str = "the selection") -> LocalField:
         """The points that ``keep`` (n,) names; raises InputError if none of them is valid."""
         if not (keep & self.good).any():

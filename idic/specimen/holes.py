@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import center_of_mass, label
 
 from modeharvest.errors import InputError
 
@@ -27,8 +27,6 @@ class Holes:
         (n, 2) centroids, (row, col) [px].
     areas
         (n,) [px^2].
-    elongation
-        (n,) length over width of the ellipse with the same second moments [-]; 1 for a circle.
     too_small
         Number of openings left out because the others are much larger.
     at_border
@@ -37,7 +35,6 @@ class Holes:
 
     centres: FloatArray
     areas: FloatArray
-    elongation: FloatArray
     too_small: int
     at_border: int
 
@@ -78,13 +75,10 @@ def find_holes(mask: ArrayLike) -> Holes:
     inner = np.setdiff1d(np.arange(1, count + 1), border)
     typical = _typical(areas[inner]) if inner.size else 0.0
     large = inner[areas[inner] >= _MUCH_SMALLER * typical]
-    boxes = find_objects(parts)
-    shapes = [_moments(parts, int(k), boxes[int(k) - 1]) for k in large]
-    moments = np.array(shapes, dtype=np.float64).reshape(-1, 3)
+    centres = np.array(center_of_mass(~material, parts, large), dtype=np.float64)
     return Holes(
-        centres=moments[:, :2],
+        centres=centres.reshape(-1, 2),
         areas=areas[large],
-        elongation=moments[:, 2],
         too_small=int(inner.size - large.size),
         at_border=int(border.size),
     )
@@ -94,19 +88,3 @@ def _typical(areas: FloatArray) -> float:
     """The area above which half of all the hole area lies: many specks don't change it."""
     ordered = np.sort(areas)[::-1]
     return float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())])
-
-
-def _moments(
-    parts: NDArray[np.int32], number: int, box: tuple[slice, slice]
-) -> tuple[float, float, float]:
-    """(row, col, elongation) of one part."""
-    row, col = (k.astype(np.float64) for k in np.nonzero(parts[box] == number))
-    middle = float(row.mean()), float(col.mean())
-    # A pixel is a square: its own second moment is 1/12 px^2.
-    spread = np.cov(np.stack([row, col]), bias=True) + np.eye(2) / 12.0
-    small, large = np.linalg.eigvalsh(spread)
-    return (
-        middle[0] + box[0].start,
-        middle[1] + box[1].start,
-        float(np.sqrt(large / small)),
-    )

@@ -85,19 +85,9 @@ class Photograph:
         return float(self.saturated.mean())
 
     @property
-    def black_share(self) -> float:
-        """Share of the pixels whose grey level is 0 [-]."""
-        return float(self.black.mean())
-
-    @property
     def contrast(self) -> float:
         """Standard deviation of the grey levels, as a share of full scale [-]."""
         return float(self.image.std(dtype=np.float64) / self.full_scale)
-
-    @property
-    def fractions(self) -> FloatImage:
-        """(rows, cols) grey levels as fractions of full scale, float32."""
-        return np.asarray(self.image / np.float32(self.full_scale))
 
     def rescaled(self, bits: int) -> Photograph:
         """The same grey levels, said to fill ``bits`` bits (a darker frame of a series)."""

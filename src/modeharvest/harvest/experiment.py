@@ -190,11 +190,6 @@ class DistortionTable:
         if self.shifts and not self.calibration:
             raise InputError("distortion: expected calibration images for the shifts, got none")
 
-    @property
-    def is_given(self) -> bool:
-        """Whether there is any."""
-        return bool(self.file or self.calibration)
-
 
 class Experiment(CaseModel):
     """Photographs of a test, and what is known of it."""

@@ -12,10 +12,8 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +40,10 @@ from modeharvest.stages import Stages, digest, file_digest
 from modeharvest.validation.harvest.report import write_harvest_report
 from modeharvest.validation.harvest.run import Harvest, HarvestTruth
 from modeharvest.validation.harvest.summary import harvest_summary
+from modeharvest.versions import versions
+
+_LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
+"""What the numbers depend on."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ class Harvesting:
             source=self.source,
             folder=self.folder,
             timings=seconds,
-            versions=versions(),
+            versions=versions(*_LIBRARIES),
             progress=self.progress,
         )
 
@@ -270,10 +272,3 @@ def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -
     experiment = read_experiment(path)
     require_inputs(experiment, path.parent)
     return Harvesting(experiment, path.parent, Path(folder), progress, str(path)).all()
-
-
-def versions() -> dict[str, str]:
-    """Of this software and what its numbers depend on."""
-    libraries = ("numpy", "scipy", "numba", "scikit-image")
-    own = {"modeharvest": __version__, "python": platform.python_version()}
-    return own | {name: version(name) for name in libraries}

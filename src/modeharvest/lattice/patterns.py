@@ -206,13 +206,9 @@ def _of_primary(
     state, unit = _state(path, load), path.cell.cell
     mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
     w = path.cell.displacement(state) - unit.mesh.nodes @ (state.gradient - np.eye(2)).T
-    inverse = np.linalg.inv(unit.lattice)
-    known = np.mod(np.mod(unit.mesh.nodes @ inverse, 1.0), 1.0)  # twice: -1e-17 becomes 1, then 0
-    wanted = np.mod(np.mod(mesh.nodes @ inverse, 1.0), 1.0)
-    u = (
-        w[cKDTree(known, boxsize=1.0).query(wanted)[1]]
-        + mesh.nodes @ (state.gradient - np.eye(2)).T
-    )
+    known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
+    same = cKDTree(known, boxsize=1.0).query(wanted)[1]
+    u = w[same] + mesh.nodes @ (state.gradient - np.eye(2)).T
     name = f"primary path at {100 * load:.4g} %"
     return Pattern(
         "family_primary.json", name, mesh, lattice, u, state.gradient, {**info, "load": load}, True
