@@ -3,7 +3,7 @@
 ::
 
     title = "..."
-    [study]        # kind = "robustness", "noise" or "systematic", and its options
+    [study]        # kind = "robustness", "noise", "systematic" or "resolution", and its options
     [experiment]   # the subject, as in every virtual experiment: see modeharvest.case
     [imaging]
     [correlation]
@@ -28,12 +28,20 @@ from pydantic import field_validator, model_validator
 from modeharvest.case import Case
 from modeharvest.case_file import checked, kind_of, nearest, of_kind, read_tables
 from modeharvest.errors import InputError
+from modeharvest.validation.resolution.study import Resolution
+from modeharvest.validation.studies.modes import Modes
 from modeharvest.validation.studies.noise import Noise
 from modeharvest.validation.studies.robustness import Robustness
 from modeharvest.validation.studies.study import Study
 from modeharvest.validation.studies.systematic import Systematic
 
-KINDS: dict[str, type[Any]] = {"robustness": Robustness, "noise": Noise, "systematic": Systematic}
+KINDS: dict[str, type[Any]] = {
+    "robustness": Robustness,
+    "noise": Noise,
+    "systematic": Systematic,
+    "resolution": Resolution,
+    "modes": Modes,
+}
 _SHIPPED = resources.files("modeharvest") / "studies"
 _QUICK = 2.0
 """A quick study's pixels are that much larger."""

@@ -1,0 +1,230 @@
+"""Resolution of parametrised fields: waves and noise against the polynomial degree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+from modeharvest.errors import InputError
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.setup import Identification
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import SpeckleSpec
+from modeharvest.studies.case import StudyCase, read_study
+from modeharvest.validation.resolution import findings as told
+from modeharvest.validation.resolution.buckled import LARGEST, Buckled, Wave
+from modeharvest.validation.resolution.curves import AXES, WAVED, Curves, Passband
+from modeharvest.validation.resolution.measure import Subject, one_case
+from modeharvest.validation.resolution.study import Resolution
+from modeharvest.validation.resolution.tangent import Tangent, share
+from modeharvest.validation.resolution.transfer import polynomial_transfer
+from modeharvest.validation.studies.subject import Subject as Experiment
+
+FloatArray = NDArray[np.float64]
+
+PIXEL = 0.05
+SPECIMEN = Specimen(holes_x=4, holes_y=4)
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    """A small specimen on images of 260 x 260 px."""
+    buckled = Buckled(SPECIMEN, Identification(), SpeckleSpec(blur_px=2.0), PIXEL, 0.1, 5.0)
+    return Subject(buckled, (3,), 0.5, 0.01)
+
+
+@pytest.fixture(scope="module")
+def curves(subject: Subject) -> Curves:
+    return Curves.of(subject, (1, 2, 3))
+
+
+# -- best fits ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("degree", [2, 5])
+def test_on_a_full_rectangle_the_transfer_is_bessel_s(degree: int, axis: int) -> None:
+    """Points stand for the integral: midpoints of 200 x 200 cells, to 1e-3 for such waves."""
+    t = (np.arange(200) + 0.5) / 100.0 - 1.0
+    half = np.array([3.0, 5.0])
+    points = np.stack(np.meshgrid(*(t * h for h in half)), axis=-1).reshape(-1, 2)
+    ansatz = Ansatz(Box.centred(*(2.0 * half)), (), degree, 0)
+    period = np.array([3.0, 6.0, 12.0, 30.0])
+    phases = [0.0, 0.5 * np.pi]
+    waves = np.zeros((len(points), 2, len(period) * len(phases)))
+    waves[:, 1] = np.stack(
+        [Wave("v0", axis, p, phase, 1.0).shape(points) for p in period for phase in phases], axis=-1
+    )
+    found = Tangent(ansatz, ansatz.start(), points).fit(waves)
+    # The power of both phases together: their shares, weighted by their own power.
+    power = (waves**2).sum(axis=(0, 1))
+    both = (share(found.whole, waves) * power).reshape(-1, 2).sum(1) / power.reshape(-1, 2).sum(1)
+    expected = polynomial_transfer(degree, 2.0 * half[axis] / period)
+    assert both == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: Subject) -> None:
+    """The fit's own curvature is what 1e-4 mm of wave leave of the difference."""
+    buckled, degree = subject.buckled, 2
+    grid = PixelGrid.centred(131, 131, 0.1)
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    mask = buckled.material(at[..., 0], at[..., 1])
+    ansatz, start = subject.ansatz(degree, "buckled"), subject.start(degree, "buckled")
+    for part in WAVED:
+        wave = buckled.wave_at(Wave(part, 0, 6.0, 0.3, 1e-4), at)
+        fit = fit_displacement(buckled.displacement(at) + wave, grid, ansatz, start, mask)
+        change = (fit.displacement() - buckled.displacement(at))[mask][..., None]
+        linear = Tangent(ansatz, start, at[mask]).fit(wave[mask][..., None]).whole
+        expected = share(linear, wave[mask][..., None])
+        assert share(change, wave[mask][..., None]) == pytest.approx(expected, abs=1e-3)
+
+
+def test_waves_that_the_ansatz_describes_are_found_whole(subject: Subject) -> None:
+    """Degree by degree less is lost, and long waves come back; nothing goes to the other part."""
+    curves = Curves.of(subject, (1, 4))
+    for part in WAVED:
+        for axis in range(len(AXES)):
+            assert (curves.own[part, axis, 4] > curves.own[part, axis, 1] - 0.02).all()
+            assert curves.own[part, axis, 4][-1] == pytest.approx(1.0, abs=1e-6)
+            assert curves.finest(part, axis, 4) < 0.6 * curves.finest(part, axis, 1)
+    assert told._cross_talk(curves) < 0.15
+
+
+def test_the_pattern_is_tuned_and_not_filtered(subject: Subject) -> None:
+    band = Passband.of(subject, 2)
+    mode = int(np.argmin(np.abs(band.stretch - 1.0)))
+    assert band.added[mode] == pytest.approx(1.0, abs=1e-9)
+    near = np.abs(band.stretch - 1.0) < 0.05
+    assert band.itself[near] == pytest.approx(1.0, abs=1e-6)
+    assert band.wavelength_error[near].max() < 1e-6
+    between = (band.stretch > 0.5) & (band.stretch < 0.6)
+    assert band.added[between].max() < 0.3
+
+
+# -- images -------------------------------------------------------------------------------
+
+
+def test_images_of_a_formula_are_exact(subject: Subject) -> None:
+    buckled = subject.buckled
+    for wave in (None, Wave("v1", 1, 4.0, 0.2, 0.02)):
+        base = buckled._base
+        points = base.points if wave is None else buckled._improved(base, wave)
+        off = points + buckled.displacement(points, wave) - base.at
+        assert np.abs(off).max() < 1e-6 * PIXEL
+    # phi1 as the ansatz has it, at its largest.
+    x, y = np.meshgrid(buckled.grid.x, buckled.grid.y)
+    phi = buckled.pattern_at(np.stack([x, y], axis=-1))
+    assert np.hypot(phi[..., 0], phi[..., 1]).max() == pytest.approx(LARGEST, rel=0.01)
+    ansatz, a = buckled.truth
+    at = np.array([[0.3, 0.7], [-1.2, 2.0]])
+    assert buckled.displacement(at) == pytest.approx(ansatz.displacement_at(a, at))
+
+
+def test_material_is_what_the_specimen_is(subject: Subject) -> None:
+    buckled, s = subject.buckled, SPECIMEN
+    area = buckled.material(*np.meshgrid(buckled.grid.x, buckled.grid.y)).sum() * PIXEL**2
+    holes = 16 * np.pi * (0.5 * s.diameter) ** 2
+    assert area == pytest.approx(4.0 * np.prod(s.half_size) - holes, rel=0.01)
+    assert not buckled.material(*s.hole_centres.T).any()
+    assert buckled.material(*(s.hole_centres + 0.5 * s.pitch).T).all()
+
+
+@pytest.fixture(scope="module")
+def table(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    """All cases of a small study, run here."""
+    folder = tmp_path_factory.mktemp("resolution")
+    experiment = Experiment(
+        replace(StudyCase().experiment, specimen=SPECIMEN),
+        replace(StudyCase().imaging, pixel_size=PIXEL, speckle=SpeckleSpec(blur_px=2.0)),
+        Identification(),
+        None,  # type: ignore[arg-type]  # nothing simulated is measured
+    )
+    study = Resolution(strain=0.1, pattern=5.0, degrees=(1, 2, 3), measured=(3,), realisations=12)
+    rows: list[dict[str, Any]] = []
+    for case in study.prepare(experiment, folder):
+        rows.append({**case, "seconds": 0.0, "error": "", **one_case(case, folder)})
+    return pd.DataFrame(rows)
+
+
+def test_images_give_what_best_fits_promise(
+    table: pd.DataFrame, subject: Subject, curves: Curves
+) -> None:
+    """The speckle's gradient weighs the fit, by grain: some 700 grains share 10 unknowns.
+
+    So what is lost, a tenth of the power, comes back in part by chance: with a standard deviation
+    of sqrt(10 / 700) sqrt(0.1) = 0.04 of the wave.
+    """
+    waves = told.measured_waves(table, subject, curves)
+    assert len(waves) == len(WAVED) * len(AXES)
+    assert waves["difference"].abs().max() < 3.5 * 0.04
+    assert abs(waves["difference"].mean()) < 3.5 * 0.04 / np.sqrt(len(waves))
+    assert waves["best fit"].to_numpy() == pytest.approx(0.9, abs=1e-3)  # that is what l10 is
+
+
+def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Subject) -> None:
+    floors = told.noise_floors(table, subject)
+    assert len(floors) == 2 * len(told.QUANTITIES)
+    z = (floors["ratio"] - 1.0) / floors["± (1)"]
+    # Twelve realisations: Student's t, and eight numbers that hang together.
+    assert z.abs().max() < 5.0
+    assert floors["ratio"].mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_findings_of_a_resolution_study(
+    table: pd.DataFrame, subject: Subject, curves: Curves
+) -> None:
+    found = told.findings(table, subject, curves, "seed 0")
+    degrees = found.numbers["degrees"]
+    finest = [d["finest_px"]["v0 x"] for d in degrees]
+    floor = [d["floor_px"]["v0"] for d in degrees]
+    assert (np.diff(finest) < 0.0).all()
+    assert (np.diff(floor) > 0.0).all()
+    for d in degrees:
+        mean = np.sqrt(d["finest_px"]["v1 x"] * d["finest_px"]["v1 y"])
+        assert d["indicator_px2"]["v1"] == pytest.approx(mean * d["floor_px"]["v1phi1"])
+    # Theory: a subset's n l10 is 3.99 sqrt(2) s / G.
+    assert 0.3 < found.numbers["affine_subset_indicator_px2"] < 3.0
+    assert len(found.plots) == 4
+    assert len(found.sentences) == 7
+    assert not any("nan" in sentence for sentence in found.sentences)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"degrees": (0, 2)}, "degrees from 1 to 12"),
+        ({"measured": (9,)}, "measured degrees among"),
+        ({"amplitude_px": 5.0}, "amplitude above 0 and up to 2 px"),
+        ({"pattern": 0.0}, "a pattern that is not 0 mm"),
+        ({"degrees": (3, 3)}, "degrees that differ"),
+    ],
+)
+def test_studies_that_can_t_be_asked(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Resolution(**options)
+
+
+def test_the_shipped_study_spells_out_the_defaults() -> None:
+    case = read_study("resolution")
+    assert case.study == Resolution()
+    assert case.imaging.pixel_size == 0.02
+    quick = case.quick()
+    assert quick.study.measured == (5,)
+    with pytest.raises(InputError, match="hold_mode"):
+        case.study.require(Identification(hold_mode=True))
+    with pytest.raises(InputError, match="camera = false"):
+        case.study.require(Identification(camera=True))
+
+
+def test_a_motion_that_folds_is_refused() -> None:
+    folded = Buckled(SPECIMEN, Identification(), SpeckleSpec(), 0.1, 0.1, 40.0)
+    with pytest.raises(InputError, match="folds the specimen"):
+        folded.images()

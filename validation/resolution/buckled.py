@@ -1,0 +1,254 @@
+"""A buckled specimen whose motion is a formula, with a small wave on top, exactly imaged.
+
+The base is a homogeneous strain and one pattern of even amplitude, which an ansatz of any degree
+describes; what an ansatz makes of the wave is what is asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.errors import InputError
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.setup import Identification
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_MARGIN = 0.03
+"""Background around the specimen, as a share of its larger side."""
+LARGEST = 0.04
+"""max ||phi1|| of the paper's mode [-]."""
+_COARSE_STEPS, _NEWTON_STEPS, _STEPS = 20, 3, 50
+_AROUND_PX = 4
+"""A wave moves no pixel farther."""
+_ENOUGH_PX = 1e-6
+"""Residual of the inversion: a thousandth of what a correlation without noise errs by."""
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A small wave of v0 or of v1.
+
+    Parameters
+    ----------
+    part
+        "v0": a motion along ``axis`` itself; "v1": of the pattern's amplitude.
+    axis
+        0: the wave runs along x; 1: along y.
+    period
+        [mm].
+    phase
+        At x = y = 0 [rad].
+    amplitude
+        Of the displacement; for "v1" where the pattern is largest [mm].
+    """
+
+    part: str
+    axis: int
+    period: float
+    phase: float
+    amplitude: float
+
+    def __post_init__(self) -> None:
+        if self.part not in ("v0", "v1") or self.axis not in (0, 1) or not self.period > 0.0:
+            raise InputError(
+                "expected a wave of 'v0' or 'v1' along axis 0 or 1 with a period above 0, got "
+                f"{self.part!r}, {self.axis} and {self.period}"
+            )
+
+    def shape(self, points: FloatArray) -> FloatArray:
+        """(...) the wave alone at points (..., 2) [mm], of amplitude 1 [-]."""
+        return np.asarray(np.cos(2.0 * np.pi / self.period * points[..., self.axis] + self.phase))
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two images and where they show material, (rows, cols) each."""
+
+    f: NDArray[np.float32]
+    g: NDArray[np.float32]
+    mask: BoolArray
+    deformed_mask: BoolArray
+
+    def noisy(self, level: float, rng: np.random.Generator) -> Pair:
+        """The pair with white noise of that standard deviation in both images."""
+        n = rng.normal(scale=level, size=(2, *self.f.shape)).astype(np.float32)
+        return Pair(self.f + n[0], self.g + n[1], self.mask, self.deformed_mask)
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Where deformed pixels come from.
+
+    Parameters
+    ----------
+    near
+        (rows, cols) the n pixels that show material, or nearly.
+    at, points
+        (n, 2) their positions x, and X with X + u(X) = x [mm].
+    slope
+        (n, 2, 2) dX/dx, nearly [-].
+    """
+
+    near: BoolArray
+    at: FloatArray
+    points: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True)
+class Buckled:
+    """A base motion and how it is imaged and correlated.
+
+    Parameters
+    ----------
+    specimen
+        The undeformed geometry.
+    how
+        The correlation; its degrees are varied.
+    speckle
+        The pattern on it.
+    pixel_size
+        [mm].
+    strain
+        Nominal compression along x [-].
+    pattern
+        v1, the same everywhere [mm].
+    """
+
+    specimen: Specimen
+    how: Identification
+    speckle: SpeckleSpec
+    pixel_size: float
+    strain: float
+    pattern: float
+
+    @cached_property
+    def grid(self) -> PixelGrid:
+        """Pixels that hold the specimen in all its states."""
+        half = np.array(self.specimen.half_size)
+        reach = half + _MARGIN * half.max()
+        cols, rows = (2 * int(np.ceil(r / self.pixel_size)) + 1 for r in reach)
+        return PixelGrid.centred(rows, cols, self.pixel_size)
+
+    @cached_property
+    def truth(self) -> tuple[Ansatz, FloatArray]:
+        """The smallest ansatz that describes the base, and its unknowns."""
+        return self.ansatz(1, 0), self.start(1, 0)
+
+    def ansatz(self, v0_degree: int, v_degree: int, hold_mode: bool = False) -> Ansatz:
+        """The paper's ansatz of these degrees; its mode held if nothing tells its parameters."""
+        how = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, hold_mode=hold_mode)
+        return how.ansatz(self.specimen)
+
+    def start(self, v0_degree: int, v_degree: int) -> FloatArray:
+        """The base in the unknowns of an ansatz of these degrees."""
+        return self.ansatz(v0_degree, v_degree).start(self.strain, self.pattern)
+
+    def material(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Whether there is material at points of the undeformed specimen [mm] that broadcast."""
+        s = self.specimen
+        x, y = np.broadcast_arrays(x, y)
+        (left, bottom), counts = s.hole_centres[0], (s.holes_x, s.holes_y)
+        i, j = (
+            np.clip(np.rint((at - first) / s.pitch), 0, count - 1).astype(int)
+            for at, first, count in zip((x, y), (left, bottom), counts, strict=True)
+        )
+        hole = i * s.holes_y + j
+        dx, dy = x - s.hole_centres[hole, 0], y - s.hole_centres[hole, 1]
+        width, height = s.half_size
+        inside = (np.abs(x) <= width) & (np.abs(y) <= height)
+        return np.asarray(inside & (np.hypot(dx, dy) > 0.5 * s.diameters[hole]))
+
+    def wave_at(self, wave: Wave, points: FloatArray) -> FloatArray:
+        """(..., 2) displacement of a wave at points (..., 2) [mm]."""
+        size = wave.amplitude * wave.shape(points)[..., None]
+        if wave.part == "v0":
+            return np.asarray(size * np.eye(2)[wave.axis])
+        return np.asarray(size / LARGEST * self.pattern_at(points))
+
+    def pattern_at(self, points: FloatArray) -> FloatArray:
+        """(..., 2) phi1 at points (..., 2) [-]."""
+        ansatz, a = self.truth
+        return ansatz.phi(0, a, points[..., None, 0], points[..., None, 1])[..., 0, :]
+
+    def displacement(self, points: FloatArray, wave: Wave | None = None) -> FloatArray:
+        """(..., 2) base and wave at points (..., 2) [mm]."""
+        height = np.full(points.shape[:-1], self.pattern)
+        if wave is not None and wave.part == "v1":
+            height += wave.amplitude / LARGEST * wave.shape(points)
+        u = height[..., None] * self.pattern_at(points)
+        u[..., 0] -= self.strain * points[..., 0]
+        if wave is not None and wave.part == "v0":
+            u[..., wave.axis] += wave.amplitude * wave.shape(points)
+        return np.asarray(u)
+
+    def images(self, wave: Wave | None = None) -> Pair:
+        """Exact images before and after the motion."""
+        grid = self.grid
+        speckle = Speckle(self.speckle, grid.shape)
+        x, y = grid.x[None, :], grid.y[:, None]
+        mask = self.material(x, y)
+        base = self._base
+        shown, point = base.near, base.points
+        if wave is not None:
+            point = self._improved(base, wave)
+        inside = self.material(point[:, 0], point[:, 1])
+        deformed_mask = shown.copy()
+        deformed_mask[shown] = inside
+        g = np.zeros(grid.shape, dtype=np.float32)
+        g[deformed_mask] = speckle(*grid.to_px(*point[inside].T))
+        f = np.where(mask, speckle.image(), 0.0).astype(np.float32)
+        return Pair(f, g, mask, deformed_mask)
+
+    def still(self) -> Pair:
+        """The image before the motion, twice."""
+        mask = self.material(self.grid.x[None, :], self.grid.y[:, None])
+        image = Speckle(self.speckle, self.grid.shape).image()
+        f = np.where(mask, image, 0.0).astype(np.float32)
+        return Pair(f, f, mask, mask)
+
+    @cached_property
+    def _base(self) -> Inverse:
+        """Of the base, by fixed-point iteration and Newton's method."""
+        at = np.stack(np.meshgrid(self.grid.x, self.grid.y), axis=-1)
+        point = at
+        for _ in range(_COARSE_STEPS):  # each brings X nearer by the largest strain
+            point = at - self.displacement(point)
+        material = self.material(point[..., 0], point[..., 1])
+        near = ndimage.binary_dilation(material, iterations=_AROUND_PX)
+        at, point = at[near], point[near]
+        for _ in range(_NEWTON_STEPS):
+            slope = np.asarray(np.linalg.inv(self._gradient(point)), dtype=np.float64)
+            error = point + self.displacement(point) - at
+            point = point - (slope @ error[..., None])[..., 0]
+        found = Inverse(near, at, point, slope)
+        return replace(found, points=self._improved(found, None))
+
+    def _improved(self, base: Inverse, wave: Wave | None) -> FloatArray:
+        """(n, 2) X from near ones, by steps of one slope."""
+        point = base.points
+        for _ in range(_STEPS):
+            error = point + self.displacement(point, wave) - base.at
+            if np.abs(error).max() < _ENOUGH_PX * self.pixel_size:
+                return point
+            point = point - (base.slope @ error[..., None])[..., 0]
+        raise InputError(
+            "study: expected a motion that can be inverted, got one that folds the specimen; take "
+            "a smaller strain, pattern or wave"
+        )
+
+    def _gradient(self, point: FloatArray) -> FloatArray:
+        """(..., 2, 2) dx/dX of the base, by forward differences."""
+        here, h = self.displacement(point), 1e-5 * self.pixel_size
+        ahead = [(self.displacement(point + h * e) - here) / h for e in np.eye(2)]
+        return np.asarray(np.eye(2) + np.stack(ahead, axis=-1))
