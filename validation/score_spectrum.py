@@ -46,6 +46,8 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     Gaps, at holes and where points were lost, count as zero error: what the pattern of gaps does
     to a wave is spread over its neighbours.
     """
+    if not len(graded.x):
+        return None
     try:
         u, points, mask = gridded(_averaged(graded, grid))
         unit = 10.0 * points.pixel_size  # any: wavelengths are told in px
