@@ -24,8 +24,9 @@ from scipy import ndimage
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.gauss_newton import GaussNewtonOptions, ScaledEigen
+from modeharvest.idic.gauss_newton import GaussNewtonOptions
 from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.scaled_eigen import ScaledEigen
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage, sample_points
 

@@ -19,7 +19,6 @@ from modeharvest.idic.gauss_newton import (
     Iteration,
     Minimum,
     Outcome,
-    ScaledEigen,
     minimise,
 )
 from modeharvest.idic.inputs import CheckedImages, checked_mask, where
@@ -27,6 +26,7 @@ from modeharvest.idic.level_search import LevelSearch, step_length
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, prepare
 from modeharvest.idic.result import Result
+from modeharvest.idic.scaled_eigen import ScaledEigen
 from modeharvest.idic.warp import residual
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.progress import Progress, silent

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.gauss_newton import ScaledEigen
 from modeharvest.idic.result import Result
+from modeharvest.idic.scaled_eigen import ScaledEigen
 
 FloatArray = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Minimum,
     Outcome,
-    ScaledEigen,
     minimise,
 )
 from modeharvest.idic.normal_equations import NormalEquations
+from modeharvest.idic.scaled_eigen import ScaledEigen
 
 FloatArray = NDArray[np.float64]
 Residual = Callable[[FloatArray], tuple[FloatArray, FloatArray]]

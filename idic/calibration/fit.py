@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.calibration.model import DistortionModel
 from modeharvest.idic.calibration.views import POSE_UNKNOWNS, Pose, View
-from modeharvest.idic.gauss_newton import ScaledEigen
+from modeharvest.idic.scaled_eigen import ScaledEigen
 from modeharvest.imaging.distortion.mapping import Distortion
 
 FloatArray = NDArray[np.float64]
