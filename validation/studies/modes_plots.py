@@ -1,0 +1,239 @@
+"""Pictures of a study of measured modes: parameters, overlaps, strains, and the patterns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh, Solution
+from modeharvest.idic.result import Result
+from modeharvest.validation.outline import Outline
+from modeharvest.validation.plots_fields import Scale
+from modeharvest.validation.studies.study import Plot
+from modeharvest.validation.style import (
+    BLUE,
+    GOLD,
+    GREEN,
+    INK,
+    MUTED,
+    RED,
+    SIGNED,
+    figure,
+    style,
+)
+
+FloatArray = NDArray[np.float64]
+
+_WAVE_VECTORS = {"a2": BLUE, "a3": GREEN, "a4": GOLD, "a5": RED}
+_PHASES = {"a6": BLUE, "a7": RED}
+_IDEAL = {"a1": 1.0, "a2": 1.0, "a3": 1.0, "a4": -1.0, "a5": 1.0, "a6": 0.0, "a7": 0.0}
+"""Eq. (mode) with a solid junction at the origin; phases in shares of l."""
+_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # triangles of a T6
+_PATTERN_END, _LEFT_END = 0.16, 0.03  # of the colours, in l
+
+
+def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], label: str) -> Figure:
+    """Draw the modes' parameters: measured with error bars, best fit, infinite lattice.
+
+    Parameters
+    ----------
+    done
+        The specimens.
+    at
+        (n,) where each is on the axis.
+    ticks
+        Its name there; none for an axis of numbers.
+    label
+        Of the axis.
+    """
+    with style():
+        drawn = figure(9.6, 3.1 if not len(ticks) else 3.9)
+        aspect, waves, phases = drawn.subplots(1, 3)
+        apart = 0.012 * np.ptp(at) if len(at) > 1 else 0.1
+        for axes, names in ((aspect, {"a1": BLUE}), (waves, _WAVE_VECTORS), (phases, _PHASES)):
+            axes.axhline(0.0, color=MUTED, linestyle=":", linewidth=1)
+            for n, (name, colour) in enumerate(names.items()):
+                _parameter(axes, done, at + apart * (n - 0.5 * (len(names) - 1)), name, colour)
+            axes.set_xlabel(label)
+            if len(ticks):
+                axes.set_xticks(at, ticks, rotation=40, ha="right", fontsize=7)
+        lattice = 100.0 * (done["lattice_a1"] - 1.0)
+        aspect.plot(at, lattice, "x", color=INK, markersize=5, label="infinite lattice")
+        aspect.set_ylabel("a₁ − 1 [%]")
+        waves.set_ylabel("wave vectors − ideal [%]")
+        phases.set_ylabel("phases [% of l]")
+        for axes in (aspect, waves, phases):
+            axes.legend(frameon=False, fontsize=7, ncols=2)
+        drawn.tight_layout()
+    return drawn
+
+
+def _parameter(axes: Axes, done: pd.DataFrame, at: FloatArray, name: str, colour: str) -> None:
+    """Draw one parameter's deviation from the ideal one [%]: dots measured, rings best fit."""
+    measured, best = (100.0 * (done[key] - _IDEAL[name]) for key in (name, f"best_{name}"))
+    error = 200.0 * done[f"{name}_sd_leftover"]
+    label = "measured" if name == "a1" else f"a{'₀₁₂₃₄₅₆₇'[int(name[1])]}"
+    axes.errorbar(at, measured, error, color=colour, marker="o", markersize=3, linestyle="none",
+                  capsize=1.5, elinewidth=0.8, label=label)  # fmt: skip
+    axes.plot(at, best, "o", markersize=5.5, markerfacecolor="none", markeredgecolor=colour,
+              markeredgewidth=0.8, label="best fit" if name == "a1" else None)  # fmt: skip
+
+
+def draw_overlaps(done: pd.DataFrame, seeds: str) -> Plot:
+    """Draw overlaps against d/l: with the infinite lattice's mode, and with the specimen's."""
+    with style():
+        drawn = figure(9.6, 2.9)
+        lattice, specimen, strains = drawn.subplots(1, 3)
+        for axes, ends in ((lattice, _LATTICE), (specimen, _SPECIMEN)):
+            for key, (text, look) in ends.items():
+                axes.plot(done["ratio"], done[key], linewidth=1, label=text, **look)
+            axes.set(xlabel="d/l [–]", ylabel="overlap [–]")
+            axes.legend(frameon=False, fontsize=7)
+        lattice.set_title("with the infinite lattice’s mode", fontsize=8)
+        specimen.set_title("with the specimen’s own pattern", fontsize=8)
+        for key, text, look in (
+            ("critical_strain", "the specimen", {"color": BLUE, "marker": "o", "markersize": 3}),
+            ("lattice_pattern_strain", "infinite lattice", {"color": INK, "marker": "x",
+                                                            "markersize": 4}),
+        ):  # fmt: skip
+            strains.plot(done["ratio"], 100 * done[key], linewidth=1, label=text, **look)
+        strains.set(xlabel="d/l [–]", ylabel="pattern critical at a strain of [%]")
+        strains.legend(frameon=False, fontsize=7)
+        drawn.tight_layout()
+    caption = (
+        "Overlap |∫ u·φ| / (‖u‖ ‖φ‖) over the material, 1 for fields that differ by a factor. "
+        "Left: of modes of constant amplitude over all cells; middle: of v₁φ₁ with the truth less "
+        "the best fit’s v₀ over the cellular part. Right: where the pattern becomes critical. "
+        f"{seeds.capitalize()}."
+    )
+    return Plot("overlaps", "Overlaps, and when the pattern comes", drawn, caption, wide=True)
+
+
+_LATTICE = {
+    "overlap_lattice": ("measured", {"color": BLUE, "marker": "o", "markersize": 3}),
+    "best_overlap_lattice": ("best fit", {"color": GREEN, "marker": "s", "markersize": 3}),
+    "lattice_overlap_ideal": ("Eq. (mode), ideal", {"color": INK, "marker": "x", "markersize": 4}),
+}
+_SPECIMEN = {
+    "overlap_truth": ("measured", {"color": BLUE, "marker": "o", "markersize": 3}),
+    "best_overlap_truth": ("best fit", {"color": GREEN, "marker": "s", "markersize": 3}),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """A specimen's fields at the nodes of its mesh.
+
+    Parameters
+    ----------
+    mesh
+        T6 [mm].
+    pitch
+        l [mm].
+    displacement, found
+        (n, 2) the truth and the measurement [mm].
+    pattern, found_pattern
+        (n, 2) the truth less the best fit's v₀, and v₁φ₁ of the measurement [mm].
+    """
+
+    mesh: Mesh
+    pitch: float
+    displacement: FloatArray
+    found: FloatArray
+    pattern: FloatArray
+    found_pattern: FloatArray
+
+    @classmethod
+    def read(cls, folder: Path) -> Patterns:
+        """Of what :func:`~modeharvest.validation.studies.modes_specimen.one_specimen` left."""
+        solution = Solution.read(folder / "solution.h5")
+        result, best = (Result.read(folder / f"{name}.json") for name in ("result", "best"))
+        (snapshot,) = solution.snapshots
+        x, y = solution.mesh.nodes.T[:, :, None]
+
+        def at_nodes(field: Callable[..., FloatArray], fit: Result) -> FloatArray:
+            return np.asarray(field(fit.unknowns, x, y)[:, 0])
+
+        true = snapshot.displacement
+        ansatz = result.ansatz
+        return cls(
+            solution.mesh,
+            ansatz.modes[0].half_wavelength,
+            true,
+            at_nodes(ansatz.displacement, result),
+            true - at_nodes(best.ansatz.v0, best),
+            at_nodes(lambda a, x, y: ansatz.fluctuation(0, a, x, y), result),
+        )
+
+
+def draw_patterns(specimens: Mapping[str, Patterns], name: str, title: str) -> Plot:
+    """Draw patterns side by side: the truth, what was measured of it, and what is left.
+
+    Parameters
+    ----------
+    specimens
+        By what to write above each.
+    name, title
+        Of the picture.
+    """
+    with style():
+        width = 9.0
+        each = width / len(specimens)
+        tall = max(_aspect(p.mesh) for p in specimens.values()) * each
+        drawn = figure(width + 0.6, 3.0 * tall + 0.35)
+        grid = drawn.subplots(3, len(specimens), squeeze=False)
+        pattern = Scale(SIGNED, -_PATTERN_END, _PATTERN_END, "l", "both")
+        left = Scale(SIGNED, -_LEFT_END, _LEFT_END, "l", "both")
+        for column, (text, p) in zip(grid.T, specimens.items(), strict=True):
+            column[0].set_title(text, fontsize=8)
+            _show(column[0], p, p.pattern, p.displacement, pattern)
+            _show(column[1], p, p.found_pattern, p.found, pattern)
+            _show(column[2], p, p.displacement - p.found, p.displacement, left)
+        for axes, text in zip(
+            grid[:, 0], ("truth − v₀", "measured v₁φ₁", "truth − IDIC"), strict=True
+        ):
+            axes.text(-0.04, 0.5, text, transform=axes.transAxes, rotation=90, va="center",
+                      ha="right", fontsize=8)  # fmt: skip
+        drawn.subplots_adjust(0.03, 0.01, 0.93, 0.95, 0.03, 0.03)
+        for axes, scale in ((grid[0, -1], pattern), (grid[2, -1], left)):
+            _bar(axes, scale)
+    caption = (
+        "The component across the load, in shares of l, on the specimens as they are deformed. v₀ "
+        "is the best fit’s. The colours of what is left are finer."
+    )
+    return Plot(name, title, drawn, caption, wide=True)
+
+
+def _aspect(mesh: Mesh) -> float:
+    width, height = np.ptp(mesh.nodes, axis=0)
+    return float(height / width)
+
+
+def _show(axes: Axes, p: Patterns, field: FloatArray, moved: FloatArray, scale: Scale) -> None:
+    nodes = p.mesh.nodes + moved
+    triangles = p.mesh.cells[:, np.array(_FINER)].reshape(-1, 3)
+    net = Triangulation(nodes[:, 0], nodes[:, 1], triangles)
+    axes.tripcolor(net, field[:, 1] / p.pitch, shading="gouraud", cmap=scale.colours,
+                   norm=scale.normalise, rasterized=True)  # fmt: skip
+    axes.add_patch(PathPatch(Outline.of(p.mesh).path(moved), fill=False, ec=MUTED, lw=0.3,
+                             rasterized=True))  # fmt: skip
+    (left, bottom), (right, top) = p.mesh.nodes.min(axis=0), p.mesh.nodes.max(axis=0)
+    axes.set(xlim=(left, right), ylim=(1.02 * bottom, 1.02 * top), aspect="equal")
+    axes.set_axis_off()
+
+
+def _bar(axes: Axes, scale: Scale) -> None:
+    from matplotlib.cm import ScalarMappable
+
+    place = axes.inset_axes((1.08, 0.1, 0.07, 0.8))
+    axes.figure.colorbar(ScalarMappable(scale.normalise, scale.colours), cax=place, extend="both",
+                         label="l")  # fmt: skip
