@@ -369,6 +369,23 @@ def test_a_study_from_the_command_line(
     assert "Stored results of modeharvest 0.0.0, 1 in number" in (out / "report.html").read_text()
 
 
+def test_a_folder_with_something_else_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for name, content, said in (
+        ("study.json", {"kind": "noise"}, "which holds a noise study"),
+        ("summary.json", {}, "which holds something that is no study"),
+    ):
+        out = tmp_path / name
+        write_json(out / name, content)
+        (tmp_path / "tiny.toml").write_text(TINY, "utf-8")
+        assert called(monkeypatch, "study", tmp_path / "tiny.toml", "--out", out) == 2
+        rows = capsys.readouterr().err.splitlines()
+        (line,) = [row for row in rows if row.startswith("error:")]
+        assert said in line
+        assert [path.name for path in out.iterdir()] == [name]  # nothing was touched
+
+
 def threads(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
     """A case that tells how many threads its kernels have."""
     return {"threads": numba.get_num_threads()}

@@ -2,6 +2,7 @@
 
 ::
 
+    study.json               which kind of study has this folder
     solution.h5              the exact displacements of the subject
     subjects/ images/        pairs of images, and how they are correlated
     cases/KEY.json           one file for each case, written when it is done
@@ -23,7 +24,7 @@ import pandas as pd
 from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import atomic, require_writable, write_json
+from modeharvest.files import atomic, read_json, require_writable, write_json
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, named, silent
 from modeharvest.studies.case import StudyCase, read_study
@@ -76,11 +77,12 @@ class StudyPipeline:
         Raises
         ------
         InputError
-            If no case succeeded, the folder can't be written to, a scheduler is not there, or its
-            workers can't do the work.
+            If no case succeeded, the folder can't be written to or holds anything else, a
+            scheduler is not there, or its workers can't do the work.
         """
         folder, study = self.folder.resolve(), self.case.study
         require_writable(folder)
+        _claim(folder, self.case.kind)
         self.workers.get_ready(study.function, folder)
         clock = _Clock()
         subject = self.subject()
@@ -176,6 +178,21 @@ def study(
     """
     case = name if isinstance(name, StudyCase) else read_study(name)
     return StudyPipeline(case, Path(folder), workers or Workers(), progress).all()
+
+
+def _claim(folder: Path, kind: str) -> None:
+    """Take a folder for a kind of study; InputError if it holds anything else."""
+    path, holds = folder / "study.json", f"a {kind} study"
+    if path.is_file():
+        holds = f"a {read_json(path)['kind']} study"
+    elif (folder / "summary.json").exists():
+        holds = "something that is no study (it has a summary.json, but no study.json)"
+    if holds != f"a {kind} study":
+        raise InputError(
+            f"expected an empty folder or one with a {kind} study, got {folder}, which holds "
+            f"{holds}; take another with --out"
+        )
+    write_json(path, {"kind": kind})
 
 
 def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
