@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import ir
 from numba import types as numba_types
 from numba.core import cgutils as numba_cgutils
 from numba.extending import intrinsic
@@ -82,7 +82,8 @@ class _Vectors:
 def _quintic_at(typing: Any, c: Any, i: Any, j: Any, t_row: Any, t_col: Any) -> Any:
     """(value, d_row, d_col) from c[i : i + 6, j : j + 6]; reads two values to the right of them.
 
-    The fractions t_row and t_col count from the third of the six. c has to be contiguous.
+    The fractions t_row and t_col count from the third of the six. c has to be contiguous, and to
+    have a row below the six: what is read to the right of the last column is that row's beginning.
     """
     if c.layout != "C":
         return None
