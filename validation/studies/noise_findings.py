@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,13 @@ from modeharvest.validation.studies.noise_levels import (
     read_levels,
 )
 from modeharvest.validation.studies.noise_plots import (
+    draw_bars,
     draw_causes,
     draw_levels,
     draw_maps,
     draw_unknowns,
 )
+from modeharvest.validation.studies.noise_statistics import Share
 from modeharvest.validation.studies.study import Findings, KeyNumber
 from modeharvest.validation.studies.subject import Scene
 
@@ -48,9 +51,9 @@ def findings(table: pd.DataFrame, scene: Scene, seeds: str) -> Findings:
     """
     points, home = Points.of(scene), WithoutNoise.of(table)
     levels = read_levels(table, home, points)
-    ours = against(levels, home, "least")
+    ours, soft = against(levels, home, "least"), against(levels, home, SOFTENED)
     shown = sorted(levels)[len(levels) // 2]
-    summary = _summary(levels, ours, against(levels, home, SOFTENED), scene)
+    summary = _summary(levels, ours, soft, scene)
     causes = _causes(levels, home)
     pairs = max(len(parts["u"].errors) for parts in levels.values())
     made = f"{pairs} pairs of realisations; {seeds}"
@@ -70,14 +73,18 @@ def findings(table: pd.DataFrame, scene: Scene, seeds: str) -> Findings:
         keys=_keys(levels, ours, shown),
         plots=(
             draw_causes(causes, made),
-            draw_levels(ours, "ratio", "rms error / least of this estimator [-]", made),
-            draw_levels(levels, "bias", "bias / Cramér–Rao bound [-]", made),
-            draw_levels(ours, "coverage", "share in 95 % intervals [-]", made),
+            draw_levels(ours, "ratio", made),
+            draw_levels(levels, "bias", made),
+            draw_levels(ours, "coverage", made),
+            draw_bars(
+                {"curvature, det F, gradient": ours, "curvature": soft, "JᵀJ only": levels}, made
+            ),
             draw_unknowns(ours[shown]["unknowns"], scene.ansatz.names, shown, made),
             draw_maps(ours[shown], points, shown, made),
         ),
-        tables={"Noise levels": summary, "Causes": causes},
+        tables={"Noise levels": _to_read(summary), "Causes": causes.round(3)},
         attachments={
+            "Noise levels": summary,
             "Each unknown": _unknowns(levels, ours, scene),
             "Maps": _maps(levels, ours, points),
         },
@@ -125,6 +132,21 @@ def _summary(levels: Levels, ours: Levels, soft: Levels, scene: Scene) -> pd.Dat
     return pd.DataFrame(rows)
 
 
+def _to_read(summary: pd.DataFrame) -> pd.DataFrame:
+    """The same with values and their standard errors together."""
+    read, last = pd.DataFrame(), ""
+    for name in summary:
+        if name.startswith("±"):
+            read[last] = [
+                str(Share(*pair)) for pair in zip(summary[last], summary[name], strict=True)
+            ]
+        else:
+            shares = name.startswith("by ")
+            read[name] = summary[name].map("{:.3f}".format) if shares else summary[name]
+            last = name
+    return read
+
+
 def _causes(levels: Levels, home: WithoutNoise) -> pd.DataFrame:
     """Rms standard deviation or error over the bound, by causes and as measured; by fields."""
     first = levels[min(levels)]
@@ -140,7 +162,7 @@ def _causes(levels: Levels, home: WithoutNoise) -> pd.DataFrame:
     rows = [{k: v if k == "what" else v / bound[k] for k, v in row.items()} for row in rows]
     for level, parts in sorted(levels.items()):
         measured = {name: parts[name].ratio.value for name in PARTS}
-        rows.append({"what": f"measured at {100 * level:g} %", **measured})
+        rows.append({"what": f"measured at {100 * level:g}\u00a0%", **measured})
     return pd.DataFrame(rows)
 
 
@@ -202,18 +224,32 @@ def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
 
 def _level_sentences(levels: Levels, ours: Levels, scene: Scene) -> tuple[str, ...]:
     px = scene.images.grid.pixel_size
-    said = []
-    for level, parts in sorted(levels.items()):
-        u, least = parts["u"], ours[level]["u"]
-        unknowns = ours[level]["unknowns"].standardised
-        said.append(
-            f"At {100 * level:g} % of noise in both images the displacement's rms error is "
-            f"{least.ratio} times the least that this estimator can do, {u.ratio} times the "
-            f"Cramér–Rao bound of {short(u.rms_bound / px)} px; its bias is {u.bias} times the "
-            f"bound; 95 % intervals hold {unknowns.coverage} of the unknowns and "
-            f"{least.coverage} of the displacement."
+    at = "at " + _listed(f"{100 * level:g}" for level in levels) + " % of noise in both images"
+    shares = [
+        (
+            ours[level]["u"].ratio, parts["u"].ratio, parts["u"].bias,
+            ours[level]["unknowns"].standardised.coverage, ours[level]["u"].coverage,
         )
-    return tuple(said)
+        for level, parts in levels.items()
+    ]  # fmt: skip
+    ratio, over, bias, held, held_u = (
+        _listed(map(str, column)) for column in zip(*shares, strict=True)
+    )
+    bound = levels[min(levels)]["u"].rms_bound / px / (100.0 * min(levels))
+    return (
+        f"The displacement's rms error is {ratio} times the least that this estimator can do, "
+        f"{at}.",
+        f"It is {over} times the Cramér–Rao bound, which is {short(bound)} px rms for each per "
+        "cent of noise.",
+        f"Of the 95 % intervals {held} hold the unknowns, and {held_u} the displacement.",
+        f"The bias of the displacement is {bias} times the bound.",
+    )
+
+
+def _listed(words: Iterable[str]) -> str:
+    """With commas, and an "and" before the last."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _cause_sentence(causes: pd.DataFrame) -> str:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from modeharvest.files import atomic
 from modeharvest.validation.page import render
 from modeharvest.validation.report import Picture
@@ -64,12 +66,26 @@ def write_study_report(path: Path | str, run: StudyRun) -> None:
     pictures = [_picture(plot, run) for plot in run.findings.plots]
     tables = [
         {"id": f"table-{slug(title)}", "title": title, "file": f"{slug(title)}.csv",
-         "columns": list(table.columns), "rows": table.astype(object).values.tolist()}
+         "columns": list(table.columns), "numbers": _numbers(table),
+         "rows": table.astype(object).values.tolist()}
         for title, table in run.findings.tables.items()
     ]  # fmt: skip
-    page = render(TEMPLATE, title=run.title, run=run, pictures=pictures, tables=tables)
+    sentences = [_together(sentence) for sentence in run.findings.sentences]
+    page = render(
+        TEMPLATE, title=run.title, run=run, sentences=sentences, pictures=pictures, tables=tables
+    )
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
+
+
+def _numbers(table: pd.DataFrame) -> list[str]:
+    """The columns of numbers, as such or in words that begin with one; not the first."""
+    others = [str(name) for name in table.columns[1:]]
+    return [name for name in others if table[name].map(_is_number).all()]
+
+
+def _is_number(cell: object) -> bool:
+    return not isinstance(cell, str) or cell[:1].isdigit()
 
 
 def slug(title: str) -> str:
@@ -80,4 +96,9 @@ def slug(title: str) -> str:
 def _picture(plot: Plot, run: StudyRun) -> dict[str, Any]:
     svg = to_svg(plot.drawn, plot.name, plot.title)
     made = Picture(plot.name, plot.title, svg, f"{run.command} · {run.seeds}")
-    return {"plot": plot, "picture": made}
+    return {"plot": plot, "picture": made, "caption": _together(plot.caption)}
+
+
+def _together(words: str) -> str:
+    """No line ends between a number and its unit or error."""
+    return re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", "\N{NO-BREAK SPACE}", words)

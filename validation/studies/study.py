@@ -75,7 +75,8 @@ class Findings:
     tables
         Tables by their titles.
     attachments
-        Tables that are too long for the page: files only.
+        Tables that are too long for the page: files only; or, by the title of a table that is
+        written to be read, the same in numbers, which its file then holds.
     """
 
     numbers: Mapping[str, Any]
