@@ -28,6 +28,7 @@ FloatArray = NDArray[np.float64]
 QUANTITIES = ("v0", "v1", "v1phi1", "u")
 FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
 """Whose noise counts against the waves of a part."""
+MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 held"}
 _SUBSET_PX = 33
 """A subset whose indicator stands for all: theory gives nearly the same for every size."""
 
@@ -46,6 +47,8 @@ class Degree:
         n by quantity, :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px].
     indicator_px2
         n l10 by part; l10 is the geometric mean of both axes' [px^2].
+    held_px2
+        That of v1 phi1 without motion, its phi1 held [px^2].
     """
 
     degree: int
@@ -53,6 +56,7 @@ class Degree:
     finest_px: Mapping[str, float]
     floor_px: Mapping[str, float]
     indicator_px2: Mapping[str, float]
+    held_px2: float
 
 
 def findings(table: pd.DataFrame, subject: Subject, curves: Curves, seeds: str) -> Findings:
@@ -81,7 +85,7 @@ def findings(table: pd.DataFrame, subject: Subject, curves: Curves, seeds: str) 
             "affine_subset_indicator_px2": local,
             "images_against_best_fits": waves.to_dict("records"),
             "noise": floors.to_dict("records"),
-            "cross_talk": _cross_talk(curves),
+            "cross_talk": dict(zip(("any_period", "resolved"), cross_talk(curves), strict=True)),
             "longest_retuned": _retuned(passband),
         },
         sentences=_sentences(degrees, chosen, subject, curves, waves, floors, passband, local),
@@ -102,45 +106,56 @@ def findings(table: pd.DataFrame, subject: Subject, curves: Curves, seeds: str) 
 
 def _degrees(done: pd.DataFrame, subject: Subject, curves: Curves) -> list[Degree]:
     """Every degree whose floor is known."""
-    floors = done[(done["task"] == "floor") & (done["motion"] == "buckled")]
-    if not len(floors):
+    floors = done[done["task"] == "floor"]
+    buckled = floors[floors["motion"] == "buckled"].sort_values("degree")
+    still = floors[floors["motion"] == "still"].set_index("degree")
+    if not len(buckled):
         raise InputError("study: expected the noise floor of a degree at least, got none")
-    px, found = subject.buckled.pixel_size, []
-    for _, row in floors.sort_values("degree").iterrows():
-        degree = int(row["degree"])
-        finest = {
-            f"{part} {name}": curves.finest(part, axis, degree) / px
-            for part in WAVED
-            for axis, name in enumerate(AXES)
-        }
-        floor = {name: float(row[f"{name}_px"]) for name in QUANTITIES}
-        indicator = {
-            part: floor[FLOOR_OF[part]] * float(np.sqrt(finest[f"{part} x"] * finest[f"{part} y"]))
-            for part in WAVED
-        }
-        found.append(Degree(degree, int(row["unknowns"]), finest, floor, indicator))
-    return found
+    return [
+        _degree(row, still["v1phi1"].get(row["degree"], np.nan), subject, curves)
+        for _, row in buckled.iterrows()
+    ]
+
+
+def _degree(row: pd.Series, held: float, subject: Subject, curves: Curves) -> Degree:
+    """One of them; ``held`` is the floor of v1 phi1 without motion [px]."""
+    degree, px = int(row["degree"]), subject.buckled.pixel_size
+    finest = {
+        f"{part} {name}": curves.finest(part, axis, degree) / px
+        for part in WAVED
+        for axis, name in enumerate(AXES)
+    }
+    mean = {part: float(np.sqrt(finest[f"{part} x"] * finest[f"{part} y"])) for part in WAVED}
+    floor = {name: float(row[name]) for name in QUANTITIES}
+    indicator = {part: floor[FLOOR_OF[part]] * mean[part] for part in WAVED}
+    unknowns = int(row["unknowns"])
+    return Degree(degree, unknowns, finest, floor, indicator, float(held) * mean["v1"])
 
 
 def noise_floors(done: pd.DataFrame, subject: Subject) -> pd.DataFrame:
-    """Scatter under noise against what the covariance says, by motion, degree and quantity."""
+    """Scatter under noise against what each result's covariance tells, and the least there can be.
+
+    The rms over realisations and material [px], by motion, degree and quantity.
+    """
     rows = []
-    for motion, what in (("buckled", "under the base motion"), ("still", "without motion")):
+    for motion, what in MOTIONS.items():
         noisy = done[(done["task"] == "noise") & (done["motion"] == motion)]
         floors = done[(done["task"] == "floor") & (done["motion"] == motion)]
         for degree in subject.measured:
-            bound = floors[floors["degree"] == degree]
-            if len(noisy) < 2 or not len(bound):
+            least = floors[floors["degree"] == degree]
+            if len(noisy) < 2 or not len(least):
                 continue
             for name in QUANTITIES:
                 squares = noisy[f"{name}_{degree}"].to_numpy(float) ** 2
+                told = float(np.sqrt((noisy[f"told_{name}_{degree}"] ** 2).mean()))
                 scatter = float(np.sqrt(squares.mean()))
                 error = squares.std(ddof=1) / np.sqrt(len(squares)) / (2.0 * scatter)
-                least = float(bound[f"{name}_px"].iloc[0])
                 rows.append({
                     "images": what, "degree": degree, "quantity": name,
-                    "by covariance [px]": least, "Monte Carlo [px]": scatter,
-                    "ratio": scatter / least, "± (1)": error / least,
+                    "bound [10⁻³ px]": 1e3 * float(least[name].iloc[0]),
+                    "told by covariance [10⁻³ px]": 1e3 * told,
+                    "Monte Carlo [10⁻³ px]": 1e3 * scatter,
+                    "Monte Carlo / told": scatter / told, "±": error / told,
                 })  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -173,9 +188,14 @@ def subset_indicator(subject: Subject) -> float:
     return float(floor * finest)
 
 
-def _cross_talk(curves: Curves) -> float:
-    """The largest share of a wave of one part that is found in the other."""
-    return max(float(np.abs(curves.whole[key] - curves.own[key]).max()) for key in curves.own)
+def cross_talk(curves: Curves) -> tuple[float, float]:
+    """The largest share of a wave of one part found in the other: at any period, from l10 on."""
+    everywhere, resolved = [], []
+    for key, own in curves.own.items():
+        other = np.abs(curves.whole[key] - own)
+        everywhere.append(other.max())
+        resolved.append(other[curves.periods >= curves.finest(*key)].max())
+    return float(max(everywhere)), float(max(resolved))
 
 
 def _retuned(passband: Passband) -> float:
@@ -200,6 +220,7 @@ def _by_degree(degrees: list[Degree], subject: Subject) -> pd.DataFrame:
                 row[f"{part} {axis} [cells]"] = at * px / pitch
         row |= {f"n of {name} [10⁻³ px]": 1e3 * d.floor_px[name] for name in QUANTITIES}
         row |= {f"n l10 of {part} [px²]": d.indicator_px2[part] for part in WAVED}
+        row["of v1, φ1 held [px²]"] = d.held_px2
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -256,23 +277,24 @@ def _sentences(
         f"{1e3 * last.floor_px['v0']:.2g} · 10⁻³ px, that of v1 φ1 from "
         f"{1e3 * first.floor_px['v1phi1']:.2g} to {1e3 * last.floor_px['v1phi1']:.2g} · 10⁻³ px.",
         _product_said(degrees, local),
-        "So no degree is better than another by the indicator alone: take the smallest whose "
-        "period is below what v0 and v1 are expected to show, and no more; noise is what every "
-        "further degree costs.",
+        "What a degree gains in resolution it costs in noise, so the indicator does not choose: "
+        "take the smallest degree whose period is below what v0 and v1 are expected to show.",
     ]
     if len(waves):
         worst = float(waves["difference"].abs().max())
+        anywhere, resolved = cross_talk(curves)
         said.append(
             f"Correlated images give what the best fits promise: shares of waves of "
             f"{subject.amplitude_px:g} px differ by {100 * worst:.1f} % of the amplitude at most. "
-            f"Of a wave of one part at most {100 * _cross_talk(curves):.1f} % is found in the "
-            "other."
+            f"Of a wave of one part up to {100 * resolved:.1f} % is found in the other where it "
+            f"is resolved, up to {100 * anywhere:.0f} % where it isn't."
         )
     if len(floors):
-        low, high = floors["ratio"].min(), floors["ratio"].max()
+        ratio = floors["Monte Carlo / told"]
         said.append(
-            f"Scatter under noise is {low:.2f} to {high:.2f} times what the covariance says, with "
-            "and without motion."
+            f"Scatter under noise is {ratio.min():.2f} to {ratio.max():.2f} times what the "
+            f"results' own covariance tells, each ± {floors['±'].mean():.2f}, with and without "
+            "motion."
         )
     said.append(_retuned_said(passband, chosen, b.specimen.pitch / b.pixel_size))
     return tuple(said)
@@ -280,12 +302,16 @@ def _sentences(
 
 def _product_said(degrees: list[Degree], local: float) -> str:
     """How constant the indicator is."""
-    ends = {part: [f([d.indicator_px2[part] for d in degrees]) for f in (min, max)]
-            for part in WAVED}  # fmt: skip
+    first, last = degrees[0], degrees[-1]
+    v0 = [d.indicator_px2["v0"] for d in degrees]
+    gain = first.finest_px["v0 x"] / last.finest_px["v0 x"]
     return (
-        f"Their product hardly changes: {ends['v0'][0]:.2f} to {ends['v0'][1]:.2f} px² for v0 and "
-        f"{ends['v1'][0]:.2f} to {ends['v1'][1]:.2f} px² for v1 φ1; an affine subset on the same "
-        f"speckle under the same noise has {local:.2f} px², whatever its size (theory)."
+        f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
+        f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
+        f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², since φ1's own "
+        "parameters cost their noise at every degree; with φ1 held and without motion it is "
+        f"{first.held_px2:.2f} to {last.held_px2:.2f} px². An affine subset on the same speckle "
+        f"under the same noise has {local:.2f} px², whatever its size (theory)."
     )
 
 

@@ -179,45 +179,53 @@ def _floor(case: Mapping[str, Any], folder: Path) -> Row:
     name = case["subject"]
     subject = Subject.read(folder, name)
     result = _quiet(folder, name, case["motion"], case["degree"])
+    told = _told(subject, result, 2.0 * subject.noise**2 * result.inverse)
+    return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **told}
+
+
+def _told(subject: Subject, result: Result, covariance: FloatArray) -> Row:
+    """Rms standard deviations of the fields by a covariance of the unknowns [px]."""
     points, cellular = subject.sparse
-    covariance = 2.0 * subject.noise**2 * result.inverse
     errors = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
     px = subject.buckled.pixel_size
     return {
-        "unknowns": result.ansatz.size,
-        "outcome": result.outcome.value,
-        "v0_px": rms(errors.v0) / px,
-        "v1_px": LARGEST * rms(errors.v[0][cellular]) / px,
-        "v1phi1_px": rms(errors.fluctuation[0][cellular]) / px,
-        "u_px": rms(errors.displacement) / px,
+        "v0": rms(errors.v0) / px,
+        "v1": LARGEST * rms(errors.v[0][cellular]) / px,
+        "v1phi1": rms(errors.fluctuation[0][cellular]) / px,
+        "u": rms(errors.displacement) / px,
     }
 
 
 def _noise(case: Mapping[str, Any], folder: Path) -> Row:
-    """Fields at the points from noisy images, less those from exact ones, by degree [px]."""
-    name = case["subject"]
+    """Errors of fields from noisy images, and those their covariance tells, by degree [px]."""
+    name, motion = case["subject"], case["motion"]
     subject = Subject.read(folder, name)
-    rng = np.random.default_rng([case["seed"], case["number"], case["motion"] == "still"])
-    pair = _exact(folder, name, case["motion"]).noisy(subject.noise, rng)
-    points, cellular = subject.sparse
-    px = subject.buckled.pixel_size
+    rng = np.random.default_rng([case["seed"], case["number"], motion == "still"])
+    pair = _exact(folder, name, motion).noisy(subject.noise, rng)
     row: Row = {}
     for degree in subject.measured:
-        found = subject.correlate(pair, degree, case["motion"])
-        quiet = _quiet(folder, name, case["motion"], degree)
-        v0, v1phi1 = (_at(found, part, points) - _at(quiet, part, points) for part in ("v0", "v1"))
-        x, y = points[:, 0, None], points[:, 1, None]
-        v1 = (found.ansatz.v(0, found.unknowns, x, y) - quiet.ansatz.v(0, quiet.unknowns, x, y))[
-            :, 0
-        ]
-        row |= {
-            f"v0_{degree}": rms(v0) / px,
-            f"v1_{degree}": LARGEST * rms(v1[cellular]) / px,
-            f"v1phi1_{degree}": rms(v1phi1[cellular]) / px,
-            f"u_{degree}": rms(v0 + v1phi1) / px,
-            f"outcome_{degree}": found.outcome.value,
-        }
+        found = subject.correlate(pair, degree, motion)
+        errors = _errors(subject, found, _quiet(folder, name, motion, degree))
+        told = _told(subject, found, found.covariance(subject.noise))
+        row |= {f"{key}_{degree}": value for key, value in errors.items()}
+        row |= {f"told_{key}_{degree}": value for key, value in told.items()}
+        row[f"outcome_{degree}"] = found.outcome.value
     return row
+
+
+def _errors(subject: Subject, found: Result, quiet: Result) -> Row:
+    """Rms differences of the fields of two results [px]."""
+    points, cellular = subject.sparse
+    x, y = points[:, 0, None], points[:, 1, None]
+    v0, v1phi1 = (_at(found, part, points) - _at(quiet, part, points) for part in ("v0", "v1"))
+    v1 = found.ansatz.v(0, found.unknowns, x, y) - quiet.ansatz.v(0, quiet.unknowns, x, y)
+    px = subject.buckled.pixel_size
+    return {
+        "v0": rms(v0) / px,
+        "v1": LARGEST * rms(v1[cellular]) / px,
+        "v1phi1": rms(v1phi1[cellular]) / px,
+        "u": rms(v0 + v1phi1) / px,
+    }
 
 
 def rms(values: FloatArray) -> float:

@@ -50,9 +50,14 @@ def draw_transfer(part: str, curves: Curves, waves: pd.DataFrame, subject: Subje
                        loc="lower right")  # fmt: skip
         drawn.tight_layout()
     caption = (
-        f"Waves of {part}, mean over their phase. Lines: best fits of the ansatz to the "
-        "displacement; dots: correlated images. Dotted: 10 % are lost."
+        f"Waves of {part}, over both phases. Lines: best fits of the ansatz to the displacement; "
+        "dots: correlated images. Dotted: 10 % are lost."
     )
+    if part == "v1":
+        caption += (
+            " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds "
+            "cos(πx/l) / 2."
+        )
     return Plot(f"transfer-{part}", f"What is found of a wave of {part}", drawn, caption, wide=True)
 
 

@@ -89,7 +89,7 @@ class StarSpec:
 _SPEC = TypeAdapter(StarSpec)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StarSet:
     """A star set in its folder.
 

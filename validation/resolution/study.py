@@ -15,12 +15,10 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case, grid
 from modeharvest.validation.resolution.buckled import Buckled
 from modeharvest.validation.resolution.curves import AXES, WAVED, Curves
-from modeharvest.validation.resolution.findings import findings
+from modeharvest.validation.resolution.findings import MOTIONS, findings
 from modeharvest.validation.resolution.measure import Subject
 from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject as Experiment
-
-MOTIONS = ("buckled", "still")
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,10 @@ class Resolution:
             "subject": measured.write(folder), "task": "floor", "motion": "buckled", "part": "",
             "axis": 0, "period": 0.0, "phase": 0.0, "degree": 0, "number": 0, "seed": self.seed,
         }  # fmt: skip
-        floors = grid(base, motion=MOTIONS, degree=self.degrees)
-        noise = grid({**base, "task": "noise"}, motion=MOTIONS, number=range(self.realisations))
+        floors = grid(base, motion=tuple(MOTIONS), degree=self.degrees)
+        noise = grid(
+            {**base, "task": "noise"}, motion=tuple(MOTIONS), number=range(self.realisations)
+        )
         curves = Curves.of(measured, self.measured, progress)
         waves = [
             {**base, "task": "wave", "part": part, "axis": axis, "phase": phase,
