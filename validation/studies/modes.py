@@ -16,7 +16,8 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.lattice.independence import MATERIALS
 from modeharvest.validation.studies import modes_findings as told
-from modeharvest.validation.studies.modes_specimen import Description, folder_of, one_specimen
+from modeharvest.validation.studies.modes_description import Description, folder_of
+from modeharvest.validation.studies.modes_specimen import one_specimen
 from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject
 

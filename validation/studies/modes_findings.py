@@ -10,7 +10,8 @@ import pandas as pd
 
 from modeharvest.validation.page import short
 from modeharvest.validation.studies import modes_plots as plots
-from modeharvest.validation.studies.modes_specimen import PARAMETERS, folder_of
+from modeharvest.validation.studies.modes_description import folder_of
+from modeharvest.validation.studies.modes_specimen import PARAMETERS
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
 
 IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
@@ -104,7 +105,8 @@ def misses(seen: pd.DataFrame) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _percent(values: Any) -> str:
-    return f"{100.0 * float(np.max(np.abs(values))):.2g} %"
+    """The largest size of some values, no smaller than anyone cares for."""
+    return f"{max(0.001, 100.0 * float(np.max(np.abs(values)))):.2g} %"
 
 
 def _between(values: pd.Series) -> str:
@@ -140,7 +142,7 @@ def _of_parameters(sizes: pd.DataFrame) -> list[str]:
     off, best = deviations(sizes), deviations(sizes, "best_")
     apart = misses(sizes)
     return [
-        f"On {len(sizes)} specimens with d/l from {sizes['ratio'].min():.3g} to "
+        f"On {len(sizes)} specimen{'s' if len(sizes) > 1 else ''} with d/l from {sizes['ratio'].min():.3g} to "
         f"{sizes['ratio'].max():.3g} the measured wave vectors are within "
         f"{_percent(off[_WAVES])} of Eq. (mode), a₁ within {_percent(off['a1'])} of 1, the "
         f"phases within {_percent(off[['a6', 'a7']])} of l.",

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.tri import Triangulation
@@ -38,7 +39,9 @@ _PHASES = {"a6": BLUE, "a7": RED}
 _IDEAL = {"a1": 1.0, "a2": 1.0, "a3": 1.0, "a4": -1.0, "a5": 1.0, "a6": 0.0, "a7": 0.0}
 """Eq. (mode) with a solid junction at the origin; phases in shares of l."""
 _FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # triangles of a T6
-_PATTERN_END, _LEFT_END = 0.16, 0.03  # of the colours, in l
+_PATTERN_END, _LEFT_END = 0.15, 0.03  # of the colours, in l
+_PAGE, _WIDEST = 8.9, 1.7  # of all specimens, and of one [in]
+_ROWS = ("truth − v₀", "measured v₁φ₁", "truth − IDIC")
 
 
 def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], label: str) -> Figure:
@@ -186,26 +189,26 @@ def draw_patterns(specimens: Mapping[str, Patterns], name: str, title: str) -> P
         Of the picture.
     """
     with style():
-        width = 9.0
-        each = width / len(specimens)
-        tall = max(_aspect(p.mesh) for p in specimens.values()) * each
-        drawn = figure(width + 0.6, 3.0 * tall + 0.35)
+        each = min(_WIDEST, _PAGE / len(specimens))
+        window = np.max([_window(p) for p in specimens.values()], axis=0)
+        tall = each * window[1] / window[0]
+        wide = 0.2 + len(specimens) * each + 0.6
+        drawn = figure(wide, 3.0 * tall + 0.3)
         grid = drawn.subplots(3, len(specimens), squeeze=False)
         pattern = Scale(SIGNED, -_PATTERN_END, _PATTERN_END, "l", "both")
         left = Scale(SIGNED, -_LEFT_END, _LEFT_END, "l", "both")
         for column, (text, p) in zip(grid.T, specimens.items(), strict=True):
-            column[0].set_title(text, fontsize=8)
-            _show(column[0], p, p.pattern, p.displacement, pattern)
-            _show(column[1], p, p.found_pattern, p.found, pattern)
-            _show(column[2], p, p.displacement - p.found, p.displacement, left)
-        for axes, text in zip(
-            grid[:, 0], ("truth − v₀", "measured v₁φ₁", "truth − IDIC"), strict=True
-        ):
-            axes.text(-0.04, 0.5, text, transform=axes.transAxes, rotation=90, va="center",
-                      ha="right", fontsize=8)  # fmt: skip
-        drawn.subplots_adjust(0.03, 0.01, 0.93, 0.95, 0.03, 0.03)
-        for axes, scale in ((grid[0, -1], pattern), (grid[2, -1], left)):
-            _bar(axes, scale)
+            column[0].set_title(text, fontsize=7.5)
+            _show(column[0], p, p.pattern, p.displacement, pattern, window)
+            _show(column[1], p, p.found_pattern, p.found, pattern, window)
+            _show(column[2], p, p.displacement - p.found, p.displacement, left, window)
+        for axes, text in zip(grid[:, 0], _ROWS, strict=True):
+            axes.text(-0.02, 0.5, text, transform=axes.transAxes, rotation=90, va="center",
+                      ha="right", fontsize=7.5)  # fmt: skip
+        top = 1.0 - 0.25 / drawn.get_figheight()
+        drawn.subplots_adjust(0.2 / wide, 0.0, 1.0 - 0.6 / wide, top, 0.02, 0.02)
+        for row, scale in ((0, pattern), (1, pattern), (2, left)):
+            _bar(grid[row, -1], scale)
     caption = (
         "The component across the load, in shares of l, on the specimens as they are deformed. v₀ "
         "is the best fit’s. The colours of what is left are finer."
@@ -213,12 +216,14 @@ def draw_patterns(specimens: Mapping[str, Patterns], name: str, title: str) -> P
     return Plot(name, title, drawn, caption, wide=True)
 
 
-def _aspect(mesh: Mesh) -> float:
-    width, height = np.ptp(mesh.nodes, axis=0)
-    return float(height / width)
+def _window(p: Patterns) -> FloatArray:
+    """(2,) width and height that hold a specimen as it is deformed [mm]."""
+    return np.asarray(2.02 * np.abs(p.mesh.nodes + p.displacement).max(axis=0))
 
 
-def _show(axes: Axes, p: Patterns, field: FloatArray, moved: FloatArray, scale: Scale) -> None:
+def _show(
+    axes: Axes, p: Patterns, field: FloatArray, moved: FloatArray, scale: Scale, window: FloatArray
+) -> None:
     nodes = p.mesh.nodes + moved
     triangles = p.mesh.cells[:, np.array(_FINER)].reshape(-1, 3)
     net = Triangulation(nodes[:, 0], nodes[:, 1], triangles)
@@ -226,14 +231,16 @@ def _show(axes: Axes, p: Patterns, field: FloatArray, moved: FloatArray, scale: 
                    norm=scale.normalise, rasterized=True)  # fmt: skip
     axes.add_patch(PathPatch(Outline.of(p.mesh).path(moved), fill=False, ec=MUTED, lw=0.3,
                              rasterized=True))  # fmt: skip
-    (left, bottom), (right, top) = p.mesh.nodes.min(axis=0), p.mesh.nodes.max(axis=0)
-    axes.set(xlim=(left, right), ylim=(1.02 * bottom, 1.02 * top), aspect="equal")
+    width, height = window
+    axes.set(xlim=(-0.5 * width, 0.5 * width), ylim=(-0.5 * height, 0.5 * height), aspect="equal")
     axes.set_axis_off()
 
 
 def _bar(axes: Axes, scale: Scale) -> None:
-    from matplotlib.cm import ScalarMappable
-
-    place = axes.inset_axes((1.08, 0.1, 0.07, 0.8))
+    place = axes.inset_axes((1.06, 0.12, 0.05, 0.76))
+    ends = [scale.low, 0.0, scale.high]
     axes.figure.colorbar(ScalarMappable(scale.normalise, scale.colours), cax=place, extend="both",
-                         label="l")  # fmt: skip
+                         ticks=ends)  # fmt: skip
+    place.set_yticks(
+        ends, [f"{end:+.2g} l".replace("-", "−") if end else "0" for end in ends], fontsize=6.5
+    )
