@@ -216,12 +216,12 @@ def test_noise_study_on_tiny_images(
     rows = [{**case, "error": "", "seconds": 0.1, **one_realisation(case, folder)}
             for case in cases]  # fmt: skip
     found = study.findings(pd.DataFrame(rows), folder)
-    summary = found.tables["Noise levels"].set_index("quantity")
+    summary = found.attachments["Noise levels"].set_index("quantity")
     # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
     assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
     assert 0.6 < summary.loc["u", "rms error / bound"] < 1.6
     assert len(found.attachments["Each unknown"]) == 77
-    plots = {"causes", "ratio", "bias", "coverage", "unknowns", "maps"}
+    plots = {"causes", "bars", "ratio", "bias", "coverage", "unknowns", "maps"}
     assert plots == {p.name for p in found.plots}
     # n and -n push the other way: what is common to them is of second order.
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
