@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 from known_truth import GRID, PIXEL, STRAIN, Truth
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.pyramid import Level
+from modeharvest.idic.pyramid import FULL
 from modeharvest.idic.result import Result
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.validation.studies.noise_statistics import Pairs, Share
 
 FloatArray = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ EVERY = 8
 
 @dataclass(frozen=True)
 class Noise:
-    """What is wrong with the images.
+    """What is wrong with the images, and how they are correlated.
 
     Parameters
     ----------
@@ -49,15 +49,16 @@ class Noise:
         Standard deviations [fraction of full scale].
     rounded
         No noise but that of rounding to 8 bits.
-    blur_px
-        Gaussian blur of both images before they are correlated [px].
+    gradient, blur_px
+        Of :class:`CorrelationOptions`.
     """
 
     name: str
     in_f: float
     in_g: float
     rounded: bool = False
-    blur_px: float = 0.0
+    gradient: str = "deformed"
+    blur_px: float | None = None
 
     def draw(self, f: FloatArray, g: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
         """Make a realisation for both images."""
@@ -71,49 +72,48 @@ class Noise:
         """``noise_sd`` and ``noisy_images`` of :meth:`Result.covariance`."""
         return max(self.in_f, self.in_g), int(self.in_f > 0) + int(self.in_g > 0)
 
-    def seen(self, image: FloatArray) -> FloatArray:
-        """What is correlated of a noisy image."""
-        return ndimage.gaussian_filter(image, self.blur_px) if self.blur_px else image
-
 
 NOISES = (
     Noise("0.2 % in both", 0.002, 0.002),
     Noise("0.5 % in both", 0.005, 0.005),
     Noise("1 % in both", 0.01, 0.01),
     Noise("2 % in both", 0.02, 0.02),
-    Noise("2 % in both, blurred by 1 px", 0.02, 0.02, blur_px=1.0),
+    Noise("4 % in both", 0.04, 0.04),
     Noise("1 % in g only", 0.0, 0.01),
     Noise("1 % in f only", 0.01, 0.0),
     Noise("8-bit rounding", ROUNDING, ROUNDING, rounded=True),
+    Noise("least squares, 1 % in both", 0.01, 0.01, blur_px=0.0),
+    Noise("least squares, 2 % in both", 0.02, 0.02, blur_px=0.0),
+    Noise("reference's gradient, 2 % in both", 0.02, 0.02, gradient="reference"),
+    Noise("mean gradient, 2 % in both", 0.02, 0.02, gradient="mean"),
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
-    """A part of the displacement at some pixels.
+class Quantity:
+    """A part of the displacement at some pixels, or the unknowns themselves.
 
     Parameters
     ----------
     name
         For the table.
     of
-        From unknowns to (points, components) [mm].
+        From unknowns to an array of any shape.
     S
-        (points, components, n) its derivatives.
+        (..., n) its derivatives.
     """
 
     name: str
     of: Callable[[FloatArray], FloatArray]
     S: FloatArray
 
-    def variance(self, covariance: FloatArray) -> float:
-        """Mean over the points of the variance, all components together [mm^2]."""
-        return float(np.einsum("pcn,nm,pcm->", self.S, covariance, self.S, optimize=True)
-                     / len(self.S))  # fmt: skip
+    def sd(self, covariance: FloatArray) -> FloatArray:
+        """(...): the standard deviations that a covariance of the unknowns means."""
+        return np.sqrt(np.einsum("...n,...n->...", self.S @ covariance, self.S))
 
 
-def fields(truth: Truth) -> list[Field]:
-    """u, v0, v1 and v1 phi1."""
+def quantities(truth: Truth) -> list[Quantity]:
+    """u, v0, v1, v1 phi1 and the unknowns."""
     ansatz = truth.ansatz
     row, col = (at[(truth.used[0] % EVERY == 0) & (truth.used[1] % EVERY == 0)]
                 for at in truth.used)  # fmt: skip
@@ -124,16 +124,18 @@ def fields(truth: Truth) -> list[Field]:
         slow[ansatz.v0_slice(c)] = True
     v = np.zeros((len(row), 1, ansatz.size))
     v[:, 0, ansatz.v_slice(0)] = ansatz.v_space.basis(x, y)[:, 0]
+    pattern = np.where(slow, 0.0, S)
     return [
-        Field("u", lambda a: ansatz.displacement(a, x, y)[:, 0], S),
-        Field("v0", lambda a: ansatz.v0(a, x, y)[:, 0], np.where(slow, S, 0.0)),
-        Field("v1", lambda a: ansatz.v(0, a, x, y), v),
-        Field("v1 phi1", lambda a: ansatz.fluctuation(0, a, x, y)[:, 0], np.where(slow, 0.0, S)),
+        Quantity("u", lambda a: ansatz.displacement(a, x, y)[:, 0], S),
+        Quantity("v0", lambda a: ansatz.v0(a, x, y)[:, 0], np.where(slow, S, 0.0)),
+        Quantity("v1", lambda a: ansatz.v(0, a, x, y), v),
+        Quantity("v1 phi1", lambda a: ansatz.fluctuation(0, a, x, y)[:, 0], pattern),
+        Quantity("unknowns", lambda a: a, np.eye(ansatz.size)),
     ]
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class Realisation:
     """Two correlations with opposite noise.
 
     Parameters
@@ -148,99 +150,80 @@ class Pair:
     found: tuple[Result, Result]
 
 
-def measure(truth: Truth, noise: Noise, pairs: int, standard_start: bool) -> Iterator[Pair]:
-    """Correlate images with n and with -n, a new speckle for each pair."""
+def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Realisation:
+    """Correlate images with n and with -n."""
     ansatz = truth.ansatz
-    options = CorrelationOptions() if standard_start else CorrelationOptions((Level(1, 0.0),))
+    levels = CorrelationOptions().levels if standard_start else (FULL,)
+    options = CorrelationOptions(levels, gradient=noise.gradient, gradient_blur_px=noise.blur_px)
     start = ansatz.start(STRAIN, 1.0) if standard_start else truth.a
-    for seed in range(pairs):
-        speckle = Speckle(SpeckleSpec(seed=seed), GRID.shape)
-        f, g = truth.images(speckle)
-        n_f, n_g = noise.draw(f, g, seed)
-        signed = [(noise.seen(f + s * n_f), noise.seen(g + s * n_g)) for s in (1, -1)]
-        plus, minus = (
-            correlate(*images, GRID, ansatz, start, truth.mask, options=options)
-            for images in signed
-        )
-        yield Pair(truth.bound(speckle, noise.in_f, noise.in_g), (plus, minus))
+    speckle = Speckle(SpeckleSpec(seed=seed), GRID.shape)
+    f, g = truth.images(speckle)
+    n_f, n_g = noise.draw(f, g, seed)
+    plus, minus = (
+        correlate(f + s * n_f, g + s * n_g, GRID, ansatz, start, truth.mask, options=options)
+        for s in (1, -1)
+    )
+    return Realisation(truth.bound(speckle, noise.in_f, noise.in_g), (plus, minus))
 
 
-def judge_field(field: Field, truth: Truth, pairs: list[Pair]) -> dict[str, float]:
-    """Ratio of the rms error to the bound, and bias over the bound, with standard errors."""
-    true, count = field.of(truth.a), len(pairs)
-    errors = np.array([[field.of(r.unknowns) - true for r in p.found] for p in pairs])
-    squares = (errors**2).sum(axis=-1).mean(axis=(1, 2))
-    bound = np.sqrt(np.mean([field.variance(p.bound) for p in pairs]))
-    ratio = np.sqrt(squares.mean()) / bound
-    even, odd = errors.mean(axis=1), 0.5 * (errors[:, 0] - errors[:, 1])
+def judge(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> Pairs:
+    """Errors, what each result tells of them, and the bound."""
+    true = quantity.of(truth.a)
 
-    def mean_square_and_scatter(part: FloatArray) -> tuple[float, float]:
-        mean, variance = part.mean(axis=0), part.var(axis=0, ddof=1)
-        return (float((mean**2).sum(axis=-1).mean()),
-                float(variance.sum(axis=-1).mean()) / count)  # fmt: skip
+    def of_all(value: Callable[[Result], FloatArray]) -> FloatArray:
+        return np.array([[value(r) for r in one.found] for one in made])
 
-    bias, scatter = mean_square_and_scatter(even)
-    drift, drift_scatter = mean_square_and_scatter(odd)
-    return {
-        "bound_px": bound / PIXEL,
-        "ratio": ratio,
-        "ratio_se": 0.5 * ratio * squares.std(ddof=1) / squares.mean() / np.sqrt(count),
-        "bias": np.sqrt(max(0.0, bias - scatter)) / bound,
-        "bias_se": np.sqrt(scatter) / bound,
-        "odd_mean": np.sqrt(drift) / bound,
-        "odd_mean_expected": np.sqrt(drift_scatter) / bound,
-    }
+    return Pairs(
+        of_all(lambda r: quantity.of(r.unknowns) - true),
+        of_all(lambda r: quantity.sd(r.covariance(*noise.as_told))),
+        np.sqrt(np.mean([quantity.sd(one.bound) ** 2 for one in made], axis=0)),
+    )
 
 
-def judge_unknowns(truth: Truth, noise: Noise, pairs: list[Pair]) -> dict[str, Any]:
-    """Standardised errors by the bound, and intervals by what each result says of itself."""
-    n, sd = truth.ansatz.size, noise.as_told
-    errors = np.array([[r.unknowns - truth.a for r in p.found] for p in pairs])
-    distance = np.array([
-        np.mean(np.einsum("sn,nm,sm->s", e, np.linalg.inv(p.bound), e)) / n
-        for e, p in zip(errors, pairs, strict=True)
-    ])  # fmt: skip
-    bound = np.array([np.diag(p.bound) for p in pairs])[:, None]
-    ratio = np.sqrt((errors**2 / bound).mean(axis=(0, 1)))
-    is_white = noise.blur_px == 0.0  # what a result tells is for white noise
-    own = np.array([[np.diag(r.covariance(*sd)) for r in p.found] for p in pairs])
-    covered = (abs(errors) < 1.96 * np.sqrt(own)).mean(axis=(1, 2))
-    return {
-        "chi_square": distance.mean(),
-        "chi_square_se": distance.std(ddof=1) / np.sqrt(len(pairs)),
-        "smallest_ratio": ratio.min(),
-        "largest_ratio": ratio.max(),
-        "told_over_error": float(np.sqrt((own / bound).mean() / (errors**2 / bound).mean()))
-        if is_white else None,
-        "coverage": covered.mean() if is_white else None,
-        "coverage_se": covered.std(ddof=1) / np.sqrt(len(pairs)),
-        "chi_square_of_residual": float(
-            np.mean([r.agreement(*sd).chi_square for p in pairs for r in p.found])
-        ) if is_white and noise.in_f > 0 else None,
-        "not_converged": sum(r.outcome.value != "converged" for p in pairs for r in p.found),
-    }  # fmt: skip
+def chi_square(truth: Truth, made: list[Realisation]) -> Share:
+    """Mean square of the unknowns' errors, standardised by the bound with its correlations."""
+    n = truth.ansatz.size
+    distance = []
+    for one in made:
+        errors = np.array([r.unknowns - truth.a for r in one.found])
+        weighted = np.linalg.solve(one.bound, errors.T).T
+        distance.append((errors * weighted).sum() / len(errors) / n)
+    return Share(float(np.mean(distance)), float(np.std(distance, ddof=1) / np.sqrt(len(made))))
 
 
 def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
     """All rows whose names begin with a text."""
     truth = Truth.default()
-    parts = fields(truth)
-    found: dict[str, Any] = {}
+    parts = quantities(truth)
+    rows: dict[str, Any] = {}
     for noise in (noise for noise in NOISES if noise.name.startswith(only)):
         print(f"{noise.name} ...", file=sys.stderr, flush=True)
-        measured = list(measure(truth, noise, pairs, standard_start))
-        found[noise.name] = {
-            "fields": {field.name: judge_field(field, truth, measured) for field in parts},
-            "unknowns": judge_unknowns(truth, noise, measured),
-        }
+        made = [measure(truth, noise, seed, standard_start) for seed in range(pairs)]
+        judged = {part.name: judge(part, truth, noise, made) for part in parts}
+        results = [r for one in made for r in one.found]
+        unknowns = judged.pop("unknowns").standardised
+        rows[noise.name] = {
+            "bound_px": judged["u"].rms_bound * np.sqrt(2.0) / PIXEL,
+            "blur_px": float(np.mean([r.weighting.blur_px for r in results])),
+            "fields": {name: {"ratio": vars(part.ratio), "bias": vars(part.bias)}
+                       for name, part in judged.items()},
+            "chi_square": vars(chi_square(truth, made)),
+            "ratios": [float(unknowns.ratios.min()), float(unknowns.ratios.max())],
+            "told_over_error": unknowns.told_over_error,
+            "coverage": vars(unknowns.coverage),
+            "chi_square_of_residual": float(
+                np.mean([r.agreement(*noise.as_told).chi_square for r in results])
+            ) if noise.in_f > 0 else None,
+            "not_converged": sum(r.outcome.value != "converged" for r in results),
+        }  # fmt: skip
+    det = np.quantile(np.linalg.det(truth.deformation_gradient), (0.0, 0.5, 1.0))
     return {
         "pairs": pairs,
         "pixels": len(truth.used[0]),
         "unknowns": truth.ansatz.size,
-        "det_F": [float(v) for v in np.quantile(
-            np.linalg.det(truth.deformation_gradient), (0.0, 0.5, 1.0))],
-        "noises": found,
-    }  # fmt: skip
+        "det_F": det.tolist(),
+        "noises": rows,
+    }
 
 
 def tell(found: dict[str, Any]) -> None:
@@ -252,24 +235,20 @@ def tell(found: dict[str, Any]) -> None:
         print(f"| {heading} | bound of u, rms [px] | u | v0 | v1 | v1 phi1 |")
         print("|---|---|---|---|---|---|")
         for noise, row in found["noises"].items():
-            cells = [f"{f[key]:.3f} ± {f[key + '_se']:.3f}"
-                     for f in row["fields"].values()]  # fmt: skip
-            print(f"| {noise} | {row['fields']['u']['bound_px']:.2e} | {' | '.join(cells)} |")
+            cells = " | ".join(str(Share(**f[key])) for f in row["fields"].values())
+            print(f"| {noise} | {row['bound_px']:.2e} | {cells} |")
         print()
-    print("| noise | chi squared of the unknowns | each unknown's rms error / bound | told "
-          "standard error / rms error | share in 95 % intervals | chi squared of the residual |\n"
-          "|---|---|---|---|---|---|")  # fmt: skip
+    print("| noise | blur of the gradient [px] | chi squared of the unknowns | each unknown's rms "
+          "error / bound | told standard error / rms error | share in 95 % intervals | chi "
+          "squared of the residual |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for noise, row in found["noises"].items():
-        u = row["unknowns"]
-        told, covered, residual = (
-            "–" if u[key] is None else f"{u[key]:.3f}"
-            for key in ("told_over_error", "coverage", "chi_square_of_residual")
-        )
-        print(f"| {noise} | {u['chi_square']:.3f} ± {u['chi_square_se']:.3f} | "
-              f"{u['smallest_ratio']:.2f} – {u['largest_ratio']:.2f} | {told} | {covered} ± "
-              f"{u['coverage_se']:.3f} | {residual} |")  # fmt: skip
-        if u["not_converged"]:
-            print(f"{noise}: {u['not_converged']} correlations did not converge")
+        residual = row["chi_square_of_residual"]
+        print(f"| {noise} | {row['blur_px']:.2f} | {Share(**row['chi_square'])} | "
+              f"{row['ratios'][0]:.2f} – {row['ratios'][1]:.2f} | {row['told_over_error']:.3f} | "
+              f"{Share(**row['coverage'])} | "
+              f"{'–' if residual is None else format(residual, '.3f')} |")  # fmt: skip
+        if row["not_converged"]:
+            print(f"{noise}: {row['not_converged']} correlations did not converge")
 
 
 def main() -> None:

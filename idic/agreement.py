@@ -19,8 +19,10 @@ from modeharvest.errors import InputError
 from modeharvest.idic.residual_sums import block_moments, lagged_products
 from modeharvest.imaging.interpolation import SplineImage
 
+_SPARED_PX = 3
+"""The deformed image's spline correlates its noise over fewer pixels than that by more than 2 %."""
 LAGS_PX = (4, 6, 8, 10, 12)
-"""Beyond what the spline itself correlates (0.43 per px), within a speckle of 10 px."""
+"""What :func:`lags_for` gives for the paper's speckle, 12 px wide."""
 BLOCK_PX, MATCH = 32, 0.3
 """Blocks of about three speckles, and the correlation below which they don't match."""
 TRAPPED = 0.1
@@ -40,17 +42,20 @@ class Agreement:
     Parameters
     ----------
     correlation
-        Rms autocorrelation of the residual at ``LAGS_PX`` along rows and columns [-].
+        Rms autocorrelation of the residual at ``lags_px`` along rows and columns [-].
     pixels
         In the residual.
     chi_square
         Sum of squares of the residual over what the noise predicts; 1 is agreement [-]. NaN
         where the noise is not known.
+    lags_px
+        Distances at which the residual was compared with itself [px].
     """
 
     correlation: float
     pixels: int
     chi_square: float = float("nan")
+    lags_px: tuple[int, ...] = LAGS_PX
 
     @classmethod
     def of(
@@ -62,6 +67,7 @@ class Agreement:
         noise_sd: float | None = None,
         noisy_images: int = 2,
         order: int = 5,
+        lags_px: tuple[int, ...] = LAGS_PX,
     ) -> Agreement:
         """Judge a residual.
 
@@ -77,6 +83,8 @@ class Agreement:
             2 if both images are noisy, 1 if only the reference is.
         order
             Of the spline, which smooths the deformed image's noise.
+        lags_px
+            Where the autocorrelation was taken.
 
         Raises
         ------
@@ -84,7 +92,7 @@ class Agreement:
             If the noise is not positive.
         """
         if noise_sd is None:
-            return cls(correlation, pixels)
+            return cls(correlation, pixels, lags_px=lags_px)
         if not noise_sd > 0 or noisy_images not in (1, 2):
             raise InputError(
                 "expected a noise of more than 0 grey levels in 1 or 2 images, got "
@@ -92,9 +100,8 @@ class Agreement:
             )
         passed = spline_noise(order) if noisy_images == 2 else 0.0
         freedom = max(1, pixels - unknowns)
-        return cls(
-            correlation, pixels, residual_rms**2 * pixels / freedom / noise_sd**2 / (1.0 + passed)
-        )
+        chi_square = residual_rms**2 * pixels / freedom / noise_sd**2 / (1.0 + passed)
+        return cls(correlation, pixels, chi_square, lags_px)
 
     @property
     def is_white(self) -> bool:
@@ -119,9 +126,9 @@ class Agreement:
                 "noise is not what it is said to be."
             )
         return (
-            f"The residual is not noise: {known}its autocorrelation over 4 to 12 px is "
-            f"{self.correlation:.2f}. The displacement has parts that the ansatz can't describe; "
-            "the standard errors don't include them."
+            f"The residual is not noise: {known}its autocorrelation over {self.lags_px[0]} "
+            f"to {self.lags_px[-1]} px is {self.correlation:.2f}. The displacement has parts that "
+            "the ansatz can't describe; the standard errors don't include them."
         )
 
 
@@ -135,15 +142,32 @@ def spline_noise(order: int) -> float:
     return float(((weights**2).sum() / fine) ** 2)
 
 
-def autocorrelation(residual: NDArray[Any]) -> float:
-    """Rms autocorrelation of a residual at ``LAGS_PX`` along rows and columns [-].
+def lags_for(width_px: float) -> tuple[int, ...]:
+    """Distances over which a displacement left over shows, and noise doesn't [px].
+
+    From a third of a speckle to a whole one, but no closer than what the spline correlates.
+
+    Parameters
+    ----------
+    width_px
+        Full width at half maximum of the speckle's autocorrelation [px]; see
+        :func:`modeharvest.idic.speckle_width.speckle_width`.
+    """
+    first, last = max(_SPARED_PX, width_px / 3.0), max(_SPARED_PX + 1, width_px)
+    return tuple(sorted({round(lag) for lag in np.linspace(first, last, 5)}))
+
+
+def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) -> float:
+    """Rms autocorrelation of a residual at some lags along rows and columns [-].
 
     Parameters
     ----------
     residual
         (rows, cols) f - g(x + u), NaN where no pixel counts.
+    lags_px
+        Which; see :func:`lags_for`.
     """
-    lags = np.array([0, *LAGS_PX])
+    lags = np.array([0, *lags_px])
     sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
     kernel: Callable[..., None] = lagged_products
     kernel(np.ascontiguousarray(residual), lags, sums, counts)

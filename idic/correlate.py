@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.agreement import TRAPPED, autocorrelation, unmatched
+from modeharvest.idic.agreement import TRAPPED, autocorrelation, lags_for, unmatched
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.brightness import Brightness
+from modeharvest.idic.estimating_equation import instrument
 from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -24,10 +25,12 @@ from modeharvest.idic.gauss_newton import (
 from modeharvest.idic.inputs import CheckedImages, checked_mask, where
 from modeharvest.idic.level_search import LevelSearch, step_length
 from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.pyramid import COARSE_TO_FINE, Level, prepare
+from modeharvest.idic.pyramid import COARSE_TO_FINE, FULL, Level, prepare
 from modeharvest.idic.result import Result
 from modeharvest.idic.scaled_eigen import ScaledEigen
+from modeharvest.idic.speckle_width import speckle_width
 from modeharvest.idic.warp import residual
+from modeharvest.idic.weighting import Gradient, Weighting, best_blur
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.progress import Progress, silent
 
@@ -56,14 +59,30 @@ class CorrelationOptions:
         Of the spline that samples the deformed image: 5 or 3.
     gauss_newton
         Tolerances and limits.
+    gradient
+        What weighs the residual in the end, see :mod:`modeharvest.idic.weighting`: the gradient
+        of the "deformed" image at x + u (the least-squares minimum), that of the "reference" at
+        x, or their "mean".
+    gradient_blur_px
+        Blur of the images that this gradient is taken of, on the finest level [px]. By default
+        none, unless the residual is noise that would spoil the gradient: then the blur that
+        makes the unknowns' variance smallest.
     """
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
     edge_px: int = 2
     order: int = 5
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
+    gradient: str = "deformed"
+    gradient_blur_px: float | None = None
 
     def __post_init__(self) -> None:
+        known = [gradient.value for gradient in Gradient]
+        if self.gradient not in known or not (self.gradient_blur_px or 0.0) >= 0.0:
+            raise InputError(
+                f"expected a gradient among {known} and a blur of it of at least 0 px, got "
+                f"{self.gradient!r} and {self.gradient_blur_px}"
+            )
         if not self.levels:
             raise InputError("expected at least one level from coarse to fine, got none")
         if self.edge_px < 0 or self.order not in (3, 5):
@@ -130,16 +149,18 @@ def correlate(
         a = np.append(found.unknowns, a[n:])
         if found.outcome in _WITHOUT_RESULT:
             break
-    pair = search.pair
-    left = residual(assembly, found.unknowns, pair.reference, pair.deformed)
-    lost = unmatched(pair.reference, left)
-    if lost > TRAPPED and found.outcome not in _WITHOUT_RESULT:
-        found = replace(found, outcome=Outcome.TRAPPED)
-    correlation = autocorrelation(left)
+    width_px = speckle_width(search.pair.reference, search.pair.mask)
+    result = _judged(search, found, assembly, width_px)
     clock.lap("judge the residual")
+    weighting = _weighting(result, width_px, options) if level == FULL else Weighting()
+    if not weighting.is_least_squares and found.outcome is Outcome.CONVERGED:
+        slopes = instrument(weighting, images, search.pair, assembly, found.unknowns)
+        found = search.reweighed(found, assembly, slopes)
+        history += found.history
+        result = replace(_judged(search, found, assembly, width_px), weighting=weighting)
+        clock.lap("weigh anew")
     progress(len(levels), len(levels), "correlate")
-    result = _result(search.ansatz, pair.grid, found, history, clock.laps)
-    return replace(result, residual_correlation=correlation, unmatched=lost)
+    return replace(result, history=history, timings_s=clock.laps)
 
 
 def fit_displacement(
@@ -204,7 +225,7 @@ def fit_displacement(
         on_iteration=_reporter(progress, 0, 1, options),
     )
     clock.lap("iterate")
-    return _result(ansatz, grid, found, found.history, clock.laps)
+    return replace(_result(ansatz, grid, found), history=found.history, timings_s=clock.laps)
 
 
 def _level_search(
@@ -238,13 +259,32 @@ def _level_search(
     )
 
 
-def _result(
-    ansatz: Ansatz,
-    grid: PixelGrid,
-    found: Minimum,
-    history: tuple[Iteration, ...],
-    timings_s: dict[str, float],
-) -> Result:
+def _judged(search: LevelSearch, found: Minimum, used: Assembly, width_px: float) -> Result:
+    """The result, with what its residual tells."""
+    pair = search.pair
+    left = residual(used, found.unknowns, pair.reference, pair.deformed)
+    lost, lags_px = unmatched(pair.reference, left), lags_for(width_px)
+    if lost > TRAPPED and found.outcome not in _WITHOUT_RESULT:
+        found = replace(found, outcome=Outcome.TRAPPED)
+    return replace(
+        _result(search.ansatz, pair.grid, found),
+        residual_correlation=autocorrelation(left, lags_px),
+        residual_lags_px=lags_px,
+        unmatched=lost,
+    )
+
+
+def _weighting(result: Result, width_px: float, options: CorrelationOptions) -> Weighting:
+    """What is to weigh the residual: as asked for, blurred if it is noise that spoils it."""
+    gradient, blur_px = Gradient(options.gradient), options.gradient_blur_px
+    if blur_px is None:
+        blur_px = 0.0
+        if result.agreement().is_white:
+            blur_px = best_blur(result.noise_in_gradient(result.noise_sd**2), width_px)
+    return Weighting(gradient, blur_px, width_px)
+
+
+def _result(ansatz: Ansatz, grid: PixelGrid, found: Minimum) -> Result:
     eigen = ScaledEigen.of(found.equations.matrix)
     return Result(
         ansatz=ansatz,
@@ -256,8 +296,6 @@ def _result(
         left_image=found.equations.left_image,
         outcome=found.outcome,
         condition_number=eigen.condition_number,
-        history=history,
-        timings_s=timings_s,
     )
 
 

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from modeharvest.idic.pyramid import eroded, levelled
+from modeharvest.idic.speckle_width import speckle_width
 
 FloatImage = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -112,43 +113,3 @@ def contrast_after(image: NDArray[Any], mask: BoolArray, blur_px: float) -> np.f
     inner = eroded(mask, int(np.ceil(3.0 * blur_px)))
     smooth = ndimage.gaussian_filter(np.asarray(image, dtype=np.float32), blur_px)
     return np.float32(smooth[inner if inner.any() else mask].std(dtype=np.float64))
-
-
-def speckle_width(image: NDArray[Any], mask: BoolArray) -> float:
-    """Full width at half maximum of the autocorrelation of an image's material [px].
-
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels.
-    mask
-        (rows, cols) True on material.
-    """
-    inner = eroded(mask, 3)
-    inner = inner if inner.any() else mask
-    level = float(image[inner].mean(dtype=np.float64))
-    shown = np.where(inner, image - np.float32(level), np.float32(0.0))
-    along = []
-    for values, weights in ((shown, inner), (shown.T, inner.T)):
-        n = fft.next_fast_len(values.shape[1] + _LONGEST, real=True)
-        pairs = [_lagged(a.astype(np.float32), n) for a in (values, weights)]
-        along.append(pairs[0] / np.maximum(pairs[1], 1.0))
-    curve = np.mean([a / a[0] for a in along], axis=0)
-    below = int(np.argmax(curve < 0.5))
-    if below == 0:
-        return 2.0 * _LONGEST
-    fraction = (curve[below - 1] - 0.5) / (curve[below - 1] - curve[below])
-    return float(2.0 * (below - 1 + fraction))
-
-
-_LONGEST = 64
-"""Lags looked at [px]."""
-
-
-def _lagged(values: NDArray[np.float32], n: int) -> NDArray[np.float64]:
-    """(_LONGEST,) sums over an image of products of pixels that lag along its rows."""
-    power = np.zeros(n // 2 + 1)
-    for first in range(0, len(values), 256):
-        part = fft.rfft(values[first : first + 256], n, axis=1)
-        power += (part.real**2 + part.imag**2).sum(axis=0)
-    return np.asarray(fft.irfft(power, n)[:_LONGEST])

@@ -279,7 +279,7 @@ def _descend(at: _Point, evaluate: Evaluate, step_length: StepLength, limits: _L
     curvature = found.matrix
     if is_settling:
         change = found.gradient - at.equations.gradient
-        curvature = _corrected(at.curvature, a - at.a, change)
+        curvature = corrected(at.curvature, a - at.a, change)
     has_fallen = found.mean_square < _FALLING * at.equations.mean_square
     return _Step(_Point(a, found, is_assembled, curvature, has_fallen), length, damping, accepted)
 
@@ -293,7 +293,7 @@ def _ending(step: _Step, number: int, limits: _Limits) -> Outcome | None:
     return Outcome.MAX_ITERATIONS if number >= limits.options.max_iterations else None
 
 
-def _corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
     """The matrix with the curvature seen along a step: matrix . step = change of the gradient.
 
     As it was where the gradient tells of no positive curvature.

@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.estimating_equation import root
 from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -109,6 +111,24 @@ class LevelSearch:
             if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
                 break
         return replace(found, history=history), used
+
+    def reweighed(self, found: Minimum, used: Assembly, slopes: NDArray[Any]) -> Minimum:
+        """Move on from the minimum to where given slopes weigh the residual to zero.
+
+        Parameters
+        ----------
+        found, used
+            The minimum and its pixels.
+        slopes
+            (2, rows, cols) in place of the deformed image's gradient [grey levels/mm].
+        """
+        pair = self.pair
+
+        def evaluate(a: FloatArray, with_matrix: bool) -> NormalEquations:
+            return used.images(a, pair.reference, pair.deformed, with_matrix, slopes)
+
+        length = step_length(self.ansatz, used.grid, used.mask, self.factor)
+        return root(evaluate, length, found, self.options, self.on_iteration)
 
     def _landed(self, a: FloatArray) -> Assembly:
         """All pixels, less those that these unknowns map onto no material."""

@@ -159,6 +159,7 @@ class Assembly:
         reference: NDArray[Any],
         deformed: SplineImage,
         with_matrix: bool = True,
+        slopes: NDArray[Any] | None = None,
     ) -> NormalEquations:
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
@@ -174,8 +175,12 @@ class Assembly:
             g.
         with_matrix
             Without the matrix the pass costs about half as much.
+        slopes
+            (2, rows, cols) what stands for the gradient of g at x + u [grey levels/mm]; matrix
+            and gradient are h'h and -h'r then, h being its products with the displacement's
+            derivatives.
         """
-        target = Target.images(reference, deformed, self.grid)
+        target = Target.images(reference, deformed, self.grid, slopes)
         return self._assemble(a, target, with_matrix)
 
     def displacement(

@@ -45,7 +45,9 @@ class Level:
             )
 
 
-COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), Level(1, 0.0))
+FULL = Level(1, 0.0)
+"""The images as they are."""
+COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
 """Blurs of 24, 12, 6 and 0 px."""
 
 _FELT, _MOST = 2e-3, 1 / 16
@@ -119,7 +121,7 @@ def prepare(
     """
     reference, deformed = (np.asarray(image, np.float32) for image in (reference, deformed))
     f_weight = mask if deformed_mask is not None else None
-    is_finest = level.factor == 1 and level.blur == 0
+    is_finest = level == FULL
     # The reference is never sampled between its pixels: no need to continue it into holes.
     f = reference if is_finest else _smooth(reference, f_weight, level)
     g = _smooth(deformed, deformed_mask, level)
@@ -197,6 +199,21 @@ def _levelled(image: Image, blur: float, around: float = _AROUND) -> Image:
     return np.asarray(image / (contrast + 1e-3 * contrast.max()))
 
 
+def smoothed(image: Image, mask: BoolArray | None, blur: float) -> Image:
+    """Blur an image over its material, and continue it beyond.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material; None for everywhere.
+    blur
+        Standard deviation [px].
+    """
+    return _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
+
+
 def levelled(
     image: Image, mask: BoolArray | None, blur: float, around: float = _AROUND
 ) -> NDArray[np.float32]:
@@ -215,5 +232,5 @@ def levelled(
     around
         How far the local mean and contrast reach [blurs].
     """
-    smooth = _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
+    smooth = smoothed(image, mask, blur)
     return np.asarray(_levelled(smooth, blur, around), dtype=np.float32)

@@ -12,20 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
-from modeharvest.idic.agreement import Agreement
+from modeharvest.idic.agreement import LAGS_PX, Agreement
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.gauss_newton import Iteration, Outcome
 from modeharvest.idic.serialise import ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.weighting import SLOPE_NOISE, Gradient, Weighting
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
 FloatArray = NDArray[np.float64]
 
-FORMAT = "modeharvest-result-2"
-
-_SLOPE_NOISE = 2.46
-"""Variance of a quintic spline's slope through white noise of variance 1, the mean over all
-positions between pixels [1/px^2]. A cubic's is 2.16."""
+FORMAT = "modeharvest-result-3"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +55,15 @@ class Result:
     timings_s
         Seconds for each stage.
     residual_correlation
-        Rms autocorrelation of the residual 4 to 12 px apart [-]: near 0 for noise; NaN for a
-        fit to a displacement. See :meth:`agreement`.
+        Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a
+        displacement. See :meth:`agreement`.
+    residual_lags_px
+        How far apart it was taken [px].
     unmatched
         Share of the image in which f and g(x + u) have little to do with each other [-]; above
         0.1 the outcome is TRAPPED. NaN for a fit to a displacement.
+    weighting
+        Which gradient weighed the residual.
     """
 
     ansatz: Ansatz
@@ -78,6 +79,8 @@ class Result:
     timings_s: Mapping[str, float] = field(default_factory=dict)
     residual_correlation: float = float("nan")
     unmatched: float = float("nan")
+    residual_lags_px: tuple[int, ...] = LAGS_PX
+    weighting: Weighting = field(default_factory=Weighting)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -128,10 +131,10 @@ class Result:
         Notes
         -----
         Two things that noise s in the deformed image does beyond that, in both of which the
-        variance q s^2 of its own gradient counts against the speckle's G^2 (``_SLOPE_NOISE``):
-        it makes M larger, by 1 + q s^2/G^2, which is taken back; and it spoils the gradient that
-        the reference's noise is weighed with, which adds q s^2/(2 G^2) of the variance. Where
-        the noise isn't given, that is done if the residual is noise.
+        variance q s^2 of its own gradient counts against the speckle's G^2: it makes M larger,
+        by 1 + q s^2/G^2, which is taken back; and it spoils the gradient that the residual is
+        weighed with, which adds what :meth:`Weighting.excess` says. Where the noise isn't given,
+        that is done if the residual is noise.
 
         The noise of the deformed image weighs 1/det F more: where the material has shrunk,
         neighbouring pixels of the reference share noise. That is not taken into account.
@@ -142,14 +145,19 @@ class Result:
         variance = noisy_images * noise_sd**2 if noise_sd is not None else 2.0 * self.noise_sd**2
         is_noise = noise_sd is not None or self.agreement().is_white
         if noisy_images == 2 and is_noise and np.isfinite(self.residual_correlation):
-            share = self._noise_in_gradient(0.5 * variance)
-            variance *= (1.0 + share) * (1.0 + 0.5 * share)
+            share = self.noise_in_gradient(0.5 * variance)
+            variance *= (1.0 + share) * (1.0 + self.weighting.excess(share))
         return np.asarray(variance * self.inverse)
 
-    def _noise_in_gradient(self, variance: float) -> float:
-        """q s^2/G^2 [-]: the noise's share of the deformed image's squared gradient.
+    def noise_in_gradient(self, variance: float) -> float:
+        """q s^2/G^2 [-]: what noise adds to the deformed image's squared gradient.
 
         The columns of a constant v0 are the gradient; as large as 4 where noise is all there is.
+
+        Parameters
+        ----------
+        variance
+            s^2 of the noise in the deformed image [grey levels squared].
         """
         kept = np.flatnonzero(np.isfinite(np.diag(self.inverse)))
         matrix = np.linalg.inv(self.inverse[np.ix_(kept, kept)])
@@ -157,7 +165,7 @@ class Result:
         if not constants.any():
             return 0.0
         seen = float(np.diag(matrix)[constants].mean()) / max(1, self.pixels)
-        noise = _SLOPE_NOISE * variance / self.grid.pixel_size**2
+        noise = SLOPE_NOISE * variance / self.grid.pixel_size**2
         return noise / max(seen - noise, 0.25 * noise)
 
     def agreement(
@@ -183,6 +191,7 @@ class Result:
             noise_sd,
             noisy_images,
             order,
+            self.residual_lags_px,
         )
 
     def standard_errors(self, noise_sd: float | None = None) -> FloatArray:
@@ -276,7 +285,14 @@ class Result:
             "history": [{k: _to_json(v) for k, v in vars(s).items()} for s in self.history],
             "timings_s": dict(self.timings_s),
             "residual_correlation": _to_json(self.residual_correlation),
+            "residual_lags_px": list(self.residual_lags_px),
             "unmatched": _to_json(self.unmatched),
+            "weighting": {
+                "gradient": self.weighting.gradient.value,
+                "blur_px": self.weighting.blur_px,
+                "width_px": _to_json(self.weighting.width_px),
+                "explanation": self.weighting.sentence,
+            },
             "grid": vars(self.grid),
             "ansatz": ansatz_to_dict(self.ansatz),
             "inverse": [[_to_json(float(v)) for v in row] for row in self.inverse],
@@ -310,7 +326,9 @@ class Result:
                 history=tuple(Iteration(**step) for step in steps),
                 timings_s=content["timings_s"],
                 residual_correlation=_or_nan(content["residual_correlation"]),
+                residual_lags_px=tuple(content["residual_lags_px"]),
                 unmatched=_or_nan(content["unmatched"]),
+                weighting=_weighting(content["weighting"]),
             )
         except InputError:
             raise
@@ -327,6 +345,11 @@ def _to_json(value: Any) -> Any:
 
 def _from_json(value: Any) -> Any:
     return np.inf if value is None else value
+
+
+def _weighting(content: dict[str, Any]) -> Weighting:
+    gradient = Gradient(content["gradient"])
+    return Weighting(gradient, content["blur_px"], _from_json(content["width_px"]))
 
 
 def _or_nan(value: float | None) -> float:

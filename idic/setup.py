@@ -41,6 +41,10 @@ class Identification:
         Hold phi1 at the ideal pattern, for images without a pattern to find it from.
     gain_degree, offset_degree
         Total degrees of a gain and of an offset between the images' grey levels; None for none.
+    gradient, gradient_blur_px
+        What weighs the residual: the gradient of the "deformed" image, of the "reference", or
+        their "mean"; and the blur of what it is taken of [px], None for as the noise asks for.
+        See :class:`CorrelationOptions`.
     """
 
     v0_degree: int = 5
@@ -52,6 +56,8 @@ class Identification:
     hold_mode: bool = False
     gain_degree: int | None = None
     offset_degree: int | None = None
+    gradient: str = "deformed"
+    gradient_blur_px: float | None = None
 
     def __post_init__(self) -> None:
         if self.v0_degree < 1 or self.v_degree < 0:
@@ -64,12 +70,17 @@ class Identification:
                 "correlation: expected a start_amplitude that is not 0 mm (the mode could not be "
                 "seen), got 0"
             )
-        self.options()  # checks edge_px and order
+        self.options()  # checks edge_px, order and gradient
         self.brightness()
 
     def options(self) -> CorrelationOptions:
         """The options of :func:`modeharvest.idic.correlate.correlate`."""
-        return CorrelationOptions(edge_px=self.edge_px, order=self.order)
+        return CorrelationOptions(
+            edge_px=self.edge_px,
+            order=self.order,
+            gradient=self.gradient,
+            gradient_blur_px=self.gradient_blur_px,
+        )
 
     def brightness(self) -> Brightness:
         """Which of gain and offset are unknowns."""

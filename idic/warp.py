@@ -55,7 +55,7 @@ def landed(
         A pixel off the image stays in: the iteration counts those and says so.
     """
     kept = assembly.mask.copy()
-    _run(assembly, a, reference, deformed, allowed, kept, np.zeros((0, 0), dtype=np.float32))
+    _run(assembly, a, reference, deformed, allowed, kept, np.zeros((0, 0, 0), dtype=np.float32))
     return kept
 
 
@@ -63,7 +63,24 @@ def residual(
     assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
-    left = np.full(assembly.grid.shape, np.nan, dtype=np.float32)
+    return np.asarray(_left(assembly, a, reference, deformed, 1)[0])
+
+
+def slopes(
+    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
+) -> NDArray[np.float32]:
+    """(2, rows, cols) (1 + b) times the gradient of g at x + u, along x and y [grey levels/mm].
+
+    NaN where no pixel counts or g doesn't reach.
+    """
+    return _left(assembly, a, reference, deformed, 3)[1:]
+
+
+def _left(
+    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage, fields: int
+) -> NDArray[np.float32]:
+    """(fields, rows, cols): the residual, and the slopes."""
+    left = np.full((fields, *assembly.grid.shape), np.nan, dtype=np.float32)
     nothing = np.zeros((0, 0), dtype=np.bool_)
     _run(assembly, a, reference, deformed, nothing, nothing, left)
     return left
@@ -94,7 +111,7 @@ def _pass(
     rows, per_px = runs.row_start.size - 1, 1.0 / target.pixel_size
     for band in range(first, bands, every):
         block = new_block(tables, degree, 3)
-        own, remains = block.own, block.E[2]
+        own, E = block.own, block.E
         for row in range(band * rows // bands, (band + 1) * rows // bands):
             run, begin = start_row(runs, tables, row, block)
             while run < runs.row_start[row + 1]:
@@ -105,9 +122,15 @@ def _pass(
                     _land(n, own, allowed, kept[row])
                 else:
                     sample_block(target, row, n, block)
-                    for m in range(n):
-                        if own[WEIGHT, m] > 0.0:
-                            left[row, int(own[COLUMN, m])] = remains[m]
+                    for k in range(left.shape[0]):
+                        _put(n, own, E[(2 + k) % 3], left[k, row])
+
+
+@compiled(relaxed=True)
+def _put(n: int, own: Any, values: Any, to: Any) -> None:
+    for m in range(n):
+        if own[WEIGHT, m] > 0.0:
+            to[int(own[COLUMN, m])] = values[m]
 
 
 @compiled(relaxed=True)

@@ -13,12 +13,21 @@ from manufactured import GRID
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.agreement import Agreement, autocorrelation, spline_noise, unmatched
+from modeharvest.idic.agreement import (
+    LAGS_PX,
+    Agreement,
+    autocorrelation,
+    lags_for,
+    spline_noise,
+    unmatched,
+)
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.result import Result
+from modeharvest.idic.speckle_width import speckle_width
 from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 
@@ -78,6 +87,37 @@ def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:
     expected = np.sqrt(np.mean([*(lags**2), *np.ones(5)]))
     assert autocorrelation(wave) == pytest.approx(expected, rel=2e-3)
     assert autocorrelation(np.zeros((20, 20))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("spectrum", "blur_px", "width_px"), [(0.14, 0.8, 3.6), (0.1, 1.0, 5.0), (0.05, 3.0, 12.4)]
+)
+def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
+    spectrum: float, blur_px: float, width_px: float
+) -> None:
+    """Half a pixel of a wave that the ansatz lacks, or noise that leaves as large a residual."""
+    shape = (256, 240)
+    speckle = Speckle(SpeckleSpec(standard_deviation=spectrum, blur_px=blur_px, seed=1), shape)
+    rows, cols = np.indices(shape).astype(float)
+    f = speckle.image()
+    width = speckle_width(f, np.ones(shape, dtype=np.bool_))
+    assert width == pytest.approx(width_px, abs=0.6)
+    lags = lags_for(width)
+    assert max(lags) <= max(4, 1.1 * width)
+    wave = 0.5 * np.sin(2 * np.pi * cols / 80)
+    left_over = f - speckle(rows + wave, cols - wave)
+    assert not Agreement(autocorrelation(left_over, lags), f.size, lags_px=lags).is_white
+    rng = np.random.default_rng(3)
+    noise = left_over.std() * rng.normal(size=(2, *shape))
+    moved = SplineImage.of(noise[1]).sample(*(0.97 * np.stack([rows, cols]) + 3))[0]
+    judged = Agreement(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
+    assert judged.is_white, judged.sentence
+
+
+def test_lags_of_the_paper_s_speckle() -> None:
+    assert lags_for(12.4) == LAGS_PX
+    said = Agreement(0.5, 1000, lags_px=lags_for(4.0)).sentence
+    assert "autocorrelation over 3 to 4 px" in said
 
 
 def test_unmatched_blocks_are_counted() -> None:

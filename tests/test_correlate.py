@@ -120,11 +120,11 @@ def test_damaged_result_file(found: Result, tmp_path: Path) -> None:
     path.write_text(path.read_text()[:-300])
     with pytest.raises(InputError, match="JSON"):
         Result.read(path)
-    path.write_text('{"format": "modeharvest-result-2"}')
+    path.write_text('{"format": "modeharvest-result-3"}')
     with pytest.raises(InputError, match="complete"):
         Result.read(path)
     path.write_text('{"format": "other"}')
-    with pytest.raises(InputError, match="modeharvest-result-2"):
+    with pytest.raises(InputError, match="modeharvest-result-3"):
         Result.read(path)
 
 

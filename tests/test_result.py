@@ -98,7 +98,7 @@ def test_a_truncated_file_is_refused(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": "modeharvest-result-0"}, "modeharvest-result-2"),
+        ({"format": "modeharvest-result-0"}, "modeharvest-result-3"),
         ({"outcome": "splendid"}, "complete"),
         ({"inverse": [[1.0, 2.0], [3.0]]}, "complete"),
         ({"inverse": [[1.0]]}, "inverse of shape"),

@@ -15,14 +15,15 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
 from modeharvest.idic.pyramid import Level
-from modeharvest.idic.result import _SLOPE_NOISE, Result
+from modeharvest.idic.result import Result
+from modeharvest.idic.weighting import SLOPE_NOISE
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
 GRID = PixelGrid.centred(240, 220, PIXEL)
 ANSATZ = Ansatz(Box.centred(2.2, 2.4), v0_degree=2)
 MASK: NDArray[np.bool_] = np.pad(np.ones((200, 180), dtype=np.bool_), 20)
-FINE = CorrelationOptions(levels=(Level(1, 0.0),))
+FINE = CorrelationOptions(levels=(Level(1, 0.0),), gradient_blur_px=0.0)
 
 
 @cache
@@ -51,7 +52,7 @@ def test_slope_of_a_spline_through_noise() -> None:
         *rng.uniform(5, 394, (2, 200_000))
     )
     # 160 000 pixels: the variance scatters by sqrt(2/160 000) = 0.35 %, and slopes are correlated.
-    assert 0.5 * (d_row.var() + d_col.var()) == pytest.approx(_SLOPE_NOISE, rel=0.02)
+    assert 0.5 * (d_row.var() + d_col.var()) == pytest.approx(SLOPE_NOISE, rel=0.02)
 
 
 @pytest.mark.parametrize("sd", [0.005, 0.01, 0.02])
@@ -63,7 +64,7 @@ def test_noise_in_the_gradient_is_taken_back(sd: float) -> None:
     gained = np.trace(np.linalg.solve(plain, clean)) / ANSATZ.size - 1
     # G^2 of the noise-free image, at its pixels.
     _, d_row, d_col = SplineImage.of(pair()[1]).sample(*np.nonzero(MASK))
-    expected = _SLOPE_NOISE * sd**2 / (0.5 * (d_row**2 + d_col**2).mean())
+    expected = SLOPE_NOISE * sd**2 / (0.5 * (d_row**2 + d_col**2).mean())
     assert gained == pytest.approx(expected, rel=0.1)
     told = np.trace(np.linalg.solve(clean, noisy.covariance(sd))) / ANSATZ.size
     # 6 %: pixels land where they land, not evenly between pixels, and errors add up at 2 %.

@@ -1,0 +1,113 @@
+"""Where h'r = 0, for weights h that are not the residual's own derivative.
+
+Their slopes are taken once, at the least-squares minimum, and from there Newton steps lead to the
+root, which is a few hundredths of a pixel off. There is no cost that has to fall; h'h stands for
+h'J, and learns from the steps. Why one would: :mod:`modeharvest.idic.weighting`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.gauss_newton import (
+    GaussNewtonOptions,
+    Iteration,
+    Minimum,
+    Outcome,
+    StepLength,
+    corrected,
+)
+from modeharvest.idic.inputs import CheckedImages
+from modeharvest.idic.normal_equations import Assembly, NormalEquations
+from modeharvest.idic.pyramid import Pair, smoothed
+from modeharvest.idic.scaled_eigen import ScaledEigen
+from modeharvest.idic.warp import slopes
+from modeharvest.idic.weighting import Gradient, Weighting
+from modeharvest.imaging.interpolation import SplineImage
+
+FloatArray = NDArray[np.float64]
+
+_FAR = 10.0
+"""Steps longer than that many times the first one: it runs away."""
+
+
+def instrument(
+    weighting: Weighting, images: CheckedImages, pair: Pair, used: Assembly, a: FloatArray
+) -> NDArray[np.float32]:
+    """Slopes along x and y that weigh the residual: (2, rows, cols) [grey levels/mm].
+
+    In the reference's frame; 0 where no pixel counts or g doesn't reach.
+
+    Parameters
+    ----------
+    weighting
+        Which gradient.
+    images, pair
+        f and g, whole and prepared for the finest level.
+    used, a
+        The pixels that count, and the (size,) unknowns of the least-squares minimum.
+    """
+
+    def of(image: NDArray[Any], mask: Any, at: FloatArray) -> NDArray[np.float32]:
+        spline = SplineImage.of(smoothed(image, mask, weighting.blur_px), pair.deformed.order)
+        return np.nan_to_num(slopes(used, at, pair.reference, spline), copy=False)
+
+    still = np.zeros_like(a)
+    if weighting.gradient is Gradient.DEFORMED:
+        return of(images.g, images.g_mask, a)
+    if weighting.gradient is Gradient.REFERENCE:
+        return of(images.f, images.f_mask, still)
+    both = of(images.g, images.g_mask, a) + of(images.f, images.f_mask, still)
+    return np.asarray(0.5 * both, dtype=np.float32)
+
+
+def root(
+    evaluate: Callable[[FloatArray, bool], NormalEquations],
+    step_length: StepLength,
+    found: Minimum,
+    options: GaussNewtonOptions,
+    on_iteration: Callable[[int], None] = lambda number: None,
+) -> Minimum:
+    """Find the root, from a least-squares minimum.
+
+    Parameters
+    ----------
+    evaluate
+        -h'r, and h'h if wanted, at some unknowns.
+    step_length
+        Rms difference of the displacement between two sets of unknowns [px].
+    found
+        The minimum.
+    options
+        When to stop.
+    on_iteration
+        Called with the number of each finished iteration.
+
+    Returns
+    -------
+    Minimum
+        With the minimum's own matrix J'J, and these steps alone. If they don't settle, the
+        minimum itself with the outcome MAX_ITERATIONS.
+    """
+    a, history = found.unknowns, list[Iteration]()
+    here = evaluate(a, True)
+    curvature, first = here.matrix, np.inf
+    for number in range(1, options.max_iterations + 1):
+        step = -ScaledEigen.of(curvature).solve(here.gradient)
+        length = step_length(a, a + step)
+        there = evaluate(a + step, False)
+        curvature = corrected(curvature, step, there.gradient - here.gradient)
+        a, here, first = a + step, there, min(first, length)
+        history.append(Iteration(1, number, here.mean_square, length, 0.0, here.pixels))
+        on_iteration(number)
+        if length <= options.tolerance_px:
+            equations = replace(here, matrix=found.equations.matrix)
+            return replace(found, unknowns=a, equations=equations, history=tuple(history))
+        if length > _FAR * first:
+            break
+    return replace(found, outcome=Outcome.MAX_ITERATIONS, history=tuple(history))

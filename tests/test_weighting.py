@@ -1,0 +1,240 @@
+"""Which gradient weighs the residual: the root is the truth, and noise no longer spoils it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import manufactured
+import numpy as np
+import pytest
+from manufactured import PIXEL
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.errors import InputError
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.estimating_equation import instrument, root
+from modeharvest.idic.gauss_newton import GaussNewtonOptions, Minimum, Outcome
+from modeharvest.idic.inputs import CheckedImages
+from modeharvest.idic.level_search import step_length
+from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.pyramid import FULL, prepare
+from modeharvest.idic.result import Result
+from modeharvest.idic.warp import slopes
+from modeharvest.idic.weighting import Gradient, Weighting, best_blur
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.interpolation import SplineImage
+
+FloatArray = NDArray[np.float64]
+
+GRID = PixelGrid.centred(150, 140, PIXEL)
+ANSATZ = Ansatz(Box.centred(1.4, 1.5), v0_degree=2)
+MASK: NDArray[np.bool_] = np.pad(np.ones((110, 100), dtype=np.bool_), 20)
+FINEST = CorrelationOptions(levels=(FULL,))
+LEAST_SQUARES = replace(FINEST, gradient_blur_px=0.0)
+NOISE, PAIRS = 0.02, 40
+
+
+@cache
+def truth() -> FloatArray:
+    """A few per cent of strain and of rotation."""
+    rng = np.random.default_rng(0)
+    return np.asarray(ANSATZ.start(0.03) + 0.01 * rng.normal(size=ANSATZ.size))
+
+
+@cache
+def pair(seed: int = 3) -> tuple[FloatArray, FloatArray]:
+    return manufactured.image_pair(manufactured.speckle(seed, GRID), ANSATZ, truth(), GRID)
+
+
+def test_the_deformed_image_s_own_slopes_change_nothing() -> None:
+    f, g = (image.astype(np.float32) for image in pair())
+    spline, used = SplineImage.of(g), Assembly(ANSATZ, GRID, MASK)
+    a = ANSATZ.start(0.028)
+    given = np.nan_to_num(slopes(used, a, f, spline))
+    own, same = used.images(a, f, spline), used.images(a, f, spline, slopes=given)
+    # float32 slopes, of which 10^4 are summed.
+    np.testing.assert_allclose(same.matrix, own.matrix, rtol=1e-5, atol=1e-7 * own.matrix.max())
+    np.testing.assert_allclose(same.gradient, own.gradient, atol=1e-6 * abs(own.gradient).max())
+    assert same.cost == own.cost
+
+
+def steps_to_the_truth(weighting: Weighting) -> int:
+    """Go to the root from unknowns that are 0.3 px off; returns in how many steps."""
+    f, g = pair()
+    images = CheckedImages.checked(f, g, GRID, MASK, None)
+    level = prepare(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    used = Assembly(ANSATZ, GRID, level.mask)
+    a = truth() + 0.002 * np.random.default_rng(4).normal(size=ANSATZ.size)
+    length = step_length(ANSATZ, GRID, level.mask, 1)
+    assert length(a, truth()) > 0.2
+    here = used.images(a, level.reference, level.deformed)
+    given = instrument(weighting, images, level, used, a)
+    found = root(
+        lambda a, with_matrix: used.images(a, level.reference, level.deformed, with_matrix, given),
+        length,
+        Minimum(a, here, Outcome.CONVERGED, (), here.matrix),
+        GaussNewtonOptions(tolerance_px=1e-6),
+    )
+    assert found.outcome is Outcome.CONVERGED
+    # float32 images, and a spline that is off by 8e-7 of full scale.
+    assert length(found.unknowns, truth()) < 1e-5
+    return len(found.history)
+
+
+@pytest.mark.parametrize("gradient", list(Gradient))
+@pytest.mark.parametrize("blur_px", [0.0, 1.5])
+def test_exact_images_have_their_root_at_the_truth(gradient: Gradient, blur_px: float) -> None:
+    assert steps_to_the_truth(Weighting(gradient, blur_px)) < 15
+
+
+def test_the_reference_s_gradient_is_off_where_the_material_turns() -> None:
+    """Its directions are those before the deformation: the steps are worse."""
+    deformed, reference = (steps_to_the_truth(Weighting(gradient)) for gradient in
+                           (Gradient.DEFORMED, Gradient.REFERENCE))  # fmt: skip
+    assert deformed < reference
+
+
+def test_noise_free_images_keep_the_least_squares_minimum() -> None:
+    found = correlate(*pair(), GRID, ANSATZ, truth(), MASK, options=FINEST)
+    assert found.weighting.is_least_squares
+    assert "deformed image's gradient." in found.weighting.sentence
+
+
+def test_a_displacement_left_over_keeps_the_least_squares_minimum() -> None:
+    """There is noise, but what the ansatz lacks is more."""
+    low = replace(ANSATZ, v0_degree=1)
+    noise = NOISE * np.random.default_rng(1).normal(size=(2, *GRID.shape))
+    f, g = pair()
+    found = correlate(f + noise[0], g + noise[1], GRID, low, low.start(0.03), MASK, options=FINEST)
+    assert not found.agreement().is_white
+    assert found.weighting.is_least_squares
+
+
+@cache
+def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, list[Result]]:
+    """(pairs, 2, n) errors under n and -n, (pairs, n, n) covariances at the bound, results.
+
+    The bound is s^2 (1 + 1/det F) M^-1 with M of the noise-free images.
+    """
+    h = 1e-6
+    u = [ANSATZ.displacement(truth(), GRID.x + dx, GRID.y + dy)
+         for dx, dy in ((h, 0), (-h, 0), (0, h), (0, -h))]  # fmt: skip
+    F = np.stack([(u[0] - u[1]), (u[2] - u[3])], axis=-1) / (2 * h) + np.eye(2)
+    weight = 1.0 + (1.0 / np.linalg.det(F[MASK])).mean()
+    errors, bounds, results = [], [], []
+    for seed in range(PAIRS):
+        f, g = pair(seed)
+        clean = correlate(f, g, GRID, ANSATZ, truth(), MASK, options=LEAST_SQUARES)
+        noise = NOISE * np.random.default_rng([seed, 7]).normal(size=(2, *GRID.shape))
+        found = [
+            correlate(f + s * noise[0], g + s * noise[1], GRID, ANSATZ, truth(), MASK,
+                      options=options)
+            for s in (1, -1)
+        ]  # fmt: skip
+        errors.append([r.unknowns - truth() for r in found])
+        bounds.append(NOISE**2 * weight * clean.inverse)
+        results += found
+    return np.array(errors), np.array(bounds), results
+
+
+def chi_square(errors: FloatArray, bounds: FloatArray) -> float:
+    """Mean square of standardised errors; the two of a pair have theirs in common."""
+    weighted = np.linalg.solve(bounds[:, None], errors[..., None])[..., 0]
+    return float((errors * weighted).sum(axis=-1).mean() / ANSATZ.size)
+
+
+def test_at_2_percent_of_noise_the_errors_are_at_the_bound() -> None:
+    errors, bounds, results = monte_carlo(FINEST)
+    assert {r.outcome for r in results} == {Outcome.CONVERGED}
+    assert all(r.weighting.blur_px > 0.6 for r in results)
+    # n and -n are one draw: chi squared over n * PAIRS = 480 degrees of freedom has a standard
+    # deviation of sqrt(2/480) = 6.5 %; four of them leave 1 in 10^4. Least squares has 1.4.
+    assert chi_square(errors, bounds) == pytest.approx(1.0, abs=4 * np.sqrt(2 / bounds[:, 0].size))
+    bare = chi_square(*monte_carlo(LEAST_SQUARES)[:2])
+    # On the same noise: the difference scatters far less than either.
+    share = results[0].noise_in_gradient(NOISE**2)
+    assert 0.25 * share < bare - chi_square(errors, bounds) < share
+
+
+def test_what_is_of_second_order_in_the_noise_is_small() -> None:
+    """What n and -n have in common is where a bias would be."""
+    common = [chi_square(monte_carlo(how)[0].mean(axis=1, keepdims=True), monte_carlo(how)[1])
+              for how in (FINEST, LEAST_SQUARES)]  # fmt: skip
+    # Its least-squares part is q s^2/(2 G^2) = 0.4 of the variance; a blur of 1 px leaves 1/30.
+    assert common[0] < 0.1 * common[1]
+
+
+def test_results_tell_the_errors_they_have() -> None:
+    _, bounds, results = monte_carlo(FINEST)
+    told = np.array([r.covariance(NOISE) for r in results])
+    share = np.trace(np.linalg.solve(np.repeat(bounds, 2, axis=0), told).mean(axis=0)) / ANSATZ.size
+    # 5 % is what 1/det F and the positions between pixels leave open (test_result_noise.py).
+    assert share == pytest.approx(1.0, abs=0.05)
+
+
+def gaussian_speckle(width_px: float, seed: int) -> FloatArray:
+    """A field whose autocorrelation is a Gaussian of that full width at half maximum."""
+    noise = np.random.default_rng(seed).normal(size=(512, 512))
+    sd = width_px / np.sqrt(8 * np.log(2)) / np.sqrt(2)
+    return np.asarray(ndimage.gaussian_filter(noise, sd, mode="wrap"))
+
+
+@pytest.mark.parametrize("width_px", [6.0, 12.0])
+@pytest.mark.parametrize("blur_px", [0.8, 1.5])
+def test_the_excess_is_that_of_sums_over_an_image(width_px: float, blur_px: float) -> None:
+    """Variance of h'r/(h'J) with h from a blurred noisy image, against that with the true slope."""
+    clean, s = gaussian_speckle(width_px, 0), 0.1
+    clean /= clean.std()
+    noise = s * np.random.default_rng(1).normal(size=clean.shape)
+
+    def slope(image: FloatArray) -> FloatArray:
+        return np.asarray(ndimage.gaussian_filter(image, blur_px, order=(0, 1), mode="wrap"))
+
+    G = np.fft.ifft(2j * np.pi * np.fft.fftfreq(512) * np.fft.fft(clean, axis=1), axis=1).real
+    h, spoilt = slope(clean), slope(noise)
+    # Noise in f, of which h is independent, sees all of h; noise in g only its true part.
+    variance = (h**2).sum() + 0.5 * (spoilt**2).sum()
+    expected = variance * (G**2).sum() / (h * G).sum() ** 2 - 1
+    share = 2.46 * s**2 / (G**2).mean()
+    # 512 px hold (512/12)^2 speckles: sums are good to 2 %, their ratios to a tenth of that.
+    assert Weighting(Gradient.DEFORMED, blur_px, width_px).excess(share) == pytest.approx(
+        expected, rel=0.1, abs=2e-3
+    )
+
+
+@pytest.mark.parametrize("width_px", [3.0, 6.0, 12.0])
+@pytest.mark.parametrize("share", [0.05, 0.8, 3.0])
+def test_the_best_blur_is_the_best(width_px: float, share: float) -> None:
+    best = best_blur(share, width_px)
+    excess = Weighting(blur_px=best, width_px=width_px).excess(share)
+    assert excess <= Weighting().excess(share)
+    if best > 0.65:  # else it is the smallest there is
+        around = [Weighting(blur_px=k * best, width_px=width_px).excess(share) for k in (0.9, 1.1)]
+        assert excess < min(around)
+
+
+def test_little_noise_needs_no_blur() -> None:
+    assert best_blur(0.0, 12.0) == best_blur(0.015, 12.0) == 0.0
+    assert best_blur(0.1, 12.0) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"gradient": "both"}, "gradient among"),
+        ({"gradient_blur_px": -1.0}, "blur of it of at least 0 px"),
+        ({"gradient_blur_px": float("nan")}, "blur of it of at least 0 px"),
+    ],
+)
+def test_bad_options(change: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        replace(CorrelationOptions(), **change)  # type: ignore[arg-type]
+
+
+def test_bad_weighting() -> None:
+    with pytest.raises(InputError, match="at least 0 px"):
+        Weighting(blur_px=-0.1)
