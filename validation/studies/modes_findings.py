@@ -141,8 +141,9 @@ def _sentences(ran: pd.DataFrame, seen: pd.DataFrame) -> list[str]:
 def _of_parameters(sizes: pd.DataFrame) -> list[str]:
     off, best = deviations(sizes), deviations(sizes, "best_")
     apart = misses(sizes)
+    specimens = "1 specimen" if len(sizes) == 1 else f"{len(sizes)} specimens"
     return [
-        f"On {len(sizes)} specimen{'s' if len(sizes) > 1 else ''} with d/l from {sizes['ratio'].min():.3g} to "
+        f"On {specimens} with d/l from {sizes['ratio'].min():.3g} to "
         f"{sizes['ratio'].max():.3g} the measured wave vectors are within "
         f"{_percent(off[_WAVES])} of Eq. (mode), a₁ within {_percent(off['a1'])} of 1, the "
         f"phases within {_percent(off[['a6', 'a7']])} of l.",
