@@ -234,9 +234,13 @@ def test_noise_study_on_tiny_images(
 
 
 def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None:
-    study = Systematic(factors=("order", "bits"), levels={"bits": (2, 10)}, seeds_of_speckle=(0,))
-    cases = study.prepare(subject, folder)
-    assert [c["factor"] for c in cases] == ["base", "order", "bits", "bits"]  # 5 is the base
+    study = Systematic(
+        factors=("order", "gradient", "bits"),
+        levels={"bits": (2, 10), "gradient": ("mean", "deformed")},
+        seeds_of_speckle=(0,),
+    )
+    cases = study.prepare(subject, folder)  # the base has order 5 and the deformed image's gradient
+    assert [c["factor"] for c in cases] == ["base", "order", "gradient", "bits", "bits"]
     rows = [{**case, "error": "", **one_level(case, folder)} for case in cases]
     kept = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if c["keep"]}
     gone = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if not c["keep"]}
@@ -248,7 +252,8 @@ def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None
     assert 0.0 < moved["bits", 10] < 0.1 * moved["bits", 2]  # rounding errors: 341 times
     w, best, lost = (rows[0][name] for name in ("w_px", "best_px", "lost_px"))
     assert best < w < best + lost  # the best fit is the best; the triangle inequality
-    assert any("g∘φ" in sentence for sentence in found.sentences)
+    assert moved["gradient", "mean"] > 0.0
+    assert moved["gradient", "deformed"] == 0.0
 
 
 def test_every_factor_has_levels_that_can_be_set() -> None:
@@ -302,6 +307,8 @@ def test_a_quick_study_is_smaller() -> None:
         ('[study]\nkind = "systematic"\nfactors = ["colour"]', "factors among"),
         ('[study]\nkind = "systematic"\nfactors = ["order"]\nlevels.bits = [8]', "only"),
         ('[study]\nkind = "systematic"\nseeds_of_speckle = []', "seed of a speckle"),
+        ('[study]\nkind = "systematic"\nlevels.gradient = ["mine"]', "one of ['deformed'"),
+        ('[study]\nkind = "systematic"\nlevels.bits = ["8"]', "expected numbers"),
         ("[study]\n[imagin]\nbits = 8", "did you mean 'imaging'?"),
         ('[imaging]\ndistortion = "lens.json"\n[study]', "perfect lens"),
         ("[experiment]", "expected a table [study]"),
@@ -317,8 +324,12 @@ def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str)
 
 
 def test_levels_out_of_range_are_told_before_anything_runs(subject: Subject, folder: Path) -> None:
-    for levels, said in (({"order": (4.5,)}, "whole numbers"), ({"order": (4,)}, "order 3 or 5")):
-        study = Systematic(factors=("order",), levels=levels)
+    for name, level, said in (
+        ("order", 4.5, "whole numbers"),
+        ("order", 4, "order 3 or 5"),
+        ("gradient", 3, "one of .*'reference'"),
+    ):
+        study = Systematic(factors=(name,), levels={name: (level,)})
         with pytest.raises(InputError, match=said):
             study.prepare(subject, folder)
 

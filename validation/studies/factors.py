@@ -61,6 +61,8 @@ class Factor:
         The level that a setting has; None where it has none (float images have no bits).
     whole
         Whether levels are whole numbers.
+    names
+        Of levels that are a choice and not a size: their numbers count these.
     """
 
     label: str
@@ -68,6 +70,32 @@ class Factor:
     change: Callable[[Setting, Any], Setting]
     base: Callable[[Setting], float | None]
     whole: bool = False
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def choice(cls, label: str, option: str, names: tuple[str, ...]) -> Factor:
+        """One of several names of an option of the correlation."""
+        return cls(
+            label,
+            tuple(range(len(names))),
+            lambda s, v: s.correlated(**{option: names[v]}),
+            lambda s: names.index(getattr(s.correlation, option)),
+            whole=True,
+            names=names,
+        )
+
+    def number(self, level: float | str) -> float:
+        """A level as a number; InputError if there is no such name."""
+        if isinstance(level, str):
+            if level not in self.names:
+                expected = f"one of {list(self.names)}" if self.names else "numbers"
+                raise InputError(f"study: expected {expected} for {self.label}, got {level!r}")
+            return self.names.index(level)
+        return level
+
+    def told(self, level: float) -> str:
+        """A level in words."""
+        return self.names[round(level)] if self.names else f"{level:g}"
 
     def set(self, setting: Setting, level: float) -> Setting:
         """Change a setting.
@@ -77,6 +105,10 @@ class Factor:
         InputError
             If the level is out of the factor's range.
         """
+        if self.names and level not in range(len(self.names)):
+            raise InputError(
+                f"study: expected one of {list(self.names)} for {self.label}, got {level:g}"
+            )
         if self.whole and level != round(level):
             raise InputError(f"study: expected whole numbers for {self.label}, got {level:g}")
         return self.change(setting, round(level) if self.whole else level)
@@ -108,6 +140,9 @@ FACTORS: dict[str, Factor] = {
     "order": Factor(
         "order of the spline [-]", (3, 5), lambda s, v: s.correlated(order=v),
         lambda s: s.correlation.order, whole=True,
+    ),
+    "gradient": Factor.choice(
+        "gradient that weighs the residual", "gradient", ("deformed", "mean", "reference")
     ),
     "speckle_size": Factor(
         "size of the speckle [times the base's]", (0.5, 0.7, 1.0, 1.4, 2.0), _speckle_size,
@@ -152,5 +187,4 @@ FACTORS: dict[str, Factor] = {
         lambda s: s.correlation.edge_px, whole=True,
     ),
 }  # fmt: skip
-"""By the names that a study uses. The engine has one gradient only, that of the deformed image at
-the displaced position (g∘φ): there is no choice of it to vary."""
+"""By the names that a study uses."""

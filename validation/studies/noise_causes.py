@@ -13,7 +13,7 @@ curvature        H⁻¹ V₀ H⁻¹        and what the ansatz leaves over makes
 least            H⁻¹ V H⁻¹         and the gradient of g's noise pushes there, too
 ===============  ================  ==========================================================
 
-The last is the least that this estimator can do. Further up, noise is not weak any more: the
+The last is the least that least squares can do. Further up, noise is not weak any more: the
 gradient of g's own noise is no longer small against the speckle's.
 """
 

@@ -120,7 +120,7 @@ def _summary(levels: Levels, ours: Levels, soft: Levels, scene: Scene) -> pd.Dat
                 "bound, rms [px]": bound.rms_bound / px if name in PARTS else np.nan,
                 "rms error / bound": bound.ratio.value,
                 "± (1)": bound.ratio.error,
-                "rms error / least of this estimator": least.ratio.value,
+                "rms error / least of least squares": least.ratio.value,
                 "± (2)": least.ratio.error,
                 "bias / bound": bound.bias.value,
                 "± (3)": bound.bias.error,
@@ -175,7 +175,7 @@ def _unknowns(levels: Levels, ours: Levels, scene: Scene) -> pd.DataFrame:
         parts.append(pd.DataFrame({
             "noise": level, "unknown": ansatz.names, "unit": ansatz.units, "bound": bound.bound,
             "rms error / bound": bound.ratios,
-            "rms error / least of this estimator": least.ratios, "bias / bound": bound.biases,
+            "rms error / least of least squares": least.ratios, "bias / bound": bound.biases,
             "share in 95 % intervals": least.covered,
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
@@ -191,7 +191,7 @@ def _maps(levels: Levels, ours: Levels, points: Points) -> pd.DataFrame:
                 "noise": level, "field": name, "x [mm]": points.x, "y [mm]": points.y,
                 "bound [mm]": np.sqrt((bound.bound**2).sum(axis=-1)),
                 "rms error / bound": np.sqrt((bound.ratios**2).mean(axis=-1)),
-                "rms error / least of this estimator": np.sqrt((least.ratios**2).mean(axis=-1)),
+                "rms error / least of least squares": np.sqrt((least.ratios**2).mean(axis=-1)),
                 "bias / bound": np.sqrt((bound.biases**2).mean(axis=-1)),
                 "share in 95 % intervals": least.covered.mean(axis=-1),
             }))  # fmt: skip
@@ -213,7 +213,7 @@ def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
     at = f"at {100 * shown:g} % of noise"
     return (
         KeyNumber("rms error of u", str(ours[shown]["u"].ratio), "",
-                  f"{at}, over the least that this estimator can do"),
+                  f"{at}, over the least that least squares can do"),
         KeyNumber("and over the bound", str(levels[shown]["u"].ratio), "",
                   "Cramér–Rao, of an ansatz that describes everything"),
         KeyNumber("bias of u", str(levels[shown]["u"].bias), "", f"{at}, over the bound"),
@@ -237,8 +237,7 @@ def _level_sentences(levels: Levels, ours: Levels, scene: Scene) -> tuple[str, .
     )
     bound = levels[min(levels)]["u"].rms_bound / px / (100.0 * min(levels))
     return (
-        f"The displacement's rms error is {ratio} times the least that this estimator can do, "
-        f"{at}.",
+        f"The displacement's rms error is {ratio} times the least that least squares can do, {at}.",
         f"It is {over} times the Cramér–Rao bound, which is {short(bound)} px rms for each per "
         "cent of noise.",
         f"Of the 95 % intervals {held} hold the unknowns, and {held_u} the displacement.",
@@ -260,7 +259,7 @@ def _cause_sentence(causes: pd.DataFrame) -> str:
         "ansatz that describes everything. Pixels that share the noise of g where the material "
         f"has shrunk (det F) make it {det:.3f} of it; the cost's own curvature, softer by what "
         f"the ansatz leaves over, {curved:.3f}; the gradient of g's noise, seen with what is left "
-        f"over, {least:.3f}: the least that this estimator can do. What is above it at strong "
+        f"over, {least:.3f}: the least that least squares can do. What is above it at strong "
         "noise is of second order: the gradient of the noise against the speckle's."
     )
 

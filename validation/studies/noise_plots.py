@@ -43,7 +43,7 @@ _FAMILIES = {"v0x": "v₀ along x", "v0y": "v₀ along y", "v1": "v₁", "phi1":
 _NOTHING = to_rgba(EDGE, 0.25)
 _HOLD = "share in 95 % intervals [-]"
 _LEVELS = {
-    "ratio": ("Scatter", "rms error / least of this estimator [-]", 1.0),
+    "ratio": ("Scatter", "rms error / least of least squares [-]", 1.0),
     "bias": ("Bias", "bias / Cramér–Rao bound [-]", 0.0),
     "coverage": ("Error bars", _HOLD, 0.95),
 }
@@ -69,7 +69,7 @@ def draw_causes(causes: pd.DataFrame, made: str) -> Plot:
     caption = (
         f"Over the Cramér–Rao bound: to the left what is predicted from exact images, one cause "
         f"after another; shaded, what is measured; {made}. Dotted: the bound, and the least that "
-        "this estimator can do for u."
+        "least squares can do for u."
     )
     return Plot("causes", "What each cause adds", drawn, caption, wide=True)
 
@@ -192,7 +192,7 @@ def draw_maps(parts: Mapping[str, Pairs], points: Points, level: float, made: st
         drawn.subplots_adjust(left=0.01, right=0.91, top=0.96, bottom=0.01)
     caption = (
         f"At {100 * level:g} % of noise; {made}. Above: rms length of the error; in the middle: "
-        "over the least that this estimator can do, 1 is white; below: share of the 95 % "
+        "over the least that least squares can do, 1 is white; below: share of the 95 % "
         "intervals that hold, 0.95 is white. Both components of a vector together. Grey: no "
         "material there, or no φ₁."
     )

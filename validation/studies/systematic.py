@@ -39,7 +39,7 @@ class Systematic:
     factors
         What to change: names in :data:`modeharvest.validation.studies.factors.FACTORS`.
     levels
-        Other levels than a factor's own, by its name.
+        Other levels than a factor's own, by its name: numbers, or names where it has names.
     seeds_of_speckle
         Every level is measured on each of these speckles.
 
@@ -52,7 +52,7 @@ class Systematic:
 
     strain: float = 0.128
     factors: tuple[str, ...] = tuple(FACTORS)
-    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    levels: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
     seeds_of_speckle: tuple[int, ...] = (0, 1)
 
     def __post_init__(self) -> None:
@@ -77,7 +77,7 @@ class Systematic:
         for name, levels in self.levels.items():
             if not levels:
                 raise InputError(f"study: expected at least one level of {name}, got none")
-            require_different(f"levels of {name}", tuple(levels))
+            require_different(f"levels of {name}", self._levels(name))
 
     @property
     def question(self) -> str:
@@ -145,7 +145,8 @@ class Systematic:
         return told.findings(table, bases, base.imaging.pixel_size, self.seeds)
 
     def _levels(self, name: str) -> tuple[float, ...]:
-        return tuple(self.levels.get(name, FACTORS[name].levels))
+        factor = FACTORS[name]
+        return tuple(factor.number(level) for level in self.levels.get(name, factor.levels))
 
 
 def _described(subject: Subject, folder: Path, strain: float, setting: Setting) -> str:

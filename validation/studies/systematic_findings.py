@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
 
 from modeharvest.validation.page import short
 from modeharvest.validation.studies.factors import FACTORS
@@ -21,7 +23,11 @@ ERRORS = {
 }
 """The errors by their names in the table; the first is what the measurement adds."""
 MOVED = "moved from the base [px]"
-_CURVES = {ERRORS["lost_px"]: BLUE, ERRORS["best_px"]: GREEN, MOVED: GOLD}
+_CURVES: dict[str, dict[str, Any]] = {
+    ERRORS["lost_px"]: {"color": BLUE, "marker": "o"},
+    ERRORS["best_px"]: {"color": GREEN, "marker": "s"},
+    MOVED: {"color": GOLD, "marker": "^"},
+}
 _COLUMNS = 3
 
 
@@ -49,10 +55,10 @@ def findings(
             "base": {name: float(base[name].mean()) for name in ERRORS},
             "factors": spans.to_dict("records"),
         },
-        sentences=_sentences(levels, spans, base, bases),
+        sentences=_sentences(levels, spans, base),
         keys=_keys(spans, base),
         plots=(_curves(levels, bases, seeds),),
-        tables={"Which factor matters": spans, "Every level": levels},
+        tables={"Which factor matters": spans, "Every level": levels.drop(columns="number")},
     )
 
 
@@ -70,7 +76,9 @@ def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) 
             part = parts[level]
             if not len(part):
                 continue
-            row = {"factor": FACTORS[name].label, "name": name, "level": level,
+            factor = FACTORS[name]
+            row = {"factor": factor.label, "name": name, "number": level,
+                   "level": factor.told(level) if factor.names else level,
                    "base": "yes" if level == at_base else ""}  # fmt: skip
             for key, label in ERRORS.items():
                 row[label] = part[key].mean()
@@ -131,43 +139,46 @@ def _keys(spans: pd.DataFrame, base: pd.DataFrame) -> tuple[KeyNumber, ...]:
     )  # fmt: skip
 
 
-def _sentences(
-    levels: pd.DataFrame,
-    spans: pd.DataFrame,
-    base: pd.DataFrame,
-    bases: Mapping[str, float | None],
-) -> tuple[str, ...]:
-    lost = ERRORS["lost_px"]
+_FAR, _NEAR = 0.1, 0.01
+"""Factors that move the measurement by more, or by less, are told apart [px]."""
+
+
+def _sentences(levels: pd.DataFrame, spans: pd.DataFrame, base: pd.DataFrame) -> tuple[str, ...]:
     said = [
         f"At the base the measurement is {short(float(base['lost_px'].mean()))} px rms per "
         f"component from the best fit of its ansatz, which is "
         f"{short(float(base['best_px'].mean()))} px from the truth; v₁ is "
         f"{short(float(base['v1_percent'].mean()))} % off the best fit's."
     ]
-    for _, row in spans.iterrows():
-        at_base = bases[str(row["name"])]
-        where = "the base has none" if at_base is None else f"the base has {at_base:g}"
-        said.append(
-            f"{str(row['factor'])[0].upper()}{str(row['factor'])[1:]}: from "
-            f"{short(float(row[f'smallest {lost}']))} px at {row['at']:g} to "
-            f"{short(float(row[f'largest {lost}']))} px at {row['at ']:g}, a factor of "
-            f"{row['ratio']:.3g} ({where}); it moves the measurement by up to "
-            f"{short(float(row[f'largest, {MOVED}']))} px."
-        )
+    far = spans[f"largest, {MOVED}"]
+    for words, part in (
+        (f"These move the measurement by more than {_FAR:g} px", spans[far > _FAR]),
+        (f"These by {_NEAR:g} to {_FAR:g} px", spans[(far >= _NEAR) & (far <= _FAR)]),
+        (f"These by less than {_NEAR:g} px", spans[far < _NEAR]),
+    ):
+        if len(part):
+            told = "; ".join(_factor_told(row) for _, row in part.iterrows())
+            said.append(f"{words}: {told}.")
     lost_ones = levels[levels["converged"].map(_some_missing)]
     if len(lost_ones):
-        told = ", ".join(f"{r['name']} = {r['level']:g}" for _, r in lost_ones.iterrows())
+        told = ", ".join(f"{r['name']} = {short(r['level'])}" for _, r in lost_ones.iterrows())
         said.append(f"Not every correlation converged at {told}.")
     said.append(
         "What the ansatz can't describe makes most of the error here, and hides smaller ones: how "
         "far a factor moves the measurement is told beside, rms per component at the junctions "
         "between holes. All are in pixels of the base."
     )
-    said.append(
-        "The engine has one gradient only, that of the deformed image at the displaced position "
-        "(g∘φ): a choice of the gradient could not be studied."
-    )
     return tuple(said)
+
+
+def _factor_told(row: pd.Series) -> str:
+    """A factor, how far it moves the measurement, and between what the error lies."""
+    lost = ERRORS["lost_px"]
+    return (
+        f"{str(row['factor']).split(' [')[0]} ({short(float(row[f'largest, {MOVED}']))} px; IDIC "
+        f"− best fit {short(float(row[f'smallest {lost}']))} px at {short(row['at'])}, "
+        f"{short(float(row[f'largest {lost}']))} px at {short(row['at '])})"
+    )
 
 
 def _some_missing(converged: str) -> bool:
@@ -185,26 +196,32 @@ def _curves(levels: pd.DataFrame, bases: Mapping[str, float | None], seeds: str)
             axes.set_visible(False)
         for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
             part = levels[levels["name"] == name]
-            for column, colour in _CURVES.items():
-                axes.plot(part["level"], part[column].replace(0.0, np.nan), marker="o",
-                          markersize=3, linewidth=1, color=colour, label=column)  # fmt: skip
-            _finish(axes, name, at_base)
-        grid[0].legend(frameon=False, fontsize=7)
-        drawn.tight_layout()
+            for column, look in _CURVES.items():
+                axes.plot(part["number"], part[column].replace(0.0, np.nan), linewidth=1,
+                          markersize=4, label=column, **look)  # fmt: skip
+            _finish(axes, part, at_base)
+        for axes in grid[::_COLUMNS]:
+            axes.set_ylabel("rms [px of the base]")
+        drawn.legend(*grid[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="upper left")
+        drawn.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.3 / drawn.get_figheight()))
     caption = (
-        f"Rms per component, in pixels of the base; means over {seeds}. Blue: what the "
-        "measurement adds to the best fit of its ansatz; green: what the ansatz can’t describe; "
-        "gold: how far the measurement is from the base’s. Dotted: the base."
+        f"Rms per component, in pixels of the base; means over {seeds}. Blue dots: what the "
+        "measurement adds to the best fit of its ansatz; green squares: what the ansatz can’t "
+        "describe; golden triangles: how far the measurement is from the base’s. Dotted: the base."
     )
     return Plot("factors", "Error against each factor", drawn, caption, wide=True)
 
 
-def _finish(axes: Axes, name: str, at_base: float | None) -> None:
-    levels = np.array(FACTORS[name].levels)
-    is_geometric = levels.min() > 0 and levels.max() / levels.min() >= 4 and name != "bits"
-    axes.set(xlabel=FACTORS[name].label, yscale="log", xscale="log" if is_geometric else "linear")
+def _finish(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:
+    factor, name = FACTORS[part["name"].iloc[0]], part["name"].iloc[0]
+    levels = part["number"].to_numpy(dtype=np.float64)
+    is_geometric = levels.min() > 0 and levels.max() / levels.min() >= 4 and not factor.whole
+    axes.set(xlabel=factor.label, yscale="log", xscale="log" if is_geometric else "linear")
     if at_base is not None:
         axes.axvline(at_base, color=MUTED, linestyle=":", linewidth=1)
-    if is_geometric:
-        axes.set_xticks(levels, [f"{v:g}" for v in levels])
-        axes.minorticks_off()
+    ticks = [factor.told(level) for level in levels]
+    if name == "pixel_size":
+        axes.set_xlabel("pixel [mm], below: pixels per ligament")
+        ticks = [f"{t}\n{p:.3g}" for t, p in zip(ticks, part["pixels per ligament"], strict=True)]
+    axes.set_xticks(levels, ticks)
+    axes.xaxis.set_minor_locator(NullLocator())
