@@ -58,10 +58,10 @@ class Modes:
 
     strain: float = 0.128
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
-    pitches: tuple[float, ...] = (0.95, 3.8)
+    pitches: tuple[float, ...] = (0.95,)
     materials: tuple[str, ...] = ("two-term I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
-    gradings_x: tuple[float, ...] = (0.01, 0.02, 0.04)
-    gradings_y: tuple[float, ...] = (0.01, 0.02)
+    gradings_x: tuple[float, ...] = (0.02, 0.04)
+    gradings_y: tuple[float, ...] = (0.02,)
     largest: float = 0.28
     divisions: int = 13
 
