@@ -88,6 +88,13 @@ def test_polynomials_over_a_rectangle(degree: int, waves: tuple[float, float]) -
     assert float(polynomial_transfer(degree, *waves)) == pytest.approx(share, abs=1e-12)
 
 
+@pytest.mark.parametrize("degree", range(1, 9))
+def test_a_rule_for_the_finest_period_of_polynomials(degree: int) -> None:
+    """L / (0.17 + 0.327 p), told in docs/resolution.md: half a percent from Bessel's formula."""
+    finest = finest_period(lambda period: polynomial_transfer(degree, 1.0 / period), 0.1, 20.0)
+    assert finest == pytest.approx(1.0 / (0.17 + 0.327 * degree), rel=5e-3)
+
+
 def test_no_transfer_is_extrapolated() -> None:
     with pytest.raises(InputError, match="rises through"):
         finest_period(lambda p: subset_transfer(17, 1, p), 5.0, 60.0)

@@ -29,6 +29,8 @@ QUANTITIES = ("v0", "v1", "v1phi1", "u")
 FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
 """Whose noise counts against the waves of a part."""
 MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 held"}
+_RESOLVED = 0.85
+"""Share of a wave that is found, from which on images are set against best fits apart [-]."""
 _SUBSET_PX = 33
 """A subset whose indicator stands for all: theory gives nearly the same for every size."""
 
@@ -281,14 +283,7 @@ def _sentences(
         "take the smallest degree whose period is below what v0 and v1 are expected to show.",
     ]
     if len(waves):
-        worst = float(waves["difference"].abs().max())
-        anywhere, resolved = cross_talk(curves)
-        said.append(
-            f"Correlated images give what the best fits promise: shares of waves of "
-            f"{subject.amplitude_px:g} px differ by {100 * worst:.1f} % of the amplitude at most. "
-            f"Of a wave of one part up to {100 * resolved:.1f} % is found in the other where it "
-            f"is resolved, up to {100 * anywhere:.0f} % where it isn't."
-        )
+        said.append(_waves_said(waves, subject, curves))
     if len(floors):
         ratio = floors["Monte Carlo / told"]
         said.append(
@@ -300,6 +295,20 @@ def _sentences(
     return tuple(said)
 
 
+def _waves_said(waves: pd.DataFrame, subject: Subject, curves: Curves) -> str:
+    """How near images come to best fits, and what goes into the wrong part."""
+    off, kept = waves["difference"].abs(), waves["best fit"] >= _RESOLVED
+    elsewhere = "" if kept.all() else f", elsewhere by {100 * off[~kept].max():.1f} %"
+    anywhere, resolved = cross_talk(curves)
+    return (
+        f"Correlated images give what the best fits promise: where these keep "
+        f"{100 * _RESOLVED:.0f} % or more of a wave of {subject.amplitude_px:g} px, its share "
+        f"differs by {100 * off[kept].max():.1f} % of the amplitude at most{elsewhere}. Of a wave "
+        f"of one part up to {100 * resolved:.1f} % is found in the other where it is resolved, up "
+        f"to {100 * anywhere:.0f} % where it isn't."
+    )
+
+
 def _product_said(degrees: list[Degree], local: float) -> str:
     """How constant the indicator is."""
     first, last = degrees[0], degrees[-1]
@@ -308,9 +317,9 @@ def _product_said(degrees: list[Degree], local: float) -> str:
     return (
         f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
         f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
-        f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², since φ1's own "
-        "parameters cost their noise at every degree; with φ1 held and without motion it is "
-        f"{first.held_px2:.2f} to {last.held_px2:.2f} px². An affine subset on the same speckle "
+        f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 held and "
+        f"without motion from {first.held_px2:.2f} to {last.held_px2:.2f} px²: the rest is the "
+        "noise of φ1's own parameters. An affine subset on the same speckle "
         f"under the same noise has {local:.2f} px², whatever its size (theory)."
     )
 

@@ -59,7 +59,7 @@ def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
                       alpha=0.6)  # fmt: skip
             end = min(high, value / (1.04 * bottom))
             if low < end and value / end < top:
-                axes.annotate(f"{value:g} px²", (end, value / end), (-3, 1), fontsize=6.5,
+                axes.annotate(f"{value:g} px²", (end, value / end), (-3, 3), fontsize=6.5,
                               textcoords="offset points", ha="right", color=MUTED)  # fmt: skip
         for n, grade in enumerate(grades):
             if grade not in known or grade.noise is None:
@@ -93,10 +93,11 @@ def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> 
     ``end`` is that of the colours; by default what 99 % of the values stay below.
     """
     star = grade.star
-    shape = (max(1, star.rows // _CELL_PX), max(1, star.cols // _CELL_PX))
-    limits = ((-0.5 * star.rows, 0.5 * star.rows), (-0.5, star.cols - 0.5))
     seen = np.isfinite(values)
     at = -grade.moved.y[seen], grade.moved.x[seen]
+    reach = min(0.5 * star.rows, float(np.abs(at[0]).max()) + _CELL_PX)
+    shape = (max(1, round(2 * reach / _CELL_PX)), max(1, star.cols // _CELL_PX))
+    limits = ((-reach, reach), (-0.5, star.cols - 0.5))
     count = np.histogram2d(*at, shape, limits)[0]
     total = np.histogram2d(*at, shape, limits, weights=values[seen])[0]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
