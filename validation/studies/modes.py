@@ -16,7 +16,7 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.lattice.independence import MATERIALS
 from modeharvest.validation.studies import modes_findings as told
-from modeharvest.validation.studies.modes_description import Description, folder_of
+from modeharvest.validation.studies.modes_description import Description
 from modeharvest.validation.studies.modes_specimen import one_specimen
 from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject
@@ -134,7 +134,7 @@ class Modes:
         name = base.leave(folder)
         snapshot = subject.solution.at(self.strain)
         own = Solution(subject.solution.mesh, (snapshot,), subject.solution.info)
-        own.write(folder_of(folder, name) / "solution.h5")
+        own.write(base.solution_path(folder))
         others = [
             {"varied": varied, "level": level, "specimen": described.leave(folder)}
             for varied, level, described in self._others(base)

@@ -138,6 +138,12 @@ class Description:
             given="",
         )
 
+    def solution_path(self, folder: Path) -> Path:
+        """Where the solution of a study's specimen is: that of all that simulating depends on."""
+        unseen = ("imaging", "correlation", "divisions")
+        simulated = {name: value for name, value in self.plain().items() if name not in unseen}
+        return folder / "solutions" / f"{digest(simulated)[:16]}.h5"
+
     def plain(self) -> dict[str, Any]:
         """As plain JSON values."""
         material = {"kind": type(self.material).__name__, **vars(self.material)}

@@ -3,7 +3,7 @@
 In ``specimens/NAME/`` of the study's folder, NAME the digest of the description::
 
     specimen.json          how it is made, imaged and correlated
-    solution.h5            the exact displacement, beyond the critical strain
+    solution.h5            the exact displacement, a copy of the one in ``solutions/``
     result.json best.json  the measurement, and the best fit of its ansatz to the truth
 """
 
@@ -57,7 +57,7 @@ def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """
     own = folder_of(folder, case["specimen"])
     described = Description.read(own / "specimen.json")
-    solution = _solution(described, own)
+    solution = _solution(described, folder)
     lattice = LatticeMode.of(described.specimen, described.material, described.divisions)
     row = _told(described, solution) | _told_of_lattice(lattice)
     if row["first"] == "none":
@@ -70,12 +70,12 @@ def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         scene.discard()
 
 
-def _solution(described: Description, own: Path) -> Solution:
-    """The one that is there, or a new one."""
-    path = own / "solution.h5"
+def _solution(described: Description, folder: Path) -> Solution:
+    """The one that is there, or a new one: simulating costs most, and knows nothing of images."""
+    path = described.solution_path(folder)
     if not path.is_file():
         if described.given:
-            raise InputError(f"expected the study's own solution at {path}, found none; start anew")
+            raise InputError(f"expected the base's solution at {path}, found none; run it again")
         simulate_pattern(described.experiment, described.amplitude, described.largest).write(path)
     return Solution.read(path)
 
