@@ -11,26 +11,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.idic.agreement import TRAPPED, autocorrelation, lags_for, unmatched
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.estimating_equation import instrument
 from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
-    Minimum,
     Outcome,
     minimise,
 )
 from modeharvest.idic.inputs import CheckedImages, checked_mask, where
+from modeharvest.idic.judged import WITHOUT_RESULT, ended, judged, weighting_for
 from modeharvest.idic.level_search import LevelSearch, step_length
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.pyramid import COARSE_TO_FINE, FULL, Level, prepare
 from modeharvest.idic.result import Result
-from modeharvest.idic.scaled_eigen import ScaledEigen
 from modeharvest.idic.speckle_width import speckle_width
-from modeharvest.idic.warp import residual
-from modeharvest.idic.weighting import Gradient, Weighting, best_blur
+from modeharvest.idic.weighting import Gradient
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.progress import Progress, silent
 
@@ -40,7 +37,6 @@ BoolArray = NDArray[np.bool_]
 _LEAST = 1e-3
 """On coarse levels, directions with an eigenvalue below this share of the largest one wait for
 the finest level: what a blur does to the images would send them into other valleys."""
-_WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
 
 
 @dataclass(frozen=True)
@@ -147,17 +143,18 @@ def correlate(
         clock.lap(f"iterate level {level.factor}")
         history += found.history
         a = np.append(found.unknowns, a[n:])
-        if found.outcome in _WITHOUT_RESULT:
+        if found.outcome in WITHOUT_RESULT:
             break
     width_px = speckle_width(search.pair.reference, search.pair.mask)
-    result = _judged(search, found, assembly, width_px)
+    result = judged(search.ansatz, search.pair, found, assembly, width_px)
     clock.lap("judge the residual")
-    weighting = _weighting(result, width_px, options) if level == FULL else Weighting()
-    if not weighting.is_least_squares and found.outcome is Outcome.CONVERGED:
+    gradient = Gradient(options.gradient)
+    weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
+    if level == FULL and result.outcome is Outcome.CONVERGED and not weighting.is_least_squares:
         slopes = instrument(weighting, images, search.pair, assembly, found.unknowns)
         found = search.reweighed(found, assembly, slopes)
         history += found.history
-        result = replace(_judged(search, found, assembly, width_px), weighting=weighting)
+        result = judged(search.ansatz, search.pair, found, assembly, width_px, weighting)
         clock.lap("weigh anew")
     progress(len(levels), len(levels), "correlate")
     return replace(result, history=history, timings_s=clock.laps)
@@ -225,7 +222,7 @@ def fit_displacement(
         on_iteration=_reporter(progress, 0, 1, options),
     )
     clock.lap("iterate")
-    return replace(_result(ansatz, grid, found), history=found.history, timings_s=clock.laps)
+    return replace(ended(ansatz, grid, found), history=found.history, timings_s=clock.laps)
 
 
 def _level_search(
@@ -256,46 +253,6 @@ def _level_search(
         coarse_px,
         options.gauss_newton,
         report,
-    )
-
-
-def _judged(search: LevelSearch, found: Minimum, used: Assembly, width_px: float) -> Result:
-    """The result, with what its residual tells."""
-    pair = search.pair
-    left = residual(used, found.unknowns, pair.reference, pair.deformed)
-    lost, lags_px = unmatched(pair.reference, left), lags_for(width_px)
-    if lost > TRAPPED and found.outcome not in _WITHOUT_RESULT:
-        found = replace(found, outcome=Outcome.TRAPPED)
-    return replace(
-        _result(search.ansatz, pair.grid, found),
-        residual_correlation=autocorrelation(left, lags_px),
-        residual_lags_px=lags_px,
-        unmatched=lost,
-    )
-
-
-def _weighting(result: Result, width_px: float, options: CorrelationOptions) -> Weighting:
-    """What is to weigh the residual: as asked for, blurred if it is noise that spoils it."""
-    gradient, blur_px = Gradient(options.gradient), options.gradient_blur_px
-    if blur_px is None:
-        blur_px = 0.0
-        if result.agreement().is_white:
-            blur_px = best_blur(result.noise_in_gradient(result.noise_sd**2), width_px)
-    return Weighting(gradient, blur_px, width_px)
-
-
-def _result(ansatz: Ansatz, grid: PixelGrid, found: Minimum) -> Result:
-    eigen = ScaledEigen.of(found.equations.matrix)
-    return Result(
-        ansatz=ansatz,
-        grid=grid,
-        unknowns=found.unknowns.copy(),
-        inverse=eigen.inverse(),
-        residual_rms=float(np.sqrt(found.equations.mean_square)),
-        pixels=found.equations.pixels,
-        left_image=found.equations.left_image,
-        outcome=found.outcome,
-        condition_number=eigen.condition_number,
     )
 
 

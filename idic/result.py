@@ -15,8 +15,8 @@ from modeharvest.files import read_json, write_json
 from modeharvest.idic.agreement import LAGS_PX, Agreement
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.serialise import ansatz_from_dict, ansatz_to_dict
-from modeharvest.idic.weighting import SLOPE_NOISE, Gradient, Weighting
+from modeharvest.idic.serialise import result_fields, result_to_dict
+from modeharvest.idic.weighting import SLOPE_NOISE, Weighting
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -272,32 +272,7 @@ class Result:
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""
-        content = {
-            "format": FORMAT,
-            "outcome": self.outcome.value,
-            "explanation": self.outcome.explanation,
-            "unknowns": dict(zip(self.names, map(float, self.unknowns), strict=True)),
-            "units": list(self.ansatz.units),
-            "residual_rms": _to_json(self.residual_rms),
-            "pixels": self.pixels,
-            "left_image": self.left_image,
-            "condition_number": _to_json(self.condition_number),
-            "history": [{k: _to_json(v) for k, v in vars(s).items()} for s in self.history],
-            "timings_s": dict(self.timings_s),
-            "residual_correlation": _to_json(self.residual_correlation),
-            "residual_lags_px": list(self.residual_lags_px),
-            "unmatched": _to_json(self.unmatched),
-            "weighting": {
-                "gradient": self.weighting.gradient.value,
-                "blur_px": self.weighting.blur_px,
-                "width_px": _to_json(self.weighting.width_px),
-                "explanation": self.weighting.sentence,
-            },
-            "grid": vars(self.grid),
-            "ansatz": ansatz_to_dict(self.ansatz),
-            "inverse": [[_to_json(float(v)) for v in row] for row in self.inverse],
-        }
-        write_json(path, content)
+        write_json(path, {"format": FORMAT, **result_to_dict(self)})
 
     @classmethod
     def read(cls, path: Path | str) -> Result:
@@ -312,48 +287,13 @@ class Result:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise InputError(f"expected a {FORMAT} file at {path}; correlate again")
         try:
-            steps = ({k: _from_json(v) for k, v in s.items()} for s in content["history"])
-            return cls(
-                ansatz=ansatz_from_dict(content["ansatz"]),
-                grid=PixelGrid(**content["grid"]),
-                unknowns=np.array(list(content["unknowns"].values())),
-                inverse=np.array([[_from_json(v) for v in row] for row in content["inverse"]]),
-                residual_rms=_from_json(content["residual_rms"]),
-                pixels=content["pixels"],
-                left_image=content["left_image"],
-                outcome=Outcome(content["outcome"]),
-                condition_number=_from_json(content["condition_number"]),
-                history=tuple(Iteration(**step) for step in steps),
-                timings_s=content["timings_s"],
-                residual_correlation=_or_nan(content["residual_correlation"]),
-                residual_lags_px=tuple(content["residual_lags_px"]),
-                unmatched=_or_nan(content["unmatched"]),
-                weighting=_weighting(content["weighting"]),
-            )
+            return cls(**result_fields(content))
         except InputError:
             raise
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise InputError(
                 f"expected a complete {FORMAT} file at {path}, got: {error!r}; correlate again"
             ) from error
-
-
-def _to_json(value: Any) -> Any:
-    """Null for infinity and NaN, which JSON doesn't know."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _from_json(value: Any) -> Any:
-    return np.inf if value is None else value
-
-
-def _weighting(content: dict[str, Any]) -> Weighting:
-    gradient = Gradient(content["gradient"])
-    return Weighting(gradient, content["blur_px"], _from_json(content["width_px"]))
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else value
 
 
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:

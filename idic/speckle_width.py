@@ -30,6 +30,11 @@ def speckle_width(image: NDArray[Any], mask: BoolArray) -> float:
         (rows, cols) grey levels.
     mask
         (rows, cols) True on material.
+
+    Returns
+    -------
+    float
+        At most twice the largest lag looked at, 128 px; that for an image without contrast, too.
     """
     inner = eroded(mask, _EDGE_PX)
     inner = inner if inner.any() else mask
@@ -46,12 +51,12 @@ def _autocorrelation(image: NDArray[Any], inner: BoolArray) -> FloatArray:
     lines = np.flatnonzero(inner.any(axis=1))
     lines = lines[:: len(lines) // _LINES + 1]
     values, weights = image[lines], inner[lines]
-    level = values[weights].mean(dtype=np.float64)
+    level = values[weights].mean(dtype=np.float64) if weights.any() else 0.0
     shown = np.where(weights, values - np.float32(level), np.float32(0.0))
     n = fft.next_fast_len(shown.shape[1] + _LONGEST, real=True)
     products, pairs = _lagged(shown, n), _lagged(weights, n)
     means = products / np.maximum(pairs, 1.0)
-    return np.asarray(means / means[0])
+    return np.asarray(means / means[0] if means[0] > 0.0 else np.ones(_LONGEST))
 
 
 def _lagged(values: NDArray[Any], n: int) -> FloatArray:

@@ -96,14 +96,21 @@ class Weighting:
     @property
     def sentence(self) -> str:
         """That in words."""
-        of = {
+        whose = {
             Gradient.DEFORMED: "the deformed image's gradient",
             Gradient.REFERENCE: "the reference's gradient",
             Gradient.MEAN: "the mean of both images' gradients",
         }[self.gradient]
-        blurred = f", blurred by {self.blur_px:.2g} px" if self.blur_px else ""
-        why = ", because of the images' noise" if self.blur_px else ""
-        return f"The residual was weighed with {of}{blurred}{why}."
+        if self.blur_px == 0.0:
+            return f"The residual was weighed with {whose}."
+        return (
+            f"The residual was weighed with {whose} after a blur of {self.blur_px:.2g} px, which "
+            "takes away the gradient of the images' noise."
+        )
+
+
+LEAST_SQUARES = Weighting()
+"""With the derivative of the cost itself."""
 
 
 def best_blur(noise_share: float, width_px: float) -> float:

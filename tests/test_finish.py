@@ -54,6 +54,11 @@ def test_holes_do_not_change_the_width() -> None:
     assert speckle_width(painted, mask) == pytest.approx(speckle_width(image, EVERYWHERE), rel=0.05)
 
 
+def test_without_contrast_a_speckle_is_as_wide_as_can_be() -> None:
+    image, nowhere = blurred_noise(3.0), np.zeros(SHAPE, dtype=np.bool_)
+    assert speckle_width(image, nowhere) == speckle_width(0.0 * image, EVERYWHERE) == 128.0
+
+
 def test_the_paper_s_speckle_is_as_wide_as_its_pixels_differences_say() -> None:
     """Two pixels differ by half as much as any two do, at half the width."""
     image = Speckle(SpeckleSpec(), SHAPE).image()
