@@ -7,7 +7,7 @@ primary path up to them as well: that costs most where ligaments are thin.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +35,7 @@ NO_DOLFINX = (
 CLOSE = 0.02
 """How near to the wanted amplitude is near enough [-]."""
 _FIRST, _SHORTEST = 0.25, 0.01  # steps along the branch, in shares of the wanted amplitude
+_WALKS = 3  # with shorter and shorter steps
 _QUADRATURE = 4
 """Points per direction: the pattern's waves are long against the elements."""
 
@@ -178,26 +179,30 @@ def _follow(
 
 
 def _until_critical(walker: Walker, largest: float) -> tuple[State, Critical | None, str]:
-    """The last stable state of the primary path, its first critical point, and what happened."""
+    """The last stable state of the primary path, its first critical point, and what happened.
+
+    Where no bifurcation is found between the last two states, steps were too long to stay on the
+    path: it is walked again from the stable one with shorter steps.
+    """
     from modeharvest.fem.critical import locate_critical
 
     path = [walker.start()]
-    reached = walker.primary(path, (largest,), until_unstable=True)
-    last = path[-1]
-    if last.negative_pivots == 0:
-        strain = 100 * last.strain
-        return last, None, (
-            f"stable up to {strain:.4g} %, the largest strain looked at"
-            if reached
-            else f"stable up to {strain:.4g} %, beyond which no equilibrium was found"
-        )  # fmt: skip
-    critical = locate_critical(walker, path[-2], last)
-    if critical is None:
-        return path[-2], None, (
-            f"unstable between {100 * path[-2].strain:.4g} and {100 * last.strain:.4g} %, where no "
-            "bifurcation was found"
-        )  # fmt: skip
-    return path[-2], critical, "complete"
+    for _ in range(_WALKS):
+        reached = walker.primary(path, (largest,), until_unstable=True)
+        last = path[-1]
+        if last.negative_pivots == 0:
+            why = "the largest strain looked at" if reached else "where the path was lost"
+            return last, None, f"stable up to {100 * last.strain:.4g} %, {why}"
+        critical = locate_critical(walker, path[-2], last)
+        if critical is not None:
+            return path[-2], critical, "complete"
+        path.pop()
+        steps = {n: getattr(walker.options, n) / 3.0 for n in ("first_step", "largest_step")}
+        walker.options, walker.factor = replace(walker.options, **steps), None
+    return path[-1], None, (
+        f"unstable between {100 * path[-1].strain:.4g} and {100 * last.strain:.4g} %, where no "
+        "bifurcation was found"
+    )  # fmt: skip
 
 
 def _solution(
