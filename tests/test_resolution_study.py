@@ -22,6 +22,7 @@ from modeharvest.studies.case import StudyCase, read_study
 from modeharvest.validation.resolution import findings as told
 from modeharvest.validation.resolution.buckled import LARGEST, Buckled, Wave
 from modeharvest.validation.resolution.curves import AXES, WAVED, Curves, Passband
+from modeharvest.validation.resolution.degrees import QUANTITIES
 from modeharvest.validation.resolution.measure import Subject, one_case
 from modeharvest.validation.resolution.study import Resolution
 from modeharvest.validation.resolution.tangent import Tangent, share
@@ -95,7 +96,7 @@ def test_waves_that_the_ansatz_describes_are_found_whole(subject: Subject) -> No
             assert (curves.own[part, axis, 4] > curves.own[part, axis, 1] - 0.02).all()
             assert curves.own[part, axis, 4][-1] == pytest.approx(1.0, abs=1e-6)
             assert curves.finest(part, axis, 4) < 0.6 * curves.finest(part, axis, 1)
-    anywhere, resolved = told.cross_talk(curves)
+    anywhere, resolved = curves.cross_talk()
     assert resolved < anywhere < 0.2
     assert resolved < 0.05
 
@@ -107,6 +108,7 @@ def test_the_pattern_is_tuned_and_not_filtered(subject: Subject) -> None:
     near = np.abs(band.stretch - 1.0) < 0.05
     assert band.itself[near] == pytest.approx(1.0, abs=1e-6)
     assert band.wavelength_error[near].max() < 1e-6
+    assert band.retuned >= 0.05
     between = (band.stretch > 0.5) & (band.stretch < 0.6)
     assert band.added[between].max() < 0.3
 
@@ -173,7 +175,7 @@ def test_images_give_what_best_fits_promise(
 
 def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Subject) -> None:
     floors = told.noise_floors(table, subject)
-    assert len(floors) == 2 * len(told.QUANTITIES)
+    assert len(floors) == 2 * len(QUANTITIES)
     z = (floors["Monte Carlo / told"] - 1.0) / floors["±"]
     # Twelve realisations: Student's t, and eight numbers that hang together.
     assert z.abs().max() < 5.0

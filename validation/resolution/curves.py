@@ -90,6 +90,15 @@ class Curves:
 
         return finest_period(transfer, float(self.periods[0]), float(self.periods[-1]))
 
+    def cross_talk(self) -> tuple[float, float]:
+        """Largest share of a wave of one part found in the other: at any period, from l10 on."""
+        everywhere, resolved = [], []
+        for key, own in self.own.items():
+            other = np.abs(self.whole[key] - own)
+            everywhere.append(other.max())
+            resolved.append(other[self.periods >= self.finest(*key)].max())
+        return float(max(everywhere)), float(max(resolved))
+
 
 def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
     """(n,) shares of waves (m, 2, 2 n), those of the two phases weighted by their power."""
@@ -145,6 +154,13 @@ class Passband:
         for k in np.flatnonzero(near):
             itself[k], error[k] = _refitted(subject, degree, float(stretch[k]))
         return cls(stretch, added, itself, error)
+
+    @property
+    def retuned(self) -> float:
+        """How far off its wave numbers may be for the pattern to be found whole, both ways [-]."""
+        whole, off = self.itself > 0.999, np.abs(self.stretch - 1.0)
+        lost = off[~whole & np.isfinite(self.itself)].min(initial=np.inf)
+        return float(off[whole & (off < lost)].max(initial=0.0))
 
 
 def _stretched(subject: Subject, stretch: float, points: FloatArray) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -13,13 +12,11 @@ from matplotlib.colors import Colormap
 from matplotlib.ticker import FuncFormatter
 
 from modeharvest.validation.resolution.curves import AXES, Curves, Passband
+from modeharvest.validation.resolution.degrees import Degree
 from modeharvest.validation.resolution.measure import Subject
 from modeharvest.validation.resolution.transfer import KEPT
 from modeharvest.validation.studies.study import Plot
 from modeharvest.validation.style import BLUE, GREEN, INK, MUTED, RED, figure, style
-
-if TYPE_CHECKING:
-    from modeharvest.validation.resolution.findings import Degree
 
 _DEGREES: Colormap = mpl.colormaps["viridis"]
 
