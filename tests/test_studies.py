@@ -328,6 +328,9 @@ def test_levels_out_of_range_are_told_before_anything_runs(subject: Subject, fol
         ("order", 4.5, "whole numbers"),
         ("order", 4, "order 3 or 5"),
         ("gradient", 3, "one of .*'reference'"),
+        ("taper", -1.0, "wider than 0"),
+        ("speckle_size", 0.0, "above 0 times"),
+        ("fill_factor", 2.0, "fill factor in 0"),
     ):
         study = Systematic(factors=(name,), levels={name: (level,)})
         with pytest.raises(InputError, match=said):

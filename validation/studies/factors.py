@@ -22,11 +22,20 @@ class Setting:
         As everywhere.
     taper
         Width over which the mode fades out [unit cells].
+
+    Raises
+    ------
+    InputError
+        If the taper has no width.
     """
 
     imaging: ImagingSpec
     correlation: Identification
     taper: float = PAPERS_TAPER
+
+    def __post_init__(self) -> None:
+        if not self.taper > 0.0:
+            raise InputError(f"study: expected a taper wider than 0 unit cells, got {self.taper}")
 
     def imaged(self, **options: Any) -> Setting:
         """With other options of the imaging."""
@@ -116,6 +125,8 @@ class Factor:
 
 def _speckle_size(setting: Setting, factor: float) -> Setting:
     """Everything about the speckle that much larger, its blur included."""
+    if not factor > 0.0:
+        raise InputError(f"study: expected a speckle_size above 0 times the base's, got {factor}")
     speckle = setting.imaging.speckle
     return setting.speckled(
         standard_deviation=speckle.standard_deviation / factor, blur_px=speckle.blur_px * factor
