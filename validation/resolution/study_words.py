@@ -126,10 +126,10 @@ class Answers:
         band = self.passband
         kept = band.stretch[(band.stretch > 0.82) & (band.added >= 0.9)]
         return (
-            f"The pattern itself has a wavelength of 2 cells along x and y, {2 * self._pitch_px:.0f} "
-            "px, far below those periods, and none of it is lost: it is one of the functions that "
-            f"are fitted. A small pattern beside it passes as through a filter, from "
-            f"{kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
+            "The pattern itself has a wavelength of 2 cells along x and y, "
+            f"{2 * self._pitch_px:.0f} px, far below those periods, and none of it is lost: it is "
+            "one of the functions that are fitted. A small pattern beside it passes as through a "
+            f"filter, from {kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
             f"{self.chosen.degree}; but if the pattern itself is up to {100 * band.retuned:.0f} % "
             "longer or shorter, its wave numbers follow, and all of its amplitude is found: "
             "l₁₀ % is a filter's number, and φ1 isn't filtered but tuned."
