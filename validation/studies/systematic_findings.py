@@ -111,10 +111,14 @@ def _moved(done: pd.DataFrame) -> pd.Series:
 
 
 def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
-    """A row for each factor: its smallest and its largest error, the most important first."""
-    lost, best = ERRORS["lost_px"], ERRORS["best_px"]
+    """A row for each factor: its smallest and its largest error, the most important first.
+
+    Levels at which not all converged have no part in it.
+    """
+    lost, best, moved = ERRORS["lost_px"], ERRORS["best_px"], f"largest, {MOVED}"
     rows = []
-    for name, part in levels.groupby("name", sort=False):
+    settled = levels[~levels["converged"].map(_some_missing)]
+    for name, part in settled.groupby("name", sort=False):
         least, most = part.loc[part[lost].idxmin()], part.loc[part[lost].idxmax()]
         rows.append({
             "factor": FACTORS[str(name)].label, "name": name,
@@ -122,9 +126,9 @@ def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
             f"largest {lost}": most[lost], "at ": most["level"],
             "ratio": most[lost] / least[lost],
             f"{best}, from": part[best].min(), "to": part[best].max(),
-            f"largest, {MOVED}": part[MOVED].max(),
+            moved: part[MOVED].max(),
         })  # fmt: skip
-    return pd.DataFrame(rows).sort_values("ratio", ascending=False, ignore_index=True)
+    return pd.DataFrame(rows).sort_values(moved, ascending=False, ignore_index=True)
 
 
 def _keys(spans: pd.DataFrame, base: pd.DataFrame) -> tuple[KeyNumber, ...]:
@@ -135,7 +139,7 @@ def _keys(spans: pd.DataFrame, base: pd.DataFrame) -> tuple[KeyNumber, ...]:
         KeyNumber("truth − best fit", short(float(base["best_px"].mean())), "px",
                   "at the base: what the ansatz can’t describe"),
         KeyNumber("matters most", str(first["factor"]).split(" [")[0], "",
-                  f"the error changes by a factor of {first['ratio']:.3g}"),
+                  f"moves the measurement by up to {first[f'largest, {MOVED}']:.2g} px"),
     )  # fmt: skip
 
 
@@ -157,28 +161,21 @@ def _sentences(levels: pd.DataFrame, spans: pd.DataFrame, base: pd.DataFrame) ->
         (f"These by less than {_NEAR:g} px", spans[far < _NEAR]),
     ):
         if len(part):
-            told = "; ".join(_factor_told(row) for _, row in part.iterrows())
+            told = ", ".join(
+                f"{row['factor'].split(' [')[0]} ({short(float(f'{moved:.2g}'))} px)"
+                for moved, (_, row) in zip(far[part.index], part.iterrows(), strict=True)
+            )
             said.append(f"{words}: {told}.")
     lost_ones = levels[levels["converged"].map(_some_missing)]
     if len(lost_ones):
         told = ", ".join(f"{r['name']} = {short(r['level'])}" for _, r in lost_ones.iterrows())
-        said.append(f"Not every correlation converged at {told}.")
+        said.append(f"Not every correlation converged at {told}: left out above.")
     said.append(
         "What the ansatz can't describe makes most of the error here, and hides smaller ones: how "
         "far a factor moves the measurement is told beside, rms per component at the junctions "
         "between holes. All are in pixels of the base."
     )
     return tuple(said)
-
-
-def _factor_told(row: pd.Series) -> str:
-    """A factor, how far it moves the measurement, and between what the error lies."""
-    lost = ERRORS["lost_px"]
-    return (
-        f"{str(row['factor']).split(' [')[0]} ({short(float(row[f'largest, {MOVED}']))} px; IDIC "
-        f"− best fit {short(float(row[f'smallest {lost}']))} px at {short(row['at'])}, "
-        f"{short(float(row[f'largest {lost}']))} px at {short(row['at '])})"
-    )
 
 
 def _some_missing(converged: str) -> bool:
@@ -197,8 +194,9 @@ def _curves(levels: pd.DataFrame, bases: Mapping[str, float | None], seeds: str)
         for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
             part = levels[levels["name"] == name]
             for column, look in _CURVES.items():
-                axes.plot(part["number"], part[column].replace(0.0, np.nan), linewidth=1,
-                          markersize=4, label=column, **look)  # fmt: skip
+                seen = part[part[column] > 0.0]  # the base is not moved from itself
+                axes.plot(seen["number"], seen[column], linewidth=1, markersize=4, label=column,
+                          **look)  # fmt: skip
             _finish(axes, part, at_base)
         for axes in grid[::_COLUMNS]:
             axes.set_ylabel("rms [px of the base]")
