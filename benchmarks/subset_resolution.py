@@ -67,8 +67,8 @@ def main() -> None:
         grading = StarGrading(star_set, tuple(ranked(list(grades.values()))))
         write_star_grading(out / "graded", grading)
         print_star_grading(grading, out / "graded")
-    columns = ["subset", "l10 [px]", "theory", "this speckle", "n [10⁻³ px]", "theory",
-               "n l10 [px²]", "theory"]  # fmt: skip
+    expected = ["theory", "this speckle"]
+    columns = ["subset", "l10 [px]", *expected, "n [10⁻³ px]", *expected, "n l10 [px²]", *expected]
     print(f"| {' | '.join(columns)} |", "|---" * len(columns) + "|", sep="\n")
     for (shape, width), graded in grades.items():
         print(row(star_set, shape, width, options.noise, graded))
@@ -105,7 +105,8 @@ def slopes(star_set: StarSet) -> FloatArray:
 def weighted(star_set: StarSet, degree: int, width: int, at: LocalField) -> LocalField:
     """Fits of a subset's shape functions to the true displacement, weighted by the speckle's slope.
 
-    What Gauss and Newton's matrix J'J makes of it at the points of a field.
+    What Gauss and Newton's matrix J'J makes of it at the points of a field, with the standard
+    deviations of v for a noise of 1 in one image.
     """
     star, half = star_set.spec.star, width // 2
     g_y, g_x = slopes(star_set)
@@ -114,25 +115,30 @@ def weighted(star_set: StarSet, degree: int, width: int, at: LocalField) -> Loca
     y, x = (o.ravel().astype(float) for o in np.mgrid[-half : half + 1, -half : half + 1])
     shapes = [x**i * y**j for i, j in orders(degree)]
     basis = np.stack(shapes, axis=-1)
-    v = np.empty(at.x.size)
+    v, sd = np.empty((2, at.x.size))
     for k, (r, c) in enumerate(zip(*(np.rint(i).astype(int) for i in star.grid.to_px(at.x, at.y)),
                                    strict=True)):  # fmt: skip
         here = np.s_[r - half : r + half + 1, c - half : c + half + 1]
         along_x, along_y = g_x[here].ravel()[:, None], g_y[here].ravel()[:, None]
         J = np.hstack([along_x * basis, along_y * basis])
         seen = along_y[:, 0] * true[here].ravel()
-        v[k] = np.linalg.solve(J.T @ J, J.T @ seen)[len(shapes)]
-    return LocalField(at.x, at.y, np.column_stack([0.0 * v, -v]), source="weighted")
+        inverse = np.linalg.inv(J.T @ J)
+        v[k] = (inverse @ (J.T @ seen))[len(shapes)]
+        sd[k] = np.sqrt(inverse[len(shapes), len(shapes)])
+    u = np.column_stack([0.0 * v, -v])
+    return LocalField(at.x, at.y, u, sd=np.column_stack([sd, sd]), source="weighted")
 
 
 def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGrade) -> str:
     """A row of the table."""
     star, degree = star_set.spec.star, DEGREES[shape]
     finest = finest_period(lambda p: subset_transfer(width, degree, p), 4.0, 2000.0)
-    here = Attenuation.of(star, weighted(star_set, degree, width, graded.moved))
+    fitted = weighted(star_set, degree, width, graded.moved)
+    here = Attenuation.of(star, fitted)
     slope = float(np.sqrt(np.mean(slopes(star_set)[0] ** 2)))
     rounding = 1.0 / np.sqrt(12.0) / (2**star_set.spec.bits - 1)
-    floor = np.sqrt(2.0) * np.hypot(noise, rounding) / (width * slope)
+    both = np.sqrt(2.0) * np.hypot(noise, rounding)
+    floor = both / (width * slope)
     found = graded.attenuation
     assert graded.noise is not None
     cells = [
@@ -142,8 +148,10 @@ def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGra
         f"{here.finest_px:.1f} ± {here.finest_se_px:.1f}",
         f"{1e3 * graded.noise.v_px:.2f} ± {1e3 * graded.noise.v_se_px:.2f}",
         f"{1e3 * floor:.2f}" if degree < 2 else "–",
+        f"{1e3 * both * fitted.sd_rms:.2f}",
         f"{graded.indicator_px2:.3f} ± {graded.indicator_se_px2:.3f}",
         f"{floor * finest:.3f}" if degree < 2 else "–",
+        f"{both * fitted.sd_rms * here.finest_px:.3f}",
     ]
     return f"| {' | '.join(cells)} |"
 
