@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -159,23 +159,50 @@ def _follow(
 
     structure = walker.structure
     largest = structure.largest(mode.vector)  # amplitudes are largest displacements
-    weights, rate = largest * mode.weighted, (1.0 / largest) * mode.vector
-    u, strain, strain_rate, amplitude = critical.u, critical.strain, 0.0, 0.0
+    weights = largest * mode.weighted
+    points = [_Point(0.0, critical.strain, 0.0, critical.u, (1.0 / largest) * mode.vector)]
     step, shortest = _FIRST * wanted, _SHORTEST * wanted
     state, reached = stable, 0.0
     while abs(step) > shortest:
-        constraint = Constraint(weights, critical.u, amplitude + step)
-        found = walker.equilibrium(strain + step * strain_rate, u + step * rate, constraint)
+        amplitude = points[-1].amplitude + step
+        constraint = Constraint(weights, critical.u, amplitude)
+        found = walker.equilibrium(*_predicted(points, amplitude), constraint)
         if found is None:
             step, walker.factor = 0.5 * step, None  # it may belong to the failed state
             continue
-        rate, strain_rate = (1.0 / step) * (found.u - u), (found.strain - strain) / step
-        u, strain, amplitude, state = found.u, found.strain, amplitude + step, found
-        reached = cells.amplitude(structure.nodal(u))
+        strain_rate = 1.0 / float(weights.dot(found.tangent))
+        points.append(
+            _Point(amplitude, found.strain, strain_rate, found.u, strain_rate * found.tangent)
+        )
+        state, reached = found, cells.amplitude(structure.nodal(found.u))
         if abs(reached / wanted - 1.0) < CLOSE:
             break
         step = amplitude * float(np.clip(wanted / reached - 1.0, -0.5, 1.0))
     return state, reached
+
+
+class _Point(NamedTuple):
+    """A point of the branch as a function of the mode's amplitude [mm]; ``u`` is a PETSc vector."""
+
+    amplitude: float
+    strain: float
+    strain_rate: float
+    u: Any
+    rate: Any
+
+
+def _predicted(points: list[_Point], amplitude: float) -> tuple[float, Any]:
+    """Strain and displacement at an amplitude, from the last two points and their rates."""
+    from modeharvest.fem.continuation import hermite_weights
+
+    b = points[-1]
+    if len(points) == 1:
+        step = amplitude - b.amplitude
+        return b.strain + step * b.strain_rate, b.u + step * b.rate
+    a = points[-2]
+    w = hermite_weights(a.amplitude, b.amplitude, amplitude)
+    strain = w[0] * a.strain + w[1] * a.strain_rate + w[2] * b.strain + w[3] * b.strain_rate
+    return strain, w[0] * a.u + w[1] * a.rate + w[2] * b.u + w[3] * b.rate
 
 
 def _until_critical(walker: Walker, largest: float) -> tuple[State, Critical | None, str]:
