@@ -109,6 +109,10 @@ def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
     assert not Agreement(autocorrelation(left_over, lags), f.size, lags_px=lags).is_white
     rng = np.random.default_rng(3)
     noise = left_over.std() * rng.normal(size=(2, *shape))
+    beside_noise = left_over + noise[0]
+    assert not Agreement(autocorrelation(beside_noise, lags), f.size, lags_px=lags).is_white
+    # What was once looked at for every speckle is beyond small ones.
+    assert Agreement(autocorrelation(beside_noise), f.size).is_white == (width < 6.0)
     moved = SplineImage.of(noise[1]).sample(*(0.97 * np.stack([rows, cols]) + 3))[0]
     judged = Agreement(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
     assert judged.is_white, judged.sentence
