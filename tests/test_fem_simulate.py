@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from functools import cache
@@ -176,16 +177,16 @@ def test_odd_numbers_of_holes_both_ways_have_no_bifurcation_into_the_pattern() -
     found = []
     for step in (0.026, 0.01):
         path = PathOptions(first_step=step, largest_step=step)
-        solution = simulate(Experiment(specimen, strains=(0.05, 0.12), mesh_size=0.35, path=path))
+        solution = simulate(small(specimen=specimen, strains=(0.05, 0.12, 0.135), path=path))
         assert solution.info["critical"] is None
         assert solution.info["outcome"] == "complete"
         assert not any(solution.info["path"]["primary"]["negative_pivots"])
         found.append(solution)
     pattern = specimen.pattern(found[0].mesh.nodes)
-    small, large = (abs(np.vdot(pattern, s.displacement)) for s in found[0].snapshots)
-    assert large > 20 * small
-    before, after = (s.snapshots[1].displacement for s in found)
-    np.testing.assert_allclose(before, after, atol=1e-6)
+    early, _, late = (abs(np.vdot(pattern, s.displacement)) for s in found[0].snapshots)
+    assert late > 20 * early
+    for one, other in zip(found[0].snapshots, found[1].snapshots, strict=True):
+        np.testing.assert_allclose(one.displacement, other.displacement, atol=1e-6)
 
 
 def test_scatter_leads_to_the_perfect_branch_as_it_vanishes() -> None:
@@ -257,9 +258,15 @@ solution.write(f"{sys.argv[1]}/rank{MPI.COMM_WORLD.rank}.h5")
 """
 
 
+PATIENT = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
+"""For Open MPI: a rank that waits leaves the processor to the others, whoever else needs it."""
+
+
 def test_two_ranks_find_the_same(tmp_path: Path) -> None:
     command = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL, str(tmp_path)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    run = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env=PATIENT, check=False
+    )
     assert run.returncode == 0, run.stderr
     expected = reference()
     for rank in (0, 1):

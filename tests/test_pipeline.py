@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -244,8 +245,9 @@ def test_under_mpirun_one_rank_writes_and_talks(case: Path, finished: Path, tmp_
         "--out",
         str(tmp_path / "out"),
     ]
+    patient = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}  # a waiting rank does not spin
     done = subprocess.run(
-        ["mpirun", "-n", "2", *command], capture_output=True, text=True, timeout=300
+        ["mpirun", "-n", "2", *command], capture_output=True, text=True, timeout=300, env=patient
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("critical strain") == 1
