@@ -175,8 +175,9 @@ def noise_covariance(
 def softened(result: Result, noise_sd: float, soft: FloatArray) -> FloatArray:
     """(n, n) covariance by white noise in both images against the cost's own curvature.
 
-    H⁻¹ V H⁻¹, where V are the pushes that make ``result.covariance(noise_sd)``, C = 2σ²M⁻¹, with
-    Gauss and Newton's curvature: V = 2σ²M = (2σ²)² C⁻¹.
+    H⁻¹ V H⁻¹, where V are the pushes that make ``result.covariance(noise_sd)``, C = 2σ²(1 + e)M⁻¹
+    with the excess e of a noisy gradient, with Gauss and Newton's curvature M without noise:
+    V = M C M = (2σ²(1 + e))² C⁻¹.
 
     Parameters
     ----------
@@ -189,7 +190,8 @@ def softened(result: Result, noise_sd: float, soft: FloatArray) -> FloatArray:
     """
     kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
     found = result.covariance(noise_sd)
-    pushes = (2.0 * noise_sd**2) ** 2 * np.linalg.inv(found[kept])
+    excess = result.weighting.excess(result.noise_in_gradient(noise_sd**2))
+    pushes = (2.0 * noise_sd**2 * (1.0 + excess)) ** 2 * np.linalg.inv(found[kept])
     found[kept] = soft[kept] @ pushes @ soft[kept].T
     return found
 
