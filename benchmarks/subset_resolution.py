@@ -5,10 +5,9 @@ several sizes; its fields are graded as anybody's. Theory: l10 by Savitzky and G
 
     n = sqrt(2) s / (w G),   G^2 the mean squared gradient of the speckle along y,
 
-for a subset of w x w px whose displacement at the centre is a mean of w^2 px (affine, rigid). Both
-take the speckle for even. It isn't: a correlation weighs each pixel of a subset by its gradient
-("this speckle"), which is the pattern-induced bias; its fits to the true displacement are graded,
-too.
+for an affine subset of w x w px, more for a quadratic one. Both take the speckle for even. It
+isn't: a correlation weighs each pixel of a subset by its gradient ("this speckle"), which is the
+pattern-induced bias; such fits to the true displacement are graded, too.
 
 ``python benchmarks/subset_resolution.py`` (2 minutes of processor time; --out keeps all files).
 """
@@ -39,7 +38,7 @@ from modeharvest.validation.resolution.star_set import (
     image_name,
     make_star_set,
 )
-from modeharvest.validation.resolution.transfer import finest_period, subset_transfer
+from modeharvest.validation.resolution.transfer import finest_period, subset_noise, subset_transfer
 
 FloatArray = NDArray[np.float64]
 
@@ -138,7 +137,7 @@ def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGra
     slope = float(np.sqrt(np.mean(slopes(star_set)[0] ** 2)))
     rounding = 1.0 / np.sqrt(12.0) / (2**star_set.spec.bits - 1)
     both = np.sqrt(2.0) * np.hypot(noise, rounding)
-    floor = both / (width * slope)
+    floor = both / slope * subset_noise(width, degree)
     found = graded.attenuation
     assert graded.noise is not None
     cells = [
@@ -147,10 +146,10 @@ def row(star_set: StarSet, shape: str, width: int, noise: float, graded: StarGra
         f"{finest:.1f}",
         f"{here.finest_px:.1f} ± {here.finest_se_px:.1f}",
         f"{1e3 * graded.noise.v_px:.2f} ± {1e3 * graded.noise.v_se_px:.2f}",
-        f"{1e3 * floor:.2f}" if degree < 2 else "–",
+        f"{1e3 * floor:.2f}",
         f"{1e3 * both * fitted.sd_rms:.2f}",
         f"{graded.indicator_px2:.3f} ± {graded.indicator_se_px2:.3f}",
-        f"{floor * finest:.3f}" if degree < 2 else "–",
+        f"{floor * finest:.3f}",
         f"{both * fitted.sd_rms * here.finest_px:.3f}",
     ]
     return f"| {' | '.join(cells)} |"

@@ -27,6 +27,7 @@ from modeharvest.validation.resolution.transfer import (
     finest_period,
     polynomial_transfer,
     savitzky_golay,
+    subset_noise,
     subset_transfer,
 )
 from modeharvest.validation.score_fields import Declared
@@ -72,6 +73,14 @@ def test_a_subset_keeps_polynomials_of_its_degree(degree: int) -> None:
     moments = [float(weights @ offsets**k) for k in range(degree + 1)]
     assert moments == pytest.approx([1.0] + [0.0] * degree, abs=1e-12)
     assert savitzky_golay(11, 2 * (degree // 2) + 1)[1] == pytest.approx(weights)  # odd ones vanish
+
+
+def test_noise_of_subsets() -> None:
+    """Of the mean of w^2 px, and more with a quadratic, whose weights are Legendre's."""
+    assert subset_noise(17, 0) == pytest.approx(1 / 17)
+    assert subset_noise(17, 1) == pytest.approx(1 / 17)
+    # Many pixels: 1 + 5 P_2(0) (P_2(x) + P_2(y)), whose mean square is 1 + 2 * 5 / 4.
+    assert 401 * subset_noise(401, 2) == pytest.approx(np.sqrt(1.0 + 2 * 1.25), rel=1e-2)
 
 
 @pytest.mark.parametrize(("degree", "waves"), [(1, (0.4, 0.0)), (4, (1.6, 0.0)), (5, (1.2, 0.9))])

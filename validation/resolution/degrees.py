@@ -13,7 +13,7 @@ from modeharvest.errors import InputError
 from modeharvest.imaging.speckle import Speckle
 from modeharvest.validation.resolution.curves import AXES, WAVED, Curves
 from modeharvest.validation.resolution.measure import Subject
-from modeharvest.validation.resolution.transfer import finest_period, subset_transfer
+from modeharvest.validation.resolution.transfer import finest_period, subset_noise, subset_transfer
 
 FloatArray = NDArray[np.float64]
 
@@ -84,6 +84,6 @@ def subset_indicator(subject: Subject) -> float:
     speckle = Speckle(subject.buckled.speckle, grid.shape)
     row, col = np.meshgrid(np.arange(0.0, grid.rows, 7), np.arange(0.0, grid.cols, 7))
     slope = float(np.sqrt(np.mean(speckle.gradient(row, col) ** 2)))
-    floor = np.sqrt(2.0) * subject.noise / (_SUBSET_PX * slope)
+    floor = np.sqrt(2.0) * subject.noise / slope * subset_noise(_SUBSET_PX, 1)
     finest = finest_period(lambda p: subset_transfer(_SUBSET_PX, 1, p), 10.0, 1000.0)
     return float(floor * finest)

@@ -51,6 +51,19 @@ def subset_transfer(width: int, degree: int, period: ArrayLike) -> FloatArray:
     return np.asarray(np.cos(phase) @ weights)
 
 
+def subset_noise(width: int, degree: int) -> float:
+    """Noise floor of a square subset's centre on even speckle, over sqrt(2) s / G [1/px].
+
+    s is the noise in each image [grey levels], G the rms gradient of the speckle along the
+    displacement [grey levels/px]: the root of the summed squares of the fit's weights, 1/width for
+    affine shape functions. Real speckle isn't even, and n is larger.
+    """
+    offsets, _ = savitzky_golay(width, degree)
+    x, y = (a.ravel() / offsets[-1] for a in np.meshgrid(offsets, offsets))
+    basis = np.stack([x**i * y**j for i, j in orders(degree)], axis=-1)
+    return float(np.sqrt(np.linalg.inv(basis.T @ basis)[0, 0]))
+
+
 def savitzky_golay(width: int, degree: int) -> tuple[FloatArray, FloatArray]:
     """(width,) offsets [px] and weights [-] of the fitted polynomial's value at the centre."""
     if width < 3 or width % 2 == 0 or not 0 <= degree < width:
