@@ -83,6 +83,11 @@ def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) 
 
     If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
     divided alike. Parameters and errors are those of :func:`read_cell`.
+
+    Raises
+    ------
+    InputError
+        If there is no model; and as :func:`read_cell` does.
     """
     if not gmsh.isInitialized():
         raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")

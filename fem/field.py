@@ -132,7 +132,13 @@ class Solution:
                 )
 
     def at(self, nominal_strain: float) -> Snapshot:
-        """The stable snapshot at a nominal strain (the first one listed, if several)."""
+        """The stable snapshot at a nominal strain (the first one listed, if several).
+
+        Raises
+        ------
+        InputError
+            If there is none at that strain.
+        """
         found = [s for s in self.snapshots if abs(s.nominal_strain - nominal_strain) < 1e-9]
         if not found:
             have = ", ".join(f"{s.nominal_strain:.4f}" for s in self.snapshots) or "none"

@@ -77,7 +77,13 @@ class UnitCell:
         return float(abs(np.linalg.det(self.lattice)))
 
     def enlarged(self, m: int, n: int) -> UnitCell:
-        """The cell of m x n copies along a1 and a2."""
+        """The cell of m x n copies along a1 and a2.
+
+        Raises
+        ------
+        InputError
+            If there is less than one copy along either.
+        """
         if m < 1 or n < 1:
             raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
         blocks = [

@@ -88,6 +88,11 @@ def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
         Geometry [mm].
     size
         Target edge length of the elements [mm].
+
+    Raises
+    ------
+    InputError
+        If the size is not positive, or too large for the cells.
     """
     if not size > 0:
         raise InputError(f"mesh size: expected a positive length in mm, got {size}")

@@ -36,6 +36,20 @@ def simulate(
     early, the snapshots reached are there. ``info["warnings"]`` names states that are not stable
     although their branch is meant to be. ``info["critical"]`` is None where the specimen
     stays stable, or is imperfect.
+
+    Parameters
+    ----------
+    experiment
+        What is compressed, how, and at which strains to keep its state.
+    progress
+        Listener.
+    comm
+        The processes that share the work.
+
+    Raises
+    ------
+    InputError
+        If the specimen can't be meshed with elements of that size.
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)

@@ -152,6 +152,11 @@ def zone_path(
     -------
     points, stops
         Phases [rad], and the places of the corners among them.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two corners, or fewer points than corners.
     """
     if len(corners) < 2 or count < len(corners):
         raise InputError(

@@ -126,6 +126,11 @@ def square_family(origin: str = "junction") -> ModeFamily:
         What the physical origin is: "junction", the solid between four holes, where a mode
         starts from [1, 1, 1, -1, 1, 0, 0], or "hole", the centre of a hole,
         [1, 1, 1, 1, -1, 0, 0].
+
+    Raises
+    ------
+    InputError
+        If the origin is neither.
     """
     starts = {"junction": [1, 1, 1, -1, 1, 0, 0], "hole": [1, 1, 1, 1, -1, 0, 0]}
     if origin not in starts:
@@ -153,6 +158,11 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
         (w, 5): A, B, kx, ky, c to start from.
     name
         What to call the family.
+
+    Raises
+    ------
+    InputError
+        If the waves are not of shape (w, 5).
     """
     full = np.atleast_2d(np.asarray(waves, dtype=np.float64))
     if full.ndim != 2 or full.shape[1] != PER_WAVE:
@@ -207,7 +217,24 @@ class FourierMode:
     def scaled(
         cls, family: ModeFamily, half_wavelength: float, taper: Taper, maximum: float = 0.04
     ) -> FourierMode:
-        """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start."""
+        """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start.
+
+        Parameters
+        ----------
+        family
+            What is free of the waves.
+        half_wavelength
+            l [mm].
+        taper
+            The mode's support.
+        maximum
+            max ||phi|| [-]; the paper's is 0.04.
+
+        Raises
+        ------
+        InputError
+            If that start gives a mode that is zero.
+        """
         unit = cls(family, half_wavelength, 1.0, taper)
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
         # with k near 1 to well under 1 %; the square one is hit exactly.

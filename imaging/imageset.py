@@ -170,7 +170,14 @@ class ImageSet:
 def is_complete(folder: Path | str, key: str, *, verify: bool = False) -> bool:
     """Whether ``folder`` holds a finished set of that key, with all files of the listed sizes.
 
-    ``verify`` also compares the files' SHA-256 digests.
+    Parameters
+    ----------
+    folder
+        Where the set may be.
+    key
+        Of :func:`image_key`.
+    verify
+        Compare the files' SHA-256 digests, too.
     """
     folder = Path(folder)
     try:

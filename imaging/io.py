@@ -94,6 +94,11 @@ def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.u
     """Grey levels as a camera stores them: 0 ... 1 clipped, times 2^bits - 1, rounded to nearest.
 
     Up to 8 bits give uint8, up to 16 uint16; values fill the range of ``bits``.
+
+    Raises
+    ------
+    InputError
+        If the bits are not 1 to 16.
     """
     if not 1 <= bits <= 16:
         raise InputError(f"expected 1 to 16 bits, got {bits}")
@@ -108,6 +113,11 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
 
     Values are stored as they are (float64 is rounded to float32); for a camera's grey levels
     see :func:`quantise`. Bool (a mask) is written as 0 and 255.
+
+    Raises
+    ------
+    InputError
+        If the name is not of a TIFF file, the image not plane, or of another type.
     """
     path = Path(path)
     if path.suffix.lower() not in _TIFF:

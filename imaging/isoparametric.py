@@ -183,6 +183,11 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
     Returns
     -------
     (c, rows, cols) values, NaN where there is no material.
+
+    Raises
+    ------
+    InputError
+        If the field is not of shape (n, c).
     """
     if nodal.ndim != 2:
         raise InputError(f"expected a nodal field of shape (n, c), got {nodal.shape}")

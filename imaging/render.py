@@ -73,7 +73,14 @@ class Truth:
 def render_reference(located: Located, speckle: Speckle, background: float) -> Rendering:
     """Show the undeformed specimen: speckle at whole pixels, ``background`` around it.
 
-    ``located`` is the undeformed mesh on the image's grid.
+    Parameters
+    ----------
+    located
+        The undeformed mesh on the image's grid.
+    speckle
+        The pattern that the material carries.
+    background
+        Intensity beside the material [fraction of full scale].
     """
     mask = located.mask
     image = np.where(mask, speckle.image(), background).astype(np.float32)
@@ -137,6 +144,26 @@ def render_image(
     """Show the deformed specimen as :func:`render_deformed` does, without the truth.
 
     Nothing is kept of the mapping, so that it is faster and needs little memory besides the image.
+
+    Parameters
+    ----------
+    mesh
+        The undeformed mesh [mm].
+    displacement
+        (n, 2) at its nodes [mm].
+    grid
+        The pixels.
+    speckle
+        The pattern that the material carries.
+    background
+        Intensity beside the material [fraction of full scale].
+    where
+        What the mesh is called in an error.
+
+    Raises
+    ------
+    InputError
+        If an element is turned inside out.
     """
     if speckle.spec.ink is None:
         return Rendering(*paint(mesh, displacement, grid, speckle.spline, background, where))

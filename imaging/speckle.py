@@ -187,6 +187,11 @@ class Speckle:
         ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
         multiplied by those of its row and its column frequency (see Aperture.transfer). Not with
         ink, whose waves are products.
+
+        Raises
+        ------
+        InputError
+            If there is a transfer and ink.
         """
         base = self._base.image(transfer)
         if self._ink is None:

@@ -154,7 +154,23 @@ def draw_blend(
     scale: Scale,
     motion: Motion,
 ) -> Figure:
-    """Let the deformed image dissolve, from left to right, into what was measured in it."""
+    """Let the deformed image dissolve, from left to right, into what was measured in it.
+
+    Parameters
+    ----------
+    sheet
+        Frame and outline.
+    image, material
+        (rows, cols) grey levels [fraction of full scale] and where they show material.
+    grid
+        Their pixels.
+    values
+        (rows, cols) on ``sheet.grid``, what was measured; NaN is left blank.
+    scale
+        Colours and unit.
+    motion
+        The displacement to draw it with.
+    """
     with style():
         drawn, axes = _map(sheet, width=3.2)
         # Gone where the field is opaque, or slivers of it would show along the holes.
@@ -189,7 +205,15 @@ def _draw_edge(axes: Axes, path: Path) -> PathPatch:
 
 
 def colour_bar(drawn: Figure, axes: Axes, scale: Scale) -> None:
-    """A bar beside the map, its unit above it."""
+    """A bar beside the map, its unit above it.
+
+    Parameters
+    ----------
+    drawn, axes
+        The figure, and the map in it.
+    scale
+        Colours and unit.
+    """
     box = axes.get_position()
     place = drawn.add_axes((_BAR_LEFT, box.y0, _BAR, box.height), label="colour bar")
     mappable = ScalarMappable(scale.normalise, scale.colours)

@@ -91,7 +91,13 @@ def read_field(
 
 
 def write_field(path: Path | str, field: LocalField) -> None:
-    """Write a field as CSV or NPZ, which :func:`read_field` reads without being told anything."""
+    """Write a field as CSV or NPZ, which :func:`read_field` reads without being told anything.
+
+    Raises
+    ------
+    InputError
+        If the name does not end in .csv or .npz.
+    """
     sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
     data = np.column_stack([field.x, field.y, field.u, sd, field.good])
     suffix = Path(path).suffix.lower()

@@ -178,6 +178,11 @@ def sampled_field(
         Distance of the points [px].
     source
         What to call it.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ from the grid's, or the step is less than 1 px.
     """
     u, inside = np.asarray(displacement, np.float64), np.asarray(mask, np.bool_)
     if u.shape != (*grid.shape, 2) or inside.shape != grid.shape or step < 1:

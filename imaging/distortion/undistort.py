@@ -73,6 +73,11 @@ def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool
         grid that were photographed at all.
     distortion
         Of the lens.
+
+    Raises
+    ------
+    InputError
+        If the mask is not plane.
     """
     inside = np.asarray(mask, dtype=np.bool_)
     if inside.ndim != 2:

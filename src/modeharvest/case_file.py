@@ -40,7 +40,13 @@ def shipped_cases() -> dict[str, str]:
 
 
 def case_text(name: str) -> str:
-    """The TOML text of a shipped case, comments included: a start for one's own."""
+    """The TOML text of a shipped case, comments included: a start for one's own.
+
+    Raises
+    ------
+    InputError
+        If no case of that name is shipped; the nearest name is suggested.
+    """
     if name not in shipped_cases():
         raise InputError(f"unknown case {name!r}{nearest(name, list(shipped_cases()))}")
     return (_SHIPPED / f"{name}.toml").read_text("utf-8")

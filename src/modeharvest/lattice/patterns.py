@@ -229,7 +229,13 @@ def find_family(pattern: Pattern, pitch: float, folder: Path) -> None:
 
 
 def found_pattern(pattern: Pattern, folder: Path) -> FoundPattern:
-    """A pattern with the family and spectrum that :func:`find_family` left."""
+    """A pattern with the family and spectrum that :func:`find_family` left.
+
+    Raises
+    ------
+    InputError
+        If the file lacks the Fourier coefficients.
+    """
     path = folder / pattern.file
     family, spectrum = read_family(path), read_spectrum(path)
     if spectrum is None:
