@@ -5,25 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from scipy.stats import binomtest
 
 from modeharvest.validation.page import short
-from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
-from modeharvest.validation.style import BLUE, GOLD, GREEN, RED, figure, style
-
-SAME_PX = 0.01
-"""Ends nearer than this, rms, are the same minimum [px]."""
-OUTLIER_PERCENT = 1.5
-"""Above this epsilon the paper calls a result erroneous."""
-PAPER = {
-    "success": 0.98,
-    "mean_epsilon_percent": 0.86,
-    "mean_epsilon_without_outliers_percent": 0.45,
-}
-"""Section "Virtual Experiments" of the paper: 100 starts, parameters up to 10 % off."""
+from modeharvest.validation.studies.robustness_plots import (
+    OUTLIER_PERCENT,
+    PAPER,
+    SAME_PX,
+    draw_basin,
+    draw_distances,
+    draw_epsilons,
+    draw_starts_of_v0,
+)
+from modeharvest.validation.studies.study import Findings, KeyNumber
 
 
 def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
@@ -53,7 +48,12 @@ def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
         numbers={**found, "basin": basin.to_dict("records")},
         sentences=(*_sentences(found), *_basin_sentences(basin), *_strain_sentences(strains)),
         keys=_keys(found),
-        plots=(_distances(asked, radius, seeds), _epsilons(asked, seeds), _basin(basin, seeds)),
+        plots=(
+            draw_distances(asked, radius, seeds),
+            draw_epsilons(asked, seeds),
+            draw_basin(basin, seeds),
+            *((draw_starts_of_v0(strains),) if len(strains) else ()),
+        ),
         tables=tables,
     )
 
@@ -171,8 +171,9 @@ def _sentences(found: Mapping[str, Any]) -> tuple[str, ...]:
         f"{100 * high:.1f} %. The paper has {100 * PAPER['success']:.0f} of 100.",
         f"The paper's ε = 100 (‖u‖ − ‖u_pert‖)/‖u‖, here without its sign, is "
         f"{short(found['mean_epsilon_percent'])} % on average and "
-        f"{short(found['largest_epsilon_percent'])} % at most; {found['outliers']} are outliers "
-        f"above {OUTLIER_PERCENT} %. The paper has {PAPER['mean_epsilon_percent']} % on average, "
+        f"{short(found['largest_epsilon_percent'])} % at most; {found['outliers'] or 'none'} lie "
+        f"above {OUTLIER_PERCENT} %, the paper's outliers. The paper has "
+        f"{PAPER['mean_epsilon_percent']} % on average, "
         f"{PAPER['mean_epsilon_without_outliers_percent']} % without two outliers.",
         "A difference of norms can vanish for fields that differ. The norm of the difference is "
         f"{short(found['largest_distance_px'])} px rms at most, "
@@ -215,63 +216,10 @@ def _strain_sentences(strains: pd.DataFrame) -> tuple[str, ...]:
         return ()
     same = strains["distance of the end [px]"] < SAME_PX
     off = strains["strain of the start, off by [%]"]
-    told = ", ".join(f"{v:+g}" for v in off[same])
+    tried, arrived = (", ".join(f"{v:+g}" for v in part).replace("-", "−")
+                      for part in (off, off[same]))  # fmt: skip
+    which = "" if same.all() or not same.any() else f": {arrived} %"
     return (
-        f"With the strain of v0's start off by {', '.join(f'{v:+g}' for v in off)} %, "
-        f"{int(same.sum())} of {len(strains)} arrive{f' ({told} %)' if told else ''}.",
+        f"With the strain of v₀'s start off by {tried} %, {int(same.sum())} of {len(strains)} "
+        f"arrive{which}.",
     )
-
-
-def _distances(asked: pd.DataFrame, radius: float, seeds: str) -> Plot:
-    with style():
-        drawn = figure(4.6, 2.6)
-        axes = drawn.add_subplot()
-        _histogram(axes, asked, "distance_px", SAME_PX)
-        axes.set_xlabel("distance from the standard start's displacement [px rms]")
-        drawn.tight_layout()
-    caption = (
-        f"{len(asked)} starts, up to {100 * radius:g} % off; {seeds}. Dashed: nearer ends count "
-        "as the same minimum."
-    )
-    return Plot("distances", "Where the starts end", drawn, caption)
-
-
-def _epsilons(asked: pd.DataFrame, seeds: str) -> Plot:
-    with style():
-        drawn = figure(4.6, 2.6)
-        axes = drawn.add_subplot()
-        _histogram(axes, asked, "epsilon_percent", OUTLIER_PERCENT)
-        axes.axvline(PAPER["mean_epsilon_percent"], color=RED, linestyle=":", linewidth=1)
-        axes.set_xlabel("ε [%]")
-        drawn.tight_layout()
-    outliers = int((asked["epsilon_percent"] > OUTLIER_PERCENT).sum())
-    caption = (
-        f"The paper's ε of every start; {seeds}. Dashed: {OUTLIER_PERCENT} %, above which the "
-        f"paper calls a result erroneous: {outliers or 'none'} here, 2 there. Dotted: the paper's "
-        f"mean, {PAPER['mean_epsilon_percent']} %."
-    )
-    return Plot("epsilon", "The paper's error", drawn, caption)
-
-
-def _histogram(axes: Axes, asked: pd.DataFrame, name: str, limit: float) -> None:
-    """Count the starts on a logarithmic axis that reaches the limit, which is marked."""
-    values = np.maximum(asked[name].dropna().to_numpy(), 1e-12)
-    low, high = np.floor(np.log10(values.min())), np.ceil(np.log10(max(values.max(), limit)))
-    axes.hist(values, bins=np.logspace(low, max(high, low + 1), 40).tolist(), color=BLUE)
-    axes.axvline(limit, color=GOLD, linestyle="--", linewidth=1)
-    axes.set(xscale="log", ylabel="starts")
-
-
-def _basin(rows: pd.DataFrame, seeds: str) -> Plot:
-    with style():
-        drawn = figure(4.6, 2.6)
-        axes = drawn.add_subplot()
-        x, y = rows["off by up to [%]"], rows["success [%]"]
-        spread = np.clip([y - rows["95 % from"], rows["to [%]"] - y], 0.0, None)
-        axes.errorbar(x, y, yerr=spread, color=GREEN, marker="o", markersize=3, capsize=2)
-        axes.plot(10.0, 100.0 * PAPER["success"], "x", color=RED)
-        axes.set(xlim=(0.0, None), ylim=(0.0, 104.0), ylabel="same minimum [%]")
-        axes.set_xlabel("mode parameters off by up to [%]")
-        drawn.tight_layout()
-    caption = f"Bars: 95 % intervals; {seeds}. Cross: the paper's 98 of 100 at 10 %."
-    return Plot("basin", "Basin of convergence", drawn, caption)
