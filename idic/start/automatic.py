@@ -193,25 +193,33 @@ def automatic_start(
     else:
         share = 100 * local.valid_share
         said.append(f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid.")
-    regions: list[Region] = []
-    modes: list[_Placed] = []
-    for box in boxes:
-        region, found = _read_region(local, box, cells, len(modes), said)
-        regions.append(region)
-        modes += found
+    regions, modes = _read_regions(local, boxes, cells, said)
     held = not modes
     if held:
         modes = _held_mode(boxes[0], cells, said)
     ansatz, a = _assembled(modes, cell_size, domain, options)
     fit = _fitted(ansatz, a, local, held)
     said.append(_fit_words(ansatz, fit, held))
-    return Start(ansatz, fit.coefficients, tuple(regions), local, held, tuple(said))
+    return Start(ansatz, fit.coefficients, regions, local, held, tuple(said))
+
+
+def _read_regions(
+    local: LocalField, boxes: Sequence[Box], cells: Cells, said: list[str]
+) -> tuple[tuple[Region, ...], list[_Placed]]:
+    """The regions, and the modes of all of them."""
+    regions: list[Region] = []
+    modes: list[_Placed] = []
+    for box in boxes:
+        region, found = _read_region(local, box, cells, len(modes), said)
+        regions.append(region)
+        modes += found
+    return tuple(regions), modes
 
 
 def _read_region(
     local: LocalField, box: Box, cells: Cells, first: int, said: list[str]
 ) -> tuple[Region, list[_Placed]]:
-    """Read the spectrum of one region, and make its modes."""
+    """Read the spectrum of one region, and make its modes, numbered from ``first``."""
     spectrum = measured_spectrum(local, cells.cell_size, box)
     pattern = read_pattern(spectrum)
     said += pattern.sentences

@@ -28,7 +28,7 @@ from modeharvest.fem.modes import Branch, ModeSet
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice.case import LatticeCase, read_lattice_case
 from modeharvest.lattice.critical import find_critical, read_critical, write_critical
-from modeharvest.lattice.kinds import FileLattice
+from modeharvest.lattice.keys import stage_keys
 from modeharvest.lattice.model import LatticeModel
 from modeharvest.lattice.patterns import (
     Pattern,
@@ -41,7 +41,7 @@ from modeharvest.lattice.patterns import (
 )
 from modeharvest.lattice.summary import exports_in, summary_of
 from modeharvest.progress import Progress, silent
-from modeharvest.stages import Stages, digest, file_digest
+from modeharvest.stages import Stages, digest
 from modeharvest.validation.lattice.mode_study import ModeStudy
 from modeharvest.validation.lattice.report import write_lattice_report
 from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
@@ -269,20 +269,7 @@ class LatticeAnalysis:
 
     @cached_property
     def _keys(self) -> dict[str, str]:
-        """By stage, the digest of all that its outcome depends on."""
-        content = self.case.plain()
-        lattice = self.case.lattice
-        if isinstance(lattice, FileLattice):
-            content["lattice"]["content"] = file_digest(lattice.path)
-        tables = {name: content[name] for name in ("lattice", "material", "loading", "search")}
-        critical = digest([tables, __version__])
-        return {
-            "critical": critical,
-            "dispersion": digest([critical, content["dispersion"]]),
-            "modes": digest([critical, content["modes"]]),
-            "families": digest([critical, content["modes"], "families"]),
-            "study": digest([tables, content["study"], __version__]),
-        }
+        return stage_keys(self.case)
 
     @property
     def _finished(self) -> dict[str, str]:
