@@ -189,8 +189,9 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     assert math.isnan(row["a1"])
     found = study.findings(table, folder)
     assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.sentences)
-    assert len(found.tables["Measured modes"]) == 3
-    assert set(found.tables["Their parameters"]["level"]) == {"", "3.8 mm"}
+    assert len(found.tables["How they buckle"]) == 3
+    assert list(found.tables["Parameters"]["level"]) == ["", "3.8 mm"]
+    assert len(found.attachments["Every parameter"]) == 2 * 7
     assert [p.name for p in found.plots] == ["parameters", "overlaps", "patterns", "others"]
     assert all(p.drawn.axes for p in found.plots)
 

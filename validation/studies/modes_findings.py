@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,11 @@ def findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:
         keys=_keys(seen, sizes),
         plots=tuple(_plots(seen, sizes, folder, seeds)),
         tables={
-            "Measured modes": overview(ran),
-            "Their parameters": parameters(seen),
+            "How they buckle": buckling(ran),
+            "Parameters": summed_up(seen),
+            "How alike modes and patterns are": alike(seen),
         },
+        attachments={"Every parameter": parameters(seen)},
     )
 
 
@@ -59,23 +62,52 @@ def _of_sizes(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["varied"].isin(["base", "d/l"])]
 
 
-def overview(ran: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: how it buckles, and how alike modes and patterns are."""
-    columns = {
-        "varied": "varied", "level": "level", "ratio": "d/l", "smallest_ratio": "smallest",
-        "largest_ratio": "largest", "first": "buckles first into",
-        "critical_strain": "critical strain [%]",
-        "lattice_pattern_strain": "infinite lattice: pattern critical at [%]",
-        "lattice_first": "infinite lattice: first", "strain": "measured at [%]",
-        "unstable_pivots": "negative pivots there", "amplitude": "rms of v₁φ₁ [l]",
-        "overlap_lattice": "overlap with the lattice: measured", "best_overlap_lattice": "best fit",
-        "lattice_overlap_ideal": "Eq. (mode)", "overlap_truth": "with the truth: measured",
-        "best_overlap_truth": "best fit ", "w_px": "truth − IDIC [px]",
-        "best_px": "truth − best fit [px]", "lost_px": "IDIC − best fit [px]",
-        "outcome": "outcome", "simulation": "simulation",
-    }  # fmt: skip
-    percent = {name: 100.0 * ran[name] for name in columns if name.endswith("strain")}
-    return ran.assign(**percent).reindex(columns=list(columns)).rename(columns=columns)
+_BUCKLING = {
+    "smallest_ratio": "d/l from", "largest_ratio": "to", "first": "buckles first into",
+    "pattern_share": "pattern’s share of that mode", "critical_strain": "critical strain [%]",
+    "lattice_first": "infinite lattice: first", "lattice_pattern_strain": "pattern critical at [%]",
+    "strain": "measured at [%]", "unstable_pivots": "negative pivots there",
+    "amplitude": "rms of v₁φ₁ [l]", "simulation": "simulation",
+}  # fmt: skip
+_LIKENESS = {
+    "overlap_lattice": "with the infinite lattice: measured", "best_overlap_lattice": "best fit",
+    "lattice_overlap_ideal": "Eq. (mode)", "overlap_truth": "with the specimen: measured",
+    "best_overlap_truth": "best fit ", "w_px": "truth − IDIC [px]",
+    "best_px": "truth − best fit [px]", "lost_px": "IDIC − best fit [px]",
+    "iterations": "iterations", "outcome": "outcome",
+}  # fmt: skip
+
+
+def buckling(ran: pd.DataFrame) -> pd.DataFrame:
+    """A row for each specimen: into what it buckles, and when."""
+    percent = {name: 100.0 * ran[name] for name in _BUCKLING if name.endswith("strain")}
+    return _renamed(ran.assign(**percent), _BUCKLING)
+
+
+def alike(seen: pd.DataFrame) -> pd.DataFrame:
+    """A row for each specimen: overlaps of its mode, and errors of its displacement."""
+    return _renamed(seen, _LIKENESS)
+
+
+def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
+    names = {"varied": "varied", "level": "level", **columns}
+    return rows.reindex(columns=list(names)).rename(columns=names)
+
+
+def summed_up(seen: pd.DataFrame) -> pd.DataFrame:
+    """A row for each specimen: a₁, and how far its wave vectors and phases are from Eq. (mode)."""
+    off, best = 100.0 * deviations(seen), 100.0 * deviations(seen, "best_")
+    sd = 100.0 * seen[[f"{name}_sd_leftover" for name in PARAMETERS]].set_axis(PARAMETERS, axis=1)
+    phases = list(PARAMETERS[5:])
+    return pd.DataFrame({
+        "varied": seen["varied"], "level": seen["level"], "a₁": seen["a1"],
+        "± 2 sd": 0.02 * sd["a1"], "best fit": seen["best_a1"],
+        "infinite lattice": seen["lattice_a1"],
+        "wave vectors off by up to [%]": off[_WAVES].abs().max(axis=1),
+        "± 2 sd ": 2.0 * sd[_WAVES].max(axis=1), "best fit ": best[_WAVES].abs().max(axis=1),
+        "phases off by up to [% of l]": off[phases].abs().max(axis=1),
+        "± 2 sd  ": 2.0 * sd[phases].max(axis=1), "best fit  ": best[phases].abs().max(axis=1),
+    })  # fmt: skip
 
 
 def parameters(seen: pd.DataFrame) -> pd.DataFrame:
@@ -267,7 +299,8 @@ def _plots(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) ->
 _MARKS = (
     "Dots: measured, with two standard deviations by what the ansatz leaves over; rings: the best "
     "fit to the specimen’s own displacement; dotted: Eq. (mode) of the paper; crosses: the "
-    "infinite lattice, whose wave vectors and phases are those of Eq. (mode) by symmetry."
+    "infinite lattice, whose wave vectors and phases are those of Eq. (mode) by symmetry. Bars "
+    "that leave a picture are in the tables."
 )
 
 

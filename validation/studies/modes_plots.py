@@ -71,6 +71,7 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
                 axes.set_xticks(at, ticks, rotation=40, ha="right", fontsize=7)
         lattice = 100.0 * (done["lattice_a1"] - 1.0)
         aspect.plot(at, lattice, "x", color=INK, markersize=5, label="infinite lattice")
+        _limit(aspect, np.abs([*lattice, *(100.0 * (done["a1"] - 1.0))]), done["a1_sd_leftover"])
         aspect.set_ylabel("a₁ − 1 [%]")
         waves.set_ylabel("wave vectors − ideal [%]")
         phases.set_ylabel("phases [% of l]")
@@ -78,6 +79,12 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
             axes.legend(frameon=False, fontsize=7, ncols=2)
         drawn.tight_layout()
     return drawn
+
+
+def _limit(axes: Axes, values: FloatArray, sd: pd.Series) -> None:
+    """Show all values, and error bars as far as they don't hide all else [%]."""
+    end = max(1.2 * float(values.max()), 2.5 * 200.0 * float(sd.median()))
+    axes.set_ylim(-end, end)
 
 
 def _parameter(axes: Axes, done: pd.DataFrame, at: FloatArray, name: str, colour: str) -> None:
