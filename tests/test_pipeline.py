@@ -23,12 +23,12 @@ CASE = """
 title = "A reduced demo"
 [experiment]
 strains = [0.08, 0.15]
-mesh_size = 0.35
+mesh_size = 0.5
 [experiment.specimen]
 holes_x = 4
 holes_y = 6
 [imaging]
-pixel_size = 0.025
+pixel_size = 0.035
 [imaging.speckle]
 seed = 3
 """
@@ -216,7 +216,7 @@ def test_a_stage_that_fails_leaves_no_older_result(case: Path, folder: Path) -> 
 def test_a_solution_without_the_strains_is_refused(case: Path, folder: Path) -> None:
     other = read_case(case)
     other = other.model_copy(
-        update={"experiment": type(other.experiment)(strains=(0.5e-1,), mesh_size=0.35)}
+        update={"experiment": type(other.experiment)(strains=(0.5e-1,), mesh_size=0.5)}
     )
     with pytest.raises(InputError, match="expected snapshots at strains"):
         Run(other, folder).image()
