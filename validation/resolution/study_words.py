@@ -94,8 +94,8 @@ class Answers:
             f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
             f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 held "
             f"and without motion from {first.held_px2:.2f} to {last.held_px2:.2f} px²: the rest is "
-            "the noise of φ1's own parameters. An affine subset on the same speckle under the same "
-            f"noise has {self.local_px2:.2f} px², whatever its size (theory)."
+            "mostly the noise of φ1's own parameters. An affine subset on the same speckle under "
+            f"the same noise has {self.local_px2:.2f} px², whatever its size (theory)."
         )
 
     @property
