@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from html_page import Page
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -136,6 +138,35 @@ def test_deformed_pixels_show_the_points_that_moved_there() -> None:
     f, g, _ = StarImages(star, fine_speckle()).render()
     assert g[61] == pytest.approx(f[60], abs=1e-9)
     assert np.abs(g[60] - f[60]).max() > 0.1
+
+
+@given(shortest=st.floats(4.0, 40.0), ratio=st.floats(1.5, 30.0), steepness=st.floats(0.01, 0.9))
+@settings(max_examples=15)
+def test_any_star_can_be_inverted(shortest: float, ratio: float, steepness: float) -> None:
+    amplitude = steepness * shortest / (2.0 * np.pi)
+    star = Star(31, 100, amplitude, shortest, ratio * shortest)
+    came_from, residual_px = star.came_from()
+    assert residual_px < 1e-12
+    assert (np.diff(came_from, axis=0) > 0.0).all()  # nothing folds
+
+
+def test_a_star_by_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*options: str) -> int:
+        command = ["modeharvest", "benchmark", "star", "--out", str(tmp_path / "s"), *options]
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit) as exited:
+            root.main()
+        return int(exited.value.code or 0)
+
+    assert run("--rows", "31", "--cols", "100", "--noise", "0.01", "--noise", "0.03") == 0
+    said = capsys.readouterr().out
+    assert "8 images of 31 x 100 px" in said
+    assert StarSet.read(tmp_path / "s").spec.noise == (0.01, 0.03)
+    assert run("--rows", "30") == 2
+    told = capsys.readouterr().err
+    assert "odd number of rows" in " ".join(told.split())
 
 
 def test_a_star_set_can_be_made_again_and_tells_all(tmp_path: Path) -> None:

@@ -115,12 +115,12 @@ class Star:
             phase = wave * (point - self.centre_row)
             error = point + self.amplitude_px * np.cos(phase) - row
             largest = float(np.abs(error).max())
-            if largest < _NEAR and largest >= 0.5 * before:  # as good as rounding lets it be
+            if largest >= 0.5 * before:  # Newton's steps have come down to rounding
                 return point, largest
             if largest < _NEAR:
                 error /= 1.0 - self.amplitude_px * wave * np.sin(phase)
+                before = largest
             point -= error
-            before = largest
 
 
 def fine_speckle(seed: int = 0) -> SpeckleSpec:
