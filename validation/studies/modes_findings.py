@@ -106,7 +106,8 @@ def summed_up(seen: pd.DataFrame) -> pd.DataFrame:
         "wave vectors off by up to [%]": off[_WAVES].abs().max(axis=1),
         "± 2 sd ": 2.0 * sd[_WAVES].max(axis=1), "best fit ": best[_WAVES].abs().max(axis=1),
         "phases off by up to [% of l]": off[phases].abs().max(axis=1),
-        "± 2 sd  ": 2.0 * sd[phases].max(axis=1), "best fit  ": best[phases].abs().max(axis=1),
+        "± 2 sd  ": 2.0 * sd[phases].max(axis=1),
+        "best fit  ": best[phases].abs().max(axis=1).round(6),
     })  # fmt: skip
 
 

@@ -76,7 +76,8 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
         waves.set_ylabel("wave vectors − ideal [%]")
         phases.set_ylabel("phases [% of l]")
         for axes in (aspect, waves, phases):
-            axes.legend(frameon=False, fontsize=7, ncols=2)
+            axes.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", handlelength=1.2,
+                        columnspacing=1.0, bbox_to_anchor=(-0.05, 1.0))  # fmt: skip
         drawn.tight_layout()
     return drawn
 
