@@ -15,6 +15,7 @@ import h5py
 import meshio
 import numpy as np
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from modeharvest.errors import InputError
 from modeharvest.idic.fields.files import read_field
@@ -22,6 +23,13 @@ from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 
 _VTK = {".vtk", ".vtu", ".vtp"}
+_TEXT = {".csv", ".txt", ".dat", ".tsv"}
+_KINDS = {*_TEXT, ".npz", ".h5", ".hdf5", ".mat", *_VTK}
+_OPTIONS = {
+    "give units='px' or 'mm'": "give --unit px or mm",
+    "give y_axis='up' or 'down'": "give --y-axis up or down",
+    "name them in columns": "say which of them by --column, as u=disp_x",
+}
 _VECTORS = ("u", "displacement", "disp", "displacements")
 _ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 
@@ -68,6 +76,7 @@ def read_measured(
         If it can't be read, or says that it is of another benchmark.
     """
     path, declared = Path(path), declared or Declared()
+    _require_file(path)
     claimed = claimed_benchmark(path)
     if claimed not in (None, benchmark):
         raise InputError(
@@ -82,20 +91,42 @@ def read_measured(
         "columns": declared.columns,
     }
     read = _read_vtk if path.suffix.lower() in _VTK else read_field
-    return replace(read(path, grid, **how), source=declared.name or path.stem)
+    try:
+        return replace(read(path, grid, **how), source=declared.name or path.stem)
+    except InputError as error:
+        raise InputError(_in_options(str(error))) from error
+
+
+def _require_file(path: Path) -> None:
+    """Raise InputError if there is no file of a known kind."""
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"expected a displacement field in {path}, found {found}")
+    if path.suffix.lower() not in _KINDS:
+        raise InputError(
+            f"{path}: expected one of {', '.join(sorted(_KINDS))}, got {path.suffix!r}; "
+            "save the field as CSV"
+        )
+
+
+def _in_options(message: str) -> str:
+    """What to declare, by the options' names."""
+    for argument, option in _OPTIONS.items():
+        message = message.replace(argument, option)
+    return message
 
 
 def claimed_benchmark(path: Path) -> str | None:
     """The id that a file itself says it belongs to; None if it says none or can't be read."""
     try:
         return _claim(path)
-    except (OSError, ValueError, KeyError, NotImplementedError):
+    except (OSError, ValueError, KeyError, NotImplementedError, MatReadError):
         return None  # whoever reads the field itself says what is wrong
 
 
 def _claim(path: Path) -> str | None:
     suffix, said = path.suffix.lower(), ""
-    if suffix in (".csv", ".txt", ".dat", ".tsv"):
+    if suffix in _TEXT:
         with path.open(encoding="utf-8", errors="replace") as file:
             said = "".join(
                 line for _, line in zip(range(50), file, strict=False) if line[0] in "#%"
@@ -126,8 +157,6 @@ def _read_vtk(path: Path, grid: PixelGrid, **how: Any) -> LocalField:
 
 def _points_of_vtk(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
     """(4, n) x, y, u, v."""
-    if not path.is_file():
-        raise InputError(f"expected a displacement field in {path}, found no such file")
     said = StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
