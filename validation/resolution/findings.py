@@ -73,7 +73,10 @@ def findings(table: pd.DataFrame, subject: Subject, curves: Curves, seeds: str) 
             "Images against best fits": waves,
             "Noise floors": floors,
         },
-        attachments={"Transfer": _transfer_table(curves, subject)},
+        attachments={
+            "Finest periods": _finest(degrees, subject),
+            "Transfer": _transfer_table(curves, subject),
+        },
     )
 
 
@@ -124,19 +127,31 @@ def measured_waves(done: pd.DataFrame, subject: Subject, curves: Curves) -> pd.D
 
 def _by_degree(degrees: list[Degree], subject: Subject) -> pd.DataFrame:
     """A row for each degree."""
-    px, pitch = subject.buckled.pixel_size, subject.buckled.specimen.pitch
+    pitch_px = subject.buckled.specimen.pitch / subject.buckled.pixel_size
     rows = []
     for d in degrees:
         row: dict[str, Any] = {"degree": d.degree, "unknowns": d.unknowns}
-        for part in WAVED:
-            for axis in AXES:
-                at = d.finest_px[f"{part} {axis}"]
-                row[f"l10 of {part} along {axis} [px]"] = at
-                row[f"{part} {axis} [cells]"] = at * px / pitch
+        row |= {f"l10 of {name} [cells]": at / pitch_px for name, at in d.finest_px.items()}
         row |= {f"n of {name} [10⁻³ px]": 1e3 * d.floor_px[name] for name in QUANTITIES}
         row |= {f"n l10 of {part} [px²]": d.indicator_px2[part] for part in WAVED}
         row["of v1, φ1 held [px²]"] = d.held_px2
         rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _finest(degrees: list[Degree], subject: Subject) -> pd.DataFrame:
+    """A row for each degree and wave: l10 in px, in cells, and over what the wave runs through."""
+    b, rows = subject.buckled, []
+    lengths = {"v0": b.specimen.half_size, "v1": b.specimen.cellular_half_size}
+    for d in degrees:
+        for name, at in d.finest_px.items():
+            part, axis = name.split()
+            length = 2.0 * lengths[part][AXES.index(axis)] / b.pixel_size
+            rows.append({
+                "degree": d.degree, "wave of": part, "along": axis, "l10 [px]": at,
+                "l10 [mm]": at * b.pixel_size, "l10 [cells]": at * b.pixel_size / b.specimen.pitch,
+                "l10 [% of the specimen, of its cellular part for v1]": 100.0 * at / length,
+            })  # fmt: skip
     return pd.DataFrame(rows)
 
 
