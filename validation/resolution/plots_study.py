@@ -108,7 +108,7 @@ def draw_passband(passband: Passband, degree: int) -> Plot:
     caption = (
         f"Degree {degree}; best fits. Line: a small pattern with other wave numbers than the "
         "mode's, added to it: v0 takes the longest, v1 those next to the mode, between them "
-        "nothing passes. Dots: the pattern itself is so long, and the fit starts from the mode: "
+        "nothing passes. Dots: the pattern itself has them, and the fit starts from the mode: "
         "its wave numbers are unknowns and follow, until the fit ends elsewhere."
     )
     return Plot("passband", "Patterns of other wavelengths", drawn, caption)
