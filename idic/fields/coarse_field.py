@@ -18,7 +18,7 @@ from skimage.registration import optical_flow_ilk
 
 from modeharvest.errors import InputError
 from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen
+from modeharvest.idic.inputs import CheckedImages
 from modeharvest.idic.pyramid import Level, Pair, prepare
 from modeharvest.imaging.grid import PixelGrid
 
@@ -78,15 +78,12 @@ def coarse_field(
         As :func:`modeharvest.idic.correlate.correlate`, or if the known part leads out of the image
         altogether.
     """
-    f, g = checked_image(reference, "reference", grid), checked_image(deformed, "deformed", grid)
-    inside, landing = (
-        checked_mask(mask, "mask", grid),
-        checked_mask(deformed_mask, "deformed mask", grid),
-    )
-    require_contrast(seen(f, inside), "reference")
-    require_contrast(seen(g, landing), "deformed")
+    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
     factor = max(1, round(cell_size / (CELL_PX * grid.pixel_size)))
-    pair = prepare(f, g, grid, inside, landing, Level(factor, BLUR), 0, 3, levelled=True)
+    pair = prepare(
+        images.f, images.g, grid, images.f_mask, images.g_mask, Level(factor, BLUR), 0, 3,
+        levelled=True,
+    )  # fmt: skip
     coarse = pair.grid
     points = np.stack(np.broadcast_arrays(coarse.x[None, :], coarse.y[:, None]), axis=-1)
     slow = np.asarray(known(points), dtype=np.float64)

@@ -31,7 +31,7 @@ from modeharvest.idic.fields.files import read_field
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.idic.fields.subset_sd import predicted_sd
 from modeharvest.idic.fields.tables import read_table
-from modeharvest.idic.inputs import checked_image, checked_mask, require_contrast, seen
+from modeharvest.idic.inputs import CheckedImages
 from modeharvest.idic.start.motion import first_motion
 from modeharvest.imaging.grid import PixelGrid
 
@@ -154,14 +154,11 @@ def subset_field(
     """
     options = options or SubsetOptions()
     python = pyvale_python()
-    f, g = checked_image(reference, "reference", grid), checked_image(deformed, "deformed", grid)
-    inside = checked_mask(mask, "mask", grid)
+    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
+    f, g, inside = images.f, images.g, images.f_mask
     inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
-    require_contrast(seen(f, inside), "reference")
-    require_contrast(g, "deformed")
     seeds = _seeds(inside, options.subset_px)
-    landing = checked_mask(deformed_mask, "deformed mask", grid)
-    largest = options.largest_px or _largest_motion(f, g, grid, inside, landing)
+    largest = options.largest_px or _largest_motion(f, g, grid, inside, images.g_mask)
     reason = ""
     with tempfile.TemporaryDirectory(prefix="modeharvest-pyvale-") as name:
         folder = Path(name)
