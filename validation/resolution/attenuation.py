@@ -104,9 +104,10 @@ class Attenuation:
             If it covers too few columns, or holds no such wave.
         """
         with np.errstate(invalid="ignore"):
-            near = np.abs(field.y) <= 0.5 * star.period(field.x)
+            inside = (field.x >= -0.5) & (field.x <= star.cols - 0.5)
+            near = inside & (np.abs(field.y) <= 0.5 * star.period(field.x))
             row = np.abs(field.y).min(where=field.good, initial=np.inf)
-            middle = np.abs(field.y) <= row + 0.5
+            middle = inside & (np.abs(field.y) <= row + 0.5)
         found = cls(Columns.of(star, field, near), Columns.of(star, field, middle))
         _require_columns(found.columns, star, field.source)
         _require_wave(found.columns, star, field)
