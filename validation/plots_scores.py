@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -126,9 +124,8 @@ def draw_distribution(scores: Sequence[Score]) -> Figure:
             lost = points - len(length)
             share = (lost + np.arange(1, len(length) + 1)) / points
             some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
-            axes.loglog(np.maximum(length[some], 1e-9), 100 * share[some], **_look(n, graded))
+            axes.loglog(np.maximum(length[some], 1e-9), 100 * share[some], color=colour(n))
         axes.set(ylim=(0.01, 120))
-        _legend(axes)
     return drawn
 
 
@@ -143,9 +140,8 @@ def draw_histogram(scores: Sequence[Score]) -> Figure:
             low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
             edges = 10.0 ** (np.arange(low, high + 2) / 10)
             count, _ = np.histogram(length, edges)
-            axes.stairs(100 * count / graded.everywhere.points, edges, lw=1.5, **_look(n, graded))
+            axes.stairs(100 * count / graded.everywhere.points, edges, lw=1.5, color=colour(n))
         axes.set(xscale="log", ylim=(0, None))
-        _legend(axes)
     return drawn
 
 
@@ -157,11 +153,10 @@ def draw_regions(scores: Sequence[Score]) -> Figure:
         for n, graded in enumerate(scores):
             at = np.arange(len(REGIONS)) + (n - 0.5 * (len(scores) - 1)) * width
             rms = [graded.by_region[name].rms_px for name in REGIONS]
-            axes.bar(at, np.nan_to_num(rms), 0.92 * width, **_look(n, graded))
+            axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=colour(n))
         axes.set_xticks(range(len(REGIONS)), REGIONS)
         if any(graded.everywhere.rms_px > 0 for graded in scores):
             axes.set_yscale("log")
-        _legend(axes)
     return drawn
 
 
@@ -169,11 +164,10 @@ def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
     """Draw the rms error by wavelength, in thirds of an octave."""
     with style():
         drawn, axes = curve("wavelength [px]", "rms per component in a third of an octave [px]")
-        for n, (name, spectrum) in enumerate(spectra.items()):
+        for n, spectrum in enumerate(spectra.values()):
             if spectrum is not None and (spectrum.rms_px > 0).any():
                 axes.loglog(spectrum.wavelength_px, spectrum.rms_px, marker="o", ms=2.5,
-                            color=_COLOURS[n % len(_COLOURS)], label=name)  # fmt: skip
-        _legend(axes)
+                            color=colour(n))  # fmt: skip
     return drawn
 
 
@@ -181,13 +175,6 @@ def _length(graded: Score) -> FloatArray:
     return np.hypot(graded.error_px[:, 0], graded.error_px[:, 1])
 
 
-def _look(n: int, graded: Score) -> dict[str, Any]:
-    return {"color": _COLOURS[n % len(_COLOURS)], "label": graded.source}
-
-
-def _legend(axes: Axes) -> None:
-    """Names above the picture, where no curve is."""
-    count = len(axes.get_legend_handles_labels()[0])
-    if count:
-        axes.legend(frameon=False, fontsize=7.5, ncols=min(count, 4), loc="lower right",
-                    bbox_to_anchor=(1.0, 0.985), borderaxespad=0.0)  # fmt: skip
+def colour(n: int) -> str:
+    """Of the n-th code in all curves and bars, "#rrggbb"."""
+    return str(to_hex(_COLOURS[n % len(_COLOURS)]))

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from modeharvest.files import atomic, write_json
 from modeharvest.validation.benchmark_set import BenchmarkTruth
-from modeharvest.validation.page import render
+from modeharvest.validation.page import render, short
 from modeharvest.validation.plots_scores import (
     ErrorMaps,
     FieldMaps,
+    colour,
     draw_distribution,
     draw_histogram,
     draw_regions,
     draw_spectra,
 )
+from modeharvest.validation.regions import REGIONS
 from modeharvest.validation.report import Picture
 from modeharvest.validation.score_spectrum import ErrorSpectrum
 from modeharvest.validation.scoring import ENOUGH_COVERED, PERCENTILES, RegionScore, Score
@@ -183,6 +185,9 @@ def page(grading: Grading) -> str:
         everywhere=EVERYWHERE,
         common=COMMON,
         percentiles=PERCENTILES,
+        regions=REGIONS,
+        colour=colour,
+        three=_three_digits,
         curves=curves,
         fields=[_field(of_field, n) for n, of_field in enumerate(maps)],
     )
@@ -198,6 +203,10 @@ def _field(maps: FieldMaps, n: int) -> dict[str, Any]:
             _picture(f"y-{n}", "Error along y", maps.draw_component(1)),
         ],
     }
+
+
+def _three_digits(value: float) -> str:
+    return short(float(f"{value:.3g}"))
 
 
 def _picture(name: str, label: str, drawn: Figure) -> Picture:

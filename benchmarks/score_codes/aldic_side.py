@@ -1,7 +1,9 @@
 """al-dic on a public folder, without modeharvest: ``python aldic_side.py PUBLIC IMAGE FIELD``.
 
-Subsets of 20 px every 4 px with its augmented-Lagrangian global step, its own treatment of partly
-masked subsets, its own first guess by Fourier correlation; options at their defaults otherwise.
+Subsets of 16 px every 4 px, no larger than a ligament is wide, with its augmented-Lagrangian
+global step, its own treatment of partly masked subsets, its own first guess by Fourier correlation;
+options at their defaults otherwise. The masks leave out pixels next to edges: with them 6 % of the
+points were off by more than 1 px, without them 0.6 %.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ import numpy as np
 from al_dic import dicpara_default, run_aldic
 from al_dic.core.data_structures import GridxyROIRange
 from PIL import Image
+from scipy import ndimage
 
-WINDOW_PX, STEP_PX, SEARCH_PX = 20, 4, 44
+WINDOW_PX, STEP_PX, SEARCH_PX = 16, 4, 44
+EDGE_PX = 3
 
 
 def main(public: Path, deformed: str, field: Path) -> None:
@@ -23,7 +27,8 @@ def main(public: Path, deformed: str, field: Path) -> None:
     names = info["reference"]["camera_image"], deformed
     images = [np.asarray(Image.open(public / name), dtype=np.float64) / 255.0 for name in names]
     mask = np.asarray(Image.open(public / info["reference"]["mask"])) > 0
-    masks = [mask.astype(np.float64), (images[1] > 0.1).astype(np.float64)]
+    material = mask, images[1] > 0.1  # nowhere black
+    masks = [ndimage.binary_erosion(m, iterations=EDGE_PX).astype(np.float64) for m in material]
     row, col = np.nonzero(mask)
     para = dicpara_default(
         winsize=WINDOW_PX,
@@ -42,7 +47,7 @@ def main(public: Path, deformed: str, field: Path) -> None:
     nodes = np.asarray(found.dic_mesh.coordinates_fem)
     u = np.asarray(found.result_disp[0].U_accum).reshape(-1, 2)
     x, y = np.rint(nodes).astype(int).T
-    inside = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+    inside = masks[0][y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)] > 0
     header = f"# benchmark: {info['id']}\nx [px],y down [px],u [px],v down [px]"
     table = np.column_stack([nodes, u])[inside]
     np.savetxt(field, table, "%.6f", ",", header=header, comments="")

@@ -82,12 +82,19 @@ def idic(task: Task, field: Path, codes: str) -> None:
     write_field(field, sampled_field(found.displacement(), task.grid, task.mask, STEP_PX))
 
 
-def pyvale(task: Task, field: Path, codes: str) -> None:
-    """pyvale's subsets: whole ones only, as their own docs' 2-D DIC but for the first window."""
-    os.environ[WHERE] = codes
-    options = SubsetOptions(subset_px=SUBSET_PX, step_px=STEP_PX)
-    images = task.reference, task.deformed, task.grid
-    write_field(field, subset_field(*images, task.mask, task.deformed_mask, options))
+def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
+    """pyvale's subsets, as their own docs' 2-D DIC but for the first window.
+
+    Of their pixels at least so large a share must be material.
+    """
+
+    def run(task: Task, field: Path, codes: str) -> None:
+        os.environ[WHERE] = codes
+        options = SubsetOptions(subset_px=SUBSET_PX, step_px=STEP_PX, filling=filling)
+        images = task.reference, task.deformed, task.grid
+        write_field(field, subset_field(*images, task.mask, task.deformed_mask, options))
+
+    return run
 
 
 def other(script: str) -> Callable[[Task, Path, str], None]:
@@ -109,8 +116,9 @@ def other(script: str) -> Callable[[Task, Path, str], None]:
 
 
 CODES: dict[str, Callable[[Task, Path, str], None]] = {
-    "micromorphic IDIC": idic,
-    "pyvale": pyvale,
+    "micromorphic IDIC, 77 unknowns": idic,
+    "pyvale": pyvale(filling=1.0),
+    "pyvale, partial subsets": pyvale(filling=0.7),
     "pyxel-dic": other("pyxel_side.py"),
     "al-dic": other("aldic_side.py"),
 }

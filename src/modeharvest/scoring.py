@@ -258,7 +258,10 @@ def _cells(grading: Grading, graded: Score) -> dict[str, str]:
         "50 %": f"{percentiles[50]:.3g}",
         "95 %": f"{percentiles[95]:.3g}",
         "largest": f"{every.max_px:.3g}",
-        **{f"rms, {name}": f"{part.rms_px:.3g}" for name, part in graded.by_region.items()},
+        **{
+            f"rms, {name}": f"{part.rms_px:.3g}" if part.points else "-"
+            for name, part in graded.by_region.items()
+        },
         "points": str(every.points),
         "returned": f"{100 * every.returned:.1f} %",
         "material covered": f"{100 * graded.covered:.1f} %",
