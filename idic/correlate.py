@@ -151,8 +151,8 @@ def correlate(
     gradient = Gradient(options.gradient)
     weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
     if level == FULL and result.outcome is Outcome.CONVERGED and not weighting.is_least_squares:
-        slopes = instrument(weighting, images, search.pair, assembly, found.unknowns)
-        found = search.reweighed(found, assembly, slopes)
+        weights = instrument(weighting, images, search.pair, assembly, found.unknowns)
+        found = search.reweighed(found, assembly, weights)
         history += found.history
         result = judged(search.ansatz, search.pair, found, assembly, width_px, weighting)
         clock.lap("weigh anew")

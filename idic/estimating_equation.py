@@ -26,7 +26,7 @@ from modeharvest.idic.inputs import CheckedImages
 from modeharvest.idic.normal_equations import Assembly, NormalEquations
 from modeharvest.idic.pyramid import Pair, smoothed
 from modeharvest.idic.scaled_eigen import ScaledEigen
-from modeharvest.idic.warp import slopes
+from modeharvest.idic.warp import brought_back
 from modeharvest.idic.weighting import Gradient, Weighting
 from modeharvest.imaging.interpolation import SplineImage
 
@@ -39,9 +39,11 @@ _FAR = 10.0
 def instrument(
     weighting: Weighting, images: CheckedImages, pair: Pair, used: Assembly, a: FloatArray
 ) -> NDArray[np.float32]:
-    """Slopes along x and y that weigh the residual: (2, rows, cols) [grey levels/mm].
+    """Make what weighs the residual: (3, rows, cols), slopes along x and y, and grey levels.
 
-    In the reference's frame; 0 where no pixel counts or g doesn't reach.
+    In the reference's frame; 0 where no pixel counts or g doesn't reach. The grey levels, for a
+    gain among the unknowns, are the mean of both images: so what their noise has in common with
+    the residual cancels.
 
     Parameters
     ----------
@@ -55,15 +57,19 @@ def instrument(
 
     def of(image: NDArray[Any], mask: Any, at: FloatArray) -> NDArray[np.float32]:
         spline = SplineImage.of(smoothed(image, mask, weighting.blur_px), pair.deformed.order)
-        return np.nan_to_num(slopes(used, at, pair.reference, spline), copy=False)
+        return np.nan_to_num(brought_back(used, at, pair.reference, spline), copy=False)
 
-    still = np.zeros_like(a)
-    if weighting.gradient is Gradient.DEFORMED:
-        return of(images.g, images.g_mask, a)
-    if weighting.gradient is Gradient.REFERENCE:
-        return of(images.f, images.f_mask, still)
-    both = of(images.g, images.g_mask, a) + of(images.f, images.f_mask, still)
-    return np.asarray(0.5 * both, dtype=np.float32)
+    made = of(images.g, images.g_mask, a)
+    if weighting.gradient is Gradient.DEFORMED and used.ansatz.brightness.gain_degree is None:
+        return made
+    slope = _SHARE_OF_G[weighting.gradient]
+    share = np.array([slope, slope, 0.5], dtype=np.float32)[:, None, None]
+    made *= share
+    made += (1 - share) * of(images.f, images.f_mask, np.zeros_like(a))
+    return made
+
+
+_SHARE_OF_G = {Gradient.DEFORMED: 1.0, Gradient.MEAN: 0.5, Gradient.REFERENCE: 0.0}
 
 
 def root(

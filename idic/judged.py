@@ -14,7 +14,7 @@ from modeharvest.idic.pyramid import Pair
 from modeharvest.idic.result import Result
 from modeharvest.idic.scaled_eigen import ScaledEigen
 from modeharvest.idic.warp import residual
-from modeharvest.idic.weighting import LEAST_SQUARES, Gradient, Weighting, best_blur
+from modeharvest.idic.weighting import LEAST_SQUARES, WORTH_IT, Gradient, Weighting, best_blur
 from modeharvest.imaging.grid import PixelGrid
 
 WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
@@ -86,5 +86,8 @@ def weighting_for(
     if blur_px is None:
         blur_px = 0.0
         if result.agreement().is_white:
-            blur_px = best_blur(result.noise_in_gradient(result.noise_sd**2), width_px)
+            # Noise in g makes a gain too small, however little of it there is.
+            has_gain = result.ansatz.brightness.gain_degree is not None
+            share = result.noise_in_gradient(result.noise_sd**2)
+            blur_px = best_blur(share, width_px, 0.0 if has_gain else WORTH_IT)
     return Weighting(gradient, blur_px, width_px)

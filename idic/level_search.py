@@ -112,20 +112,20 @@ class LevelSearch:
                 break
         return replace(found, history=history), used
 
-    def reweighed(self, found: Minimum, used: Assembly, slopes: NDArray[Any]) -> Minimum:
-        """Move on from the minimum to where given slopes weigh the residual to zero.
+    def reweighed(self, found: Minimum, used: Assembly, instrument: NDArray[Any]) -> Minimum:
+        """Move on from the minimum to where an instrument weighs the residual to zero.
 
         Parameters
         ----------
         found, used
             The minimum and its pixels.
-        slopes
-            (2, rows, cols) in place of the deformed image's gradient [grey levels/mm].
+        instrument
+            (3, rows, cols) as for :meth:`Assembly.images`.
         """
         pair = self.pair
 
         def evaluate(a: FloatArray, with_matrix: bool) -> NormalEquations:
-            return used.images(a, pair.reference, pair.deformed, with_matrix, slopes)
+            return used.images(a, pair.reference, pair.deformed, with_matrix, instrument)
 
         length = step_length(self.ansatz, used.grid, used.mask, self.factor)
         return root(evaluate, length, found, self.options, self.on_iteration)

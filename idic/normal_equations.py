@@ -159,7 +159,7 @@ class Assembly:
         reference: NDArray[Any],
         deformed: SplineImage,
         with_matrix: bool = True,
-        slopes: NDArray[Any] | None = None,
+        instrument: NDArray[Any] | None = None,
     ) -> NormalEquations:
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
@@ -175,12 +175,12 @@ class Assembly:
             g.
         with_matrix
             Without the matrix the pass costs about half as much.
-        slopes
-            (2, rows, cols) what stands for the gradient of g at x + u [grey levels/mm]; matrix
-            and gradient are h'h and -h'r then, h being its products with the displacement's
-            derivatives.
+        instrument
+            (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and
+            y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
+            being its products with the derivatives of the displacement and of the gain.
         """
-        target = Target.images(reference, deformed, self.grid, slopes)
+        target = Target.images(reference, deformed, self.grid, instrument)
         return self._assemble(a, target, with_matrix)
 
     def displacement(

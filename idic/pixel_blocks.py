@@ -41,9 +41,9 @@ class Target(NamedTuple):
         Spline of g.
     displacement
         (rows, cols) [mm]; of no account for images.
-    slopes
-        (2, rows, cols) along x and y [grey levels/mm]: stand for (1 + b) times the gradient of g
-        at x + u; (2, 0, 0) for that itself.
+    instrument
+        (3, rows, cols) what weighs the residual in place of (1 + b) times the gradient of g at
+        x + u, along x and y [grey levels/mm], and of g there; (3, 0, 0) for these themselves.
     pixel_size
         [mm/px].
     """
@@ -53,7 +53,7 @@ class Target(NamedTuple):
     coefficients: NDArray[Any]
     order: int
     displacement: NDArray[Any]
-    slopes: NDArray[Any]
+    instrument: NDArray[Any]
     pixel_size: float
 
     @classmethod
@@ -62,11 +62,11 @@ class Target(NamedTuple):
         reference: NDArray[Any],
         deformed: SplineImage,
         grid: PixelGrid,
-        slopes: NDArray[Any] | None = None,
+        instrument: NDArray[Any] | None = None,
     ) -> Target:
         """A pair of images."""
         f, nothing = readable(reference), readable(np.zeros((0, 0)))
-        given = readable(NO_SLOPES if slopes is None else slopes)
+        given = readable(NO_INSTRUMENT if instrument is None else instrument)
         spline = deformed.coefficients, deformed.order
         return cls(IMAGES, f, *spline, nothing, given, grid.pixel_size)
 
@@ -75,18 +75,18 @@ class Target(NamedTuple):
         """One component of a displacement (rows, cols) [mm]: 0 for u_x, 1 for u_y."""
         nothing = np.zeros((0, 0), dtype=np.float32)
         u = readable(displacement)
-        none = readable(NO_SLOPES)
+        none = readable(NO_INSTRUMENT)
         return cls(component, readable(nothing), nothing, 5, u, none, grid.pixel_size)
 
 
 IMAGES = -1
 """``component`` of a pair of images."""
-NO_SLOPES = np.zeros((2, 0, 0), dtype=np.float32)
-"""``slopes`` where the deformed image's own are taken."""
+NO_INSTRUMENT = np.zeros((3, 0, 0), dtype=np.float32)
+"""``instrument`` where the deformed image itself weighs the residual."""
 
 
 COLUMN, KNOWN, U_X, U_Y, GAIN, OFFSET, AT_ROW, AT_COL, G, D_ROW, D_COL, WEIGHT = range(12)
-SLOPE_X, SLOPE_Y = 12, 13
+INSTRUMENT = 12
 """Rows of :class:`Block`'s ``own``."""
 
 
@@ -98,9 +98,9 @@ class Block(NamedTuple):
     Parameters
     ----------
     own
-        (14, BLOCK): column [px]; f, or the known displacement; u_x, u_y [mm]; b [-] and c [grey
+        (15, BLOCK): column [px]; f, or the known displacement; u_x, u_y [mm]; b [-] and c [grey
         levels]; x + u as row and column [px]; g there and its derivatives; 1, or 0 outside g;
-        the slopes that are given.
+        the three of the instrument.
     along_x
         (1 + 2 w + n, BLOCK): those of the tables.
     T, eta_T
@@ -127,7 +127,7 @@ def new_block(tables: Any, degree: int, fields: int) -> Block:
     """Make room for a block, with Chebyshev polynomials up to a degree of at least 1."""
     n, w = tables.v.shape[0], tables.waves.shape[0]
     return Block(
-        np.zeros((14, BLOCK)), np.empty((tables.along_x.shape[0], BLOCK)),
+        np.zeros((15, BLOCK)), np.empty((tables.along_x.shape[0], BLOCK)),
         np.empty((degree + 1, BLOCK)), np.empty(degree + 1),
         np.empty((n, 3, BLOCK)), np.empty((w, 2, BLOCK)), np.empty((fields, BLOCK)),
     )  # fmt: skip
@@ -174,10 +174,10 @@ def _gather(target: Any, row: int, first: int, n: int, at: int, tables: Any, blo
         copy_block(target.displacement[row, first : first + n], n, known)
     else:
         copy_block(target.reference[row, first : first + n], n, known)
-    if target.slopes.shape[1]:
-        for k in range(2):
-            slope = block.own[SLOPE_X + k, at : at + n]
-            copy_block(target.slopes[k, row, first : first + n], n, slope)
+    if target.instrument.shape[1]:
+        for k in range(3):
+            given = block.own[INSTRUMENT + k, at : at + n]
+            copy_block(target.instrument[k, row, first : first + n], n, given)
     for k in range(block.along_x.shape[0]):
         copy_block(tables.along_x[k, first : first + n], n, block.along_x[k, at : at + n])
 
@@ -325,9 +325,9 @@ def sample_block(target: Any, row: int, n: int, block: Any) -> int:
         g_y[m] = -(per_px + per_px * b[m]) * d_row[m]
     for m in range(n):
         residual[m] = (known[m] - c[m]) * weight[m] - (1.0 + b[m]) * g[m]
-    if target.slopes.shape[1]:
-        for k in range(2):
-            slope, to = own[SLOPE_X + k], E[k]
+    if target.instrument.shape[1]:
+        for k in range(3):
+            given, to = own[INSTRUMENT + k], (E[k] if k < 2 else g)
             for m in range(n):
-                to[m] = weight[m] * slope[m]
+                to[m] = weight[m] * given[m]
     return off

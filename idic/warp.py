@@ -66,14 +66,16 @@ def residual(
     return np.asarray(_left(assembly, a, reference, deformed, 1)[0])
 
 
-def slopes(
+def brought_back(
     assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
 ) -> NDArray[np.float32]:
-    """(2, rows, cols) (1 + b) times the gradient of g at x + u, along x and y [grey levels/mm].
+    """(3, rows, cols) (1 + b) times the gradient of g at x + u, along x and y, and (1 + b) g + c.
 
-    NaN where no pixel counts or g doesn't reach.
+    The gradient in [grey levels/mm]. NaN where no pixel counts or g doesn't reach.
     """
-    return _left(assembly, a, reference, deformed, 3)[1:]
+    left = _left(assembly, a, reference, deformed, 3)
+    left[0] = reference - left[0]
+    return np.roll(left, -1, axis=0)
 
 
 def _left(

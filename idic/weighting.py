@@ -26,7 +26,7 @@ from modeharvest.errors import InputError
 SLOPE_NOISE = 2.46
 """Variance of a quintic spline's slope through white noise of variance 1, the mean over all
 positions between pixels [1/px^2]. A cubic's is 2.17."""
-_WORTH_IT = 0.01
+WORTH_IT = 0.01
 """Share of the unknowns' variance for which a blur is worth the steps [-]."""
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -113,7 +113,7 @@ LEAST_SQUARES = Weighting()
 """With the derivative of the cost itself."""
 
 
-def best_blur(noise_share: float, width_px: float) -> float:
+def best_blur(noise_share: float, width_px: float, worth: float = WORTH_IT) -> float:
     """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
 
     Parameters
@@ -122,11 +122,13 @@ def best_blur(noise_share: float, width_px: float) -> float:
         As for :meth:`Weighting.excess`.
     width_px
         Full width at half maximum of the speckle's autocorrelation [px].
+    worth
+        Share of the variance that a blur has to spare at least [-].
     """
     candidates = [Weighting(blur_px=blur, width_px=width_px) for blur in (0.0, *_BLURS_PX)]
     excess = [weighting.excess(noise_share) for weighting in candidates]
     best = int(np.argmin(excess))
-    return candidates[best].blur_px if excess[0] - excess[best] > _WORTH_IT else 0.0
+    return candidates[best].blur_px if excess[0] - excess[best] > worth else 0.0
 
 
 _BLURS_PX = tuple(0.05 * k for k in range(12, 81))

@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions, correlate
 from modeharvest.idic.estimating_equation import instrument, root
@@ -23,7 +24,7 @@ from modeharvest.idic.level_search import step_length
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.pyramid import FULL, prepare
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import slopes
+from modeharvest.idic.warp import brought_back
 from modeharvest.idic.weighting import Gradient, Weighting, best_blur
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
@@ -50,12 +51,12 @@ def pair(seed: int = 3) -> tuple[FloatArray, FloatArray]:
     return manufactured.image_pair(manufactured.speckle(seed, GRID), ANSATZ, truth(), GRID)
 
 
-def test_the_deformed_image_s_own_slopes_change_nothing() -> None:
+def test_the_deformed_image_itself_as_the_instrument_changes_nothing() -> None:
     f, g = (image.astype(np.float32) for image in pair())
     spline, used = SplineImage.of(g), Assembly(ANSATZ, GRID, MASK)
     a = ANSATZ.start(0.028)
-    given = np.nan_to_num(slopes(used, a, f, spline))
-    own, same = used.images(a, f, spline), used.images(a, f, spline, slopes=given)
+    given = np.nan_to_num(brought_back(used, a, f, spline))
+    own, same = used.images(a, f, spline), used.images(a, f, spline, instrument=given)
     # float32 slopes, of which 10^4 are summed.
     np.testing.assert_allclose(same.matrix, own.matrix, rtol=1e-5, atol=1e-7 * own.matrix.max())
     np.testing.assert_allclose(same.gradient, own.gradient, atol=1e-6 * abs(own.gradient).max())
@@ -174,6 +175,25 @@ def test_results_tell_the_errors_they_have() -> None:
     share = np.trace(np.linalg.solve(np.repeat(bounds, 2, axis=0), told).mean(axis=0)) / ANSATZ.size
     # 5 % is what 1/det F and the positions between pixels leave open (test_result_noise.py).
     assert share == pytest.approx(1.0, abs=0.05)
+
+
+def test_noise_does_not_make_a_gain_too_small() -> None:
+    ansatz = replace(ANSATZ, brightness=Brightness(gain_degree=0, offset_degree=0))
+    truth_of_all, number = np.append(truth(), [0.0, 0.0]), ansatz.names.index("gain[0,0]")
+    means = []
+    for options in (FINEST, LEAST_SQUARES):
+        gains, sds = [], []
+        for seed in range(16):
+            noise = NOISE * np.random.default_rng([seed, 8]).normal(size=(2, *GRID.shape))
+            f, g = (image + n for image, n in zip(pair(seed), noise, strict=True))
+            found = correlate(f, g, GRID, ansatz, truth_of_all, MASK, options=options)
+            gains.append(found.unknowns[number])
+            sds.append(found.standard_errors(NOISE)[number])
+        means.append(np.mean(gains) / (np.mean(sds) / np.sqrt(len(gains))))
+    with_instrument, least_squares = means
+    # Errors in the variable g take s^2/V of a gain of 1: 0.01 here, and its sd is 0.002.
+    assert abs(with_instrument) < 4.0
+    assert least_squares < -10.0
 
 
 def gaussian_speckle(width_px: float, seed: int) -> FloatArray:
