@@ -12,7 +12,7 @@ from perforated import PITCH, SQUARE, holed_cell
 from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.scoring import make_benchmark
-from modeharvest.validation.benchmark_set import BenchmarkTruth
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
 FloatArray = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from modeharvest import cli
 from modeharvest.errors import InputError
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.scoring import make_benchmark
-from modeharvest.validation.benchmark_set import BenchmarkTruth, displacement_at
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth, displacement_at
 
 PUBLIC = {
     "README.md", "benchmark.json", "mask.tif", "reference.tif", "reference_8bit.tif",

@@ -32,7 +32,7 @@ from modeharvest.validation.resolution.transfer import (
     subset_noise,
     subset_transfer,
 )
-from modeharvest.validation.score_fields import Declared
+from modeharvest.validation.scoring.fields import Declared
 
 FloatArray = NDArray[np.float64]
 

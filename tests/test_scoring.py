@@ -10,8 +10,8 @@ from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.regions import REGIONS, regions
-from modeharvest.validation.scoring import score
+from modeharvest.validation.scoring.regions import REGIONS, regions
+from modeharvest.validation.scoring.score import score
 
 FloatArray = NDArray[np.float64]
 

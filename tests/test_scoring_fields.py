@@ -23,11 +23,11 @@ from synthetic_benchmark import PIXEL, STRAIN
 from modeharvest.errors import InputError
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.scoring import Declared, declarations
-from modeharvest.validation.benchmark_set import BenchmarkTruth
-from modeharvest.validation.regions import regions
-from modeharvest.validation.score_fields import read_measured
-from modeharvest.validation.score_mistakes import mistakes
-from modeharvest.validation.scoring import Score, score
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth
+from modeharvest.validation.scoring.fields import read_measured
+from modeharvest.validation.scoring.mistakes import mistakes
+from modeharvest.validation.scoring.regions import regions
+from modeharvest.validation.scoring.score import Score, score
 
 FloatArray = NDArray[np.float64]
 ROUNDED_PX = 1e-6

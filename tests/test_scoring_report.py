@@ -24,11 +24,11 @@ from modeharvest import cli
 from modeharvest.idic.fields.files import write_field
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.benchmark_set import BenchmarkTruth
 from modeharvest.validation.page import short
-from modeharvest.validation.regions import REGIONS, regions
-from modeharvest.validation.score_spectrum import error_spectrum
-from modeharvest.validation.scoring import Score, ranked, score
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth
+from modeharvest.validation.scoring.regions import REGIONS, regions
+from modeharvest.validation.scoring.score import Score, ranked, score
+from modeharvest.validation.scoring.spectrum import error_spectrum
 
 FloatArray = NDArray[np.float64]
 

@@ -25,19 +25,19 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, require_writable
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, silent
-from modeharvest.validation.benchmark_set import (
+from modeharvest.validation.scoring.benchmark import (
     SOLUTION,
     BenchmarkTruth,
     publish,
     require_apart,
     require_no_lens,
 )
-from modeharvest.validation.regions import EDGE_PX, regions
-from modeharvest.validation.score_fields import Declared, read_measured
-from modeharvest.validation.score_mistakes import mistakes
-from modeharvest.validation.score_report import Grading, write_grading
-from modeharvest.validation.score_spectrum import error_spectrum
-from modeharvest.validation.scoring import PERCENTILES, Score, ranked, score
+from modeharvest.validation.scoring.fields import Declared, read_measured
+from modeharvest.validation.scoring.mistakes import mistakes
+from modeharvest.validation.scoring.regions import EDGE_PX, regions
+from modeharvest.validation.scoring.report import Grading, write_grading
+from modeharvest.validation.scoring.score import PERCENTILES, Score, ranked, score
+from modeharvest.validation.scoring.spectrum import error_spectrum
 
 __all__ = ["Declared", "declarations", "grade", "make_benchmark", "print_grading"]
 

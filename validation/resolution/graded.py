@@ -23,7 +23,7 @@ from modeharvest.validation.resolution.star_report import (
     write_star_grading,
 )
 from modeharvest.validation.resolution.star_set import StarSet
-from modeharvest.validation.score_fields import Declared, read_measured
+from modeharvest.validation.scoring.fields import Declared, read_measured
 
 
 def grade_star(

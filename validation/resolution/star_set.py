@@ -30,9 +30,9 @@ from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import digest, file_digest
-from modeharvest.validation.benchmark_words import RETURNED
 from modeharvest.validation.resolution.star import Star, StarImages, fine_speckle
 from modeharvest.validation.resolution.star_words import readme
+from modeharvest.validation.scoring.benchmark_words import RETURNED
 
 FORMAT = "modeharvest-star-1"
 SIDECAR, README = "star.json", "README.md"

@@ -12,7 +12,7 @@ from modeharvest.idic.families.spectrum import spectral_density
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.idic.fields.measured_spectrum import gridded
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.scoring import Score
+from modeharvest.validation.scoring.score import Score
 
 FloatArray = NDArray[np.float64]
 

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from modeharvest.files import atomic, write_json
-from modeharvest.validation.benchmark_set import BenchmarkTruth
 from modeharvest.validation.page import render, short
-from modeharvest.validation.plots_scores import (
+from modeharvest.validation.report import Picture
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth
+from modeharvest.validation.scoring.plots import (
     ErrorMaps,
     FieldMaps,
     colour,
@@ -24,16 +25,15 @@ from modeharvest.validation.plots_scores import (
     draw_regions,
     draw_spectra,
 )
-from modeharvest.validation.regions import REGIONS
-from modeharvest.validation.report import Picture
-from modeharvest.validation.score_spectrum import ErrorSpectrum
-from modeharvest.validation.scoring import ENOUGH_COVERED, PERCENTILES, RegionScore, Score
+from modeharvest.validation.scoring.regions import REGIONS
+from modeharvest.validation.scoring.score import ENOUGH_COVERED, PERCENTILES, RegionScore, Score
+from modeharvest.validation.scoring.spectrum import ErrorSpectrum
 from modeharvest.validation.style import to_svg
 
 BoolArray = NDArray[np.bool_]
 
 FORMAT = "modeharvest-scores-1"
-TEMPLATE = "score_report.html"
+TEMPLATE = "scoring/report.html"
 EVERYWHERE, COMMON = "everywhere", "where all measure"
 """Rows of the table beside the regions."""
 
@@ -51,7 +51,7 @@ class Grading:
     edge_px
         Width of the region of edges [px].
     labels
-        (rows, cols) of :func:`modeharvest.validation.regions.regions`.
+        (rows, cols) of :func:`modeharvest.validation.scoring.regions.regions`.
     scores
         The best first.
     spectra

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from modeharvest.errors import InputError
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.regions import REGIONS
+from modeharvest.validation.scoring.regions import REGIONS
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -85,7 +85,7 @@ class Score:
     everywhere
         Over all its points on material.
     by_region
-        For each of :data:`modeharvest.validation.regions.REGIONS`.
+        For each of :data:`modeharvest.validation.scoring.regions.REGIONS`.
     off_material
         Points that lie in holes or outside the specimen: not graded.
     spacing_px
@@ -134,7 +134,7 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
     truth
         (n, 2) true displacements at the field's points [mm]; NaN off the material.
     labels
-        (rows, cols) of :func:`modeharvest.validation.regions.regions`.
+        (rows, cols) of :func:`modeharvest.validation.scoring.regions.regions`.
     grid
         The reference image's pixels.
 

@@ -33,7 +33,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec
 from modeharvest.imaging.isoparametric import interpolate, locate
 from modeharvest.imaging.pointwise import locate_points
-from modeharvest.validation.benchmark_words import RETURNED, readme
+from modeharvest.validation.scoring.benchmark_words import RETURNED, readme
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

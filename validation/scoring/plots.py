@@ -20,9 +20,9 @@ from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.plots_fields import Scale, draw_field
 from modeharvest.validation.plots_path import curve
-from modeharvest.validation.regions import REGIONS
-from modeharvest.validation.score_spectrum import ErrorSpectrum
-from modeharvest.validation.scoring import Score
+from modeharvest.validation.scoring.regions import REGIONS
+from modeharvest.validation.scoring.score import Score
+from modeharvest.validation.scoring.spectrum import ErrorSpectrum
 from modeharvest.validation.sheet import Sheet
 from modeharvest.validation.style import BLUE, GOLD, GREEN, RED, SIZE, style
 
