@@ -176,6 +176,15 @@ def test_a_bias_and_error_bars_that_are_too_short_are_seen() -> None:
     assert short.told_over_error == pytest.approx(0.5, abs=0.05)
 
 
+def test_the_same_errors_against_a_larger_bound() -> None:
+    """Error bars that are half as long as the errors are right against a bound twice as large."""
+    short = normal_pairs(told_by=0.5)
+    long = short.against(np.full(3, 2.0))
+    assert long.ratio.value == pytest.approx(0.5 * short.ratio.value)
+    assert long.bias.value == pytest.approx(0.5 * short.bias.value, abs=1e-12)
+    assert str(long.coverage) == str(normal_pairs().coverage)
+
+
 def test_what_no_noise_moves_does_not_count() -> None:
     pairs = normal_pairs()
     zero = np.zeros((400, 2, 2))
