@@ -143,7 +143,9 @@ def _percent(values: Any) -> str:
 
 
 def _between(values: pd.Series) -> str:
-    return f"{values.min():.4f} to {values.max():.4f}"
+    """From the least to the largest of some overlaps; one that is alone by itself."""
+    ends = dict.fromkeys(f"{value:.4f}" for value in (values.min(), values.max()))
+    return " to ".join(ends)
 
 
 def _keys(seen: pd.DataFrame, sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
@@ -230,7 +232,7 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
         f"wave vectors within {_percent(off[_WAVES])} and an overlap with the specimen’s own "
         f"pattern of {_between(part['overlap_truth'])}, least where {worst['varied']} by "
         f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); truth − best fit is "
-        f"{short(float(part['best_px'].min()))} to {short(float(part['best_px'].max()))} px (base: "
+        f"up to {short(float(part['best_px'].max()))} px (base: "
         f"{short(float(base['best_px'].iloc[0]))})."
     ]
 
@@ -265,7 +267,7 @@ def _not_seen(ran: pd.DataFrame, seen: pd.DataFrame) -> list[str]:
 
 def _of_strains(ran: pd.DataFrame) -> list[str]:
     """Critical strains of the specimens against their lattices'."""
-    known = ran[ran["first"] == "pattern"]
+    known = ran[(ran["first"] == "pattern") & ~ran["varied"].str.startswith("graded")]
     both = known.dropna(subset=["lattice_pattern_strain"])
     if not len(both):
         return []
