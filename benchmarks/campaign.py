@@ -18,7 +18,9 @@ import argparse
 import tempfile
 import time
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +70,12 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> T
     return Timing(whole, ticks[1], ticks[-1], float(table["seconds"].sum()))
 
 
+def alone(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> Timing:
+    """The same in a process of its own: workers of an earlier campaign would make it faster."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        return process.submit(run, function, cases, folder, workers).result()
+
+
 def speedup(starts: int, pixel: float, folder: Path) -> None:
     """One worker against two."""
     from modeharvest.case import shipped_solution  # here: workers import this file, too
@@ -85,7 +93,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
     for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
         own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"
         cases = study.prepare(subject, own)
-        timing = run(study.function, cases, own, workers)
+        timing = alone(study.function, cases, own, workers)
         found.setdefault(workers, []).append(timing)
         print(f"{workers} worker{'s' * (workers > 1)}: {timing.whole:.1f} s, "
               f"{timing.first:.1f} s until the first case was done, "
@@ -99,7 +107,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
 def overhead(sleeps: int, folder: Path) -> None:
     """Cases of a second on two workers."""
     cases = grid({"seconds": SLEEP_S, "number": 0}, number=list(range(sleeps)))
-    timing = run("campaign:sleep", cases, folder, 2)
+    timing = alone("campaign:sleep", cases, folder, 2)
     ideal = SLEEP_S * sleeps / 2
     steady, steady_ideal = timing.last - timing.first, ideal - SLEEP_S
     print(f"{sleeps} cases of {SLEEP_S:g} s on two workers: {timing.whole:.2f} s, "
