@@ -25,6 +25,8 @@ from modeharvest.idic.fields.files import write_field
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.page import short
+from modeharvest.validation.scoring import score as grades
+from modeharvest.validation.scoring import spectrum as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.regions import REGIONS, regions
 from modeharvest.validation.scoring.score import Score, ranked, score
@@ -208,6 +210,33 @@ def test_a_wave_of_error_is_found_at_its_wavelength(length_px: float) -> None:
     shifted = error_spectrum(moved, grid)
     assert shifted is not None
     assert shifted.affine_px == pytest.approx(0.3 / np.sqrt(2), rel=1e-2)
+
+
+def test_a_field_of_too_many_points_is_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of waves long against the squares, averaging over 2 x 2 points leaves sinc of their width."""
+    grid = PixelGrid(96, 96, PIXEL, 0.0, 95 * PIXEL)
+    col, row = (i.ravel() for i in np.meshgrid(np.arange(96.0), np.arange(96.0)))
+    x, y = grid.to_mm(row, col)
+    wave = 0.2 * np.cos(2 * np.pi * col / 32)
+    field = LocalField(x, y, PIXEL * np.column_stack([wave, 0 * wave]), source="wave")
+    graded = score(field, np.zeros((x.size, 2)), np.zeros(grid.shape, dtype=np.int8), grid)
+    monkeypatch.setattr(spectra, "_MOST", 48)
+    spectrum = error_spectrum(graded, grid)
+    assert spectrum is not None
+    everything = np.sqrt((spectrum.rms_px**2).sum() + spectrum.affine_px**2)
+    left = np.cos(np.pi / 32)  # 0.5 % less, of two points 1 px apart
+    # The affine part, a thousandth of all, is that of the points and not of their averages.
+    assert everything == pytest.approx(left * graded.everywhere.rms_px, rel=5e-4)
+
+
+def test_a_part_of_the_points_tells_their_spacing(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = PixelGrid(60, 60, PIXEL, 0.0, 59 * PIXEL)
+    col, row = (i.ravel() for i in np.meshgrid(np.arange(0.0, 60, 3), np.arange(0.0, 60, 3)))
+    x, y = grid.to_mm(row, col)
+    field = LocalField(x, y, np.zeros((x.size, 2)), source="still")
+    monkeypatch.setattr(grades, "_ENOUGH_POINTS", 7)
+    graded = score(field, np.zeros((x.size, 2)), np.zeros(grid.shape, dtype=np.int8), grid)
+    assert graded.spacing_px == pytest.approx(3.0, rel=1e-12)
 
 
 def test_points_in_a_line_have_no_spectrum(truth: BenchmarkTruth) -> None:

@@ -78,14 +78,15 @@ def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
     many = int(np.ceil(max(np.ptp(x), np.ptp(y)) / (step * _MOST)))
     if many > 1:
         side = many * step
-        col, row = (((at - at.min()) / side).astype(int) for at in (x, y))
+        left, low = (at.min() - 0.5 * step for at in (x, y))  # no point of a grid on a border
+        col, row = (((at - begin) / side).astype(int) for at, begin in ((x, left), (y, low)))
         cols = int(col.max()) + 1
         square = row * cols + col
         count = np.bincount(square)
         there = np.flatnonzero(count)
         error = np.column_stack([np.bincount(square, e)[there] / count[there] for e in error.T])
-        x = x.min() + side * (there % cols + 0.5)
-        y = y.min() + side * (there // cols + 0.5)
+        x = left + side * (there % cols + 0.5)
+        y = low + side * (there // cols + 0.5)
     return LocalField(x, y, error, source=graded.source)
 
 
