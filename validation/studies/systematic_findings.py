@@ -83,7 +83,7 @@ def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) 
             for key, label in ERRORS.items():
                 row[label] = part[key].mean()
             row[MOVED] = part["moved"].mean()
-            row["scatter of the first"] = part["lost_px"].std(ddof=0)
+            row["IDIC − best fit, sd over speckles [px]"] = part["lost_px"].std(ddof=0)
             row["pixels per ligament"] = part["pixels_per_ligament"].mean()
             row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
             rows.append(row)
