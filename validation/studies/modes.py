@@ -60,7 +60,7 @@ class Modes:
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
     pitches: tuple[float, ...] = (0.95,)
     materials: tuple[str, ...] = ("two-term I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
-    gradings_x: tuple[float, ...] = (0.02, 0.04)
+    gradings_x: tuple[float, ...] = (0.02,)
     gradings_y: tuple[float, ...] = (0.02,)
     largest: float = 0.28
     divisions: int = 13
@@ -110,13 +110,13 @@ class Modes:
         require_mode(correlation)
 
     def quick(self) -> Self:
-        """A third of the d/l beside the base's, and the most graded specimen."""
+        """A third of the d/l beside the base's, and one graded specimen."""
         return replace(
             self,
             ratios=self.ratios[2::3],
             pitches=(),
             materials=(),
-            gradings_x=self.gradings_x[-1:],
+            gradings_x=self.gradings_x[:1],
             gradings_y=(),
         )
 
