@@ -85,7 +85,7 @@ def scheduler() -> Iterator[str]:
         import sys, time
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from distributed import LocalCluster
-        options = dict(processes=False, protocol="tcp", dashboard_address=None)
+        options = dict(processes=False, protocol="tcp", dashboard_address=":0")
         with LocalCluster(n_workers=1, threads_per_worker=1, **options) as cluster:
             print(cluster.scheduler_address, flush=True)
             sys.stdin.read()

@@ -163,7 +163,7 @@ def _processes(function: str, count: int, memory: str) -> Iterator[Any]:
             n_workers=count,
             threads_per_worker=1,
             memory_limit=memory,
-            dashboard_address=None,
+            dashboard_address=":0",  # any free port: campaigns may run side by side
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,  # type: ignore[no-untyped-call]
