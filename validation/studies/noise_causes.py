@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.error_bars import noise_covariance, softness
 from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.pyramid import Level, prepare
+from modeharvest.idic.pyramid import FULL, prepare
 from modeharvest.idic.result import Result
 from modeharvest.idic.warp import landed
 from modeharvest.validation.studies.subject import Images, Scene
@@ -68,8 +68,7 @@ class Seen:
     def of(cls, scene: Scene, result: Result, images: Images) -> Seen:
         """What a correlation of images of this scene compared at its end."""
         options, grid = scene.how.options(), result.grid
-        full = Level(1, 0.0)
-        pair = prepare(*images, grid, *scene.masks(), full, options.edge_px, options.order)
+        pair = prepare(*images, grid, *scene.masks(), FULL, options.edge_px, options.order)
         used, everything = pair.mask, Assembly(result.ansatz, grid, pair.mask)
         if pair.allowed is not None:
             a = result.unknowns
