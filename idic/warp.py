@@ -73,15 +73,15 @@ def brought_back(
 
     The gradient in [grey levels/mm]. NaN where no pixel counts or g doesn't reach.
     """
-    left = _left(assembly, a, reference, deformed, 3)
-    left[0] = reference - left[0]
-    return np.roll(left, -1, axis=0)
+    found = _left(assembly, a, reference, deformed, 3)
+    np.subtract(reference, found[2], out=found[2])
+    return found
 
 
 def _left(
     assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage, fields: int
 ) -> NDArray[np.float32]:
-    """(fields, rows, cols): the residual, and the slopes."""
+    """(fields, rows, cols): the residual; or the slopes along x and y, and the residual."""
     left = np.full((fields, *assembly.grid.shape), np.nan, dtype=np.float32)
     nothing = np.zeros((0, 0), dtype=np.bool_)
     _run(assembly, a, reference, deformed, nothing, nothing, left)
@@ -125,7 +125,7 @@ def _pass(
                 else:
                     sample_block(target, row, n, block)
                     for k in range(left.shape[0]):
-                        _put(n, own, E[(2 + k) % 3], left[k, row])
+                        _put(n, own, E[k + 3 - left.shape[0]], left[k, row])
 
 
 @compiled(relaxed=True)
