@@ -152,7 +152,8 @@ def _cause_sentence(causes: pd.DataFrame) -> str:
         f"has shrunk (det F) make it {det:.3f} of it; the cost's own curvature, softer by what "
         f"the ansatz leaves over, {curved:.3f}; the gradient of g's noise, seen with what is left "
         f"over, {least:.3f}: the least that least squares can do. What is above it at strong "
-        "noise is of second order: the gradient of the noise against the speckle's."
+        "noise is of second order: the gradient of the noise against the speckle's, most of which "
+        "correlation.gradient_blur_px keeps out."
     )
 
 
