@@ -172,6 +172,15 @@ def test_a_worker_killed_costs_nothing(tmp_path: Path) -> None:
     assert table["error"].eq("").all()
 
 
+def test_a_case_that_kills_every_worker_is_one_line_of_the_table(tmp_path: Path) -> None:
+    campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=[3, 4, 5]), tmp_path)
+    table = campaign.run()
+    assert list(table["x_again"].dropna()) == [3, 5]
+    assert table["error"][1] == (
+        "KilledWorker: its workers died; it may need more memory than they are given"
+    )
+
+
 def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     program = textwrap.dedent(f"""
         import sys
