@@ -228,7 +228,7 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
     worst = part.loc[part["overlap_truth"].idxmin()]
     return [
         f"Graded specimens, d/l from {part['smallest_ratio'].min():.3g} to "
-        f"{part['largest_ratio'].max():.3g} in the strongest: one family with v₁ modulated has "
+        f"{part['largest_ratio'].max():.3g}: one family with v₁ modulated has "
         f"wave vectors within {_percent(off[_WAVES])} and an overlap with the specimen’s own "
         f"pattern of {_between(part['overlap_truth'])}, least where {worst['varied']} by "
         f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); truth − best fit is "

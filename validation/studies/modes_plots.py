@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +66,12 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
             axes.axhline(0.0, color=MUTED, linestyle=":", linewidth=1)
             for n, (name, colour) in enumerate(names.items()):
                 _parameter(axes, done, at + apart * (n - 0.5 * (len(names) - 1)), name, colour)
+            _limit(axes, done, names)
             axes.set_xlabel(label)
             if len(ticks):
                 axes.set_xticks(at, ticks, rotation=40, ha="right", fontsize=7)
         lattice = 100.0 * (done["lattice_a1"] - 1.0)
         aspect.plot(at, lattice, "x", color=INK, markersize=5, label="infinite lattice")
-        _limit(aspect, np.abs([*lattice, *(100.0 * (done["a1"] - 1.0))]), done["a1_sd_leftover"])
         aspect.set_ylabel("a₁ − 1 [%]")
         waves.set_ylabel("wave vectors − ideal [%]")
         phases.set_ylabel("phases [% of l]")
@@ -82,9 +82,11 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
     return drawn
 
 
-def _limit(axes: Axes, values: FloatArray, sd: pd.Series) -> None:
+def _limit(axes: Axes, done: pd.DataFrame, names: Iterable[str]) -> None:
     """Show all values, and error bars as far as they don't hide all else [%]."""
-    end = max(1.2 * float(values.max()), 2.5 * 200.0 * float(sd.median()))
+    off = [done[prefix + name] - _IDEAL[name] for name in names for prefix in ("", "best_")]
+    bars = 2.0 * done[[f"{name}_sd_leftover" for name in names]]
+    end = 100.0 * max(1.2 * float(np.abs(off).max()), 2.5 * float(bars.median().max()))
     axes.set_ylim(-end, end)
 
 
