@@ -41,7 +41,7 @@ def instrument(
 ) -> NDArray[np.float32]:
     """Make what weighs the residual: (3, rows, cols), slopes along x and y, and grey levels.
 
-    In the reference's frame; 0 where no pixel counts or g doesn't reach. The grey levels, for a
+    In the reference's frame, at the pixels that count. The grey levels, for a
     gain among the unknowns, are the mean of both images: so what their noise has in common with
     the residual cancels.
 
@@ -57,15 +57,17 @@ def instrument(
 
     def of(image: NDArray[Any], mask: Any, at: FloatArray) -> NDArray[np.float32]:
         spline = SplineImage.of(smoothed(image, mask, weighting.blur_px), pair.deformed.order)
-        return np.nan_to_num(brought_back(used, at, pair.reference, spline), copy=False)
+        return brought_back(used, at, pair.reference, spline)
 
     made = of(images.g, images.g_mask, a)
     if weighting.gradient is Gradient.DEFORMED and used.ansatz.brightness.gain_degree is None:
         return made
     slope = _SHARE_OF_G[weighting.gradient]
     share = np.array([slope, slope, 0.5], dtype=np.float32)[:, None, None]
+    other = of(images.f, images.f_mask, np.zeros_like(a))
     made *= share
-    made += (1 - share) * of(images.f, images.f_mask, np.zeros_like(a))
+    other *= 1 - share
+    made += other
     return made
 
 

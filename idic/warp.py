@@ -63,7 +63,9 @@ def residual(
     assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
-    return np.asarray(_left(assembly, a, reference, deformed, 1)[0])
+    left = np.full((1, *assembly.grid.shape), np.nan, dtype=np.float32)
+    _fill(left, assembly, a, reference, deformed)
+    return np.asarray(left[0])
 
 
 def brought_back(
@@ -71,21 +73,24 @@ def brought_back(
 ) -> NDArray[np.float32]:
     """(3, rows, cols) (1 + b) times the gradient of g at x + u, along x and y, and (1 + b) g + c.
 
-    The gradient in [grey levels/mm]. NaN where no pixel counts or g doesn't reach.
+    The gradient in [grey levels/mm]; 0, and f, where no pixel counts or g doesn't reach.
     """
-    found = _left(assembly, a, reference, deformed, 3)
+    found = np.zeros((3, *assembly.grid.shape), dtype=np.float32)
+    _fill(found, assembly, a, reference, deformed)
     np.subtract(reference, found[2], out=found[2])
     return found
 
 
-def _left(
-    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage, fields: int
-) -> NDArray[np.float32]:
-    """(fields, rows, cols): the residual; or the slopes along x and y, and the residual."""
-    left = np.full((fields, *assembly.grid.shape), np.nan, dtype=np.float32)
+def _fill(
+    left: NDArray[np.float32],
+    assembly: Assembly,
+    a: FloatArray,
+    reference: NDArray[Any],
+    deformed: SplineImage,
+) -> None:
+    """Fill (1, rows, cols) with the residual, or (3, rows, cols) with slopes and residual."""
     nothing = np.zeros((0, 0), dtype=np.bool_)
     _run(assembly, a, reference, deformed, nothing, nothing, left)
-    return left
 
 
 def _run(

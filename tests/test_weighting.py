@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 
@@ -55,7 +56,7 @@ def test_the_deformed_image_itself_as_the_instrument_changes_nothing() -> None:
     f, g = (image.astype(np.float32) for image in pair())
     spline, used = SplineImage.of(g), Assembly(ANSATZ, GRID, MASK)
     a = ANSATZ.start(0.028)
-    given = np.nan_to_num(brought_back(used, a, f, spline))
+    given = brought_back(used, a, f, spline)
     own, same = used.images(a, f, spline), used.images(a, f, spline, instrument=given)
     # float32 slopes, of which 10^4 are summed.
     np.testing.assert_allclose(same.matrix, own.matrix, rtol=1e-5, atol=1e-7 * own.matrix.max())
@@ -194,6 +195,21 @@ def test_noise_does_not_make_a_gain_too_small() -> None:
     # Errors in the variable g take s^2/V of a gain of 1: 0.01 here, and its sd is 0.002.
     assert abs(with_instrument) < 4.0
     assert least_squares < -10.0
+
+
+@pytest.mark.parametrize("gradient", ["deformed", "mean"])
+def test_weighing_anew_takes_little_memory(gradient: str) -> None:
+    image = gaussian_speckle(10.0, 2)
+    f, g = ((image + 0.05 * noise * image.std()).astype(np.float32)
+            for noise in np.random.default_rng(5).normal(size=(2, *image.shape)))  # fmt: skip
+    grid, everywhere = PixelGrid.centred(*image.shape, PIXEL), np.ones(image.shape, dtype=np.bool_)
+    options = replace(CorrelationOptions(), gradient=gradient)
+    tracemalloc.start()
+    found = correlate(f, g, grid, ANSATZ, ANSATZ.start(0.0), everywhere, everywhere, options)
+    peak = tracemalloc.get_traced_memory()[1] / f.nbytes
+    tracemalloc.stop()
+    assert found.weighting.blur_px > 0.0
+    assert peak < 12.0  # float32 images, the bound of a whole correlation
 
 
 def gaussian_speckle(width_px: float, seed: int) -> FloatArray:
