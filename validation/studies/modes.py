@@ -116,8 +116,8 @@ class Modes:
             ratios=self.ratios[2::3],
             pitches=(),
             materials=(),
-            gradings_x=self.gradings_x[:1],
-            gradings_y=(),
+            gradings_x=(),
+            gradings_y=self.gradings_y[:1],
         )
 
     def prepare(
