@@ -106,6 +106,7 @@ def test_numbers_of_a_robustness_study() -> None:
     assert numbers["elsewhere_but_called_converged"] == 1
     assert found.sentences[0].startswith("97 of 100 starts")
     assert any("1 failed, and count as not arrived" in s for s in found.sentences)
+    assert any("does not see 1 of the 2 ends elsewhere" in s for s in found.sentences)  # 0.5 %
     assert any("2 that end elsewhere, 1 pass for converged" in s for s in found.sentences)
 
 

@@ -46,7 +46,12 @@ def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
         tables["Start of v0"] = strains
     return Findings(
         numbers={**found, "basin": basin.to_dict("records")},
-        sentences=(*_sentences(found), *_basin_sentences(basin), *_strain_sentences(strains)),
+        sentences=(
+            *_sentences(found),
+            *_basin_sentences(basin),
+            *_unseen_sentences(moved),
+            *_strain_sentences(strains),
+        ),
         keys=_keys(found),
         plots=(
             draw_distances(asked, radius, seeds),
@@ -208,6 +213,19 @@ def _basin_sentences(basin: pd.DataFrame) -> tuple[str, ...]:
     return (
         f"{said} The fewest do at {lowest['off by up to [%]']:g} %: "
         f"{lowest['same minimum']:.0f} of {lowest['starts']:.0f}.",
+    )
+
+
+def _unseen_sentences(moved: pd.DataFrame) -> tuple[str, ...]:
+    """How many ends elsewhere the paper's error does not see."""
+    others = moved[~moved["same"] & moved["distance_px"].notna()]
+    unseen = others[others["epsilon_percent"] <= OUTLIER_PERCENT]["distance_px"]
+    if not len(unseen):
+        return ()
+    return (
+        f"The paper's ε does not see {len(unseen)} of the {len(others)} ends elsewhere: it is "
+        f"below {OUTLIER_PERCENT} % there, with displacements {short(float(unseen.min()))} to "
+        f"{short(float(unseen.max()))} px rms off.",
     )
 
 
