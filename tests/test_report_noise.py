@@ -59,6 +59,7 @@ def test_chi_squared_is_noise_and_what_noise_free_images_leave(
     assert snapshot["chi_square"] == pytest.approx(1 + clean.residual_rms**2 / noise, rel=0.04)
     assert snapshot["chi_square"] > 1.1  # w is seen
     assert "chi squared is" in snapshot["residual_verdict"]
+    assert "The residual was weighed with" in snapshot["weighting"]
 
 
 def test_gain_and_offset_are_told_where_they_were_unknown(exposed: Run) -> None:
@@ -70,6 +71,7 @@ def test_gain_and_offset_are_told_where_they_were_unknown(exposed: Run) -> None:
     assert "gain between the images" in page
     assert "χ² of the residual" in page
     assert "single exposures of the virtual camera" in page
+    assert "the residual was weighed with" in page
 
 
 def summary(**snapshot: Any) -> dict[str, Any]:

@@ -22,9 +22,9 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``noise_sd`` (of the images that were correlated, rms over the material and both images
     [fraction of full scale]; null for the noise-free ones), ``chi_square`` (the residual against
     that noise, or null), ``gain_min``, ``gain_max``, ``offset_min``, ``offset_max`` (over the
-    material, where they were unknowns), ``residual_verdict``, ``identifiability_warnings``,
-    ``pixels``, ``details_px`` (more statistics of w, best-fit error and IDIC - best fit),
-    ``pattern_reading`` (the spectral densities, in words).
+    material, where they were unknowns), ``residual_verdict`` and ``weighting``
+    (sentences), ``identifiability_warnings``, ``pixels``, ``details_px`` (more statistics of w,
+    best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
 ``expected``
     Rows of expected and obtained values.
 ``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
@@ -211,6 +211,7 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "chi_square": None if noise_sd is None else agreement.chi_square,
         "identifiability_warnings": list(seen.warnings),
         "residual_verdict": agreement.sentence,
+        "weighting": result.weighting.sentence,
         "iterations": result.iterations,
         "iterations_all_levels": len(result.history),
         "outcome": result.outcome.name.lower(),

@@ -181,6 +181,9 @@ def _about(snapshot: Snapshot) -> list[str]:
     if "residual_verdict" in snapshot:
         verdict = snapshot["residual_verdict"]
         said.append(f"{at} {verdict[0].lower()}{verdict[1:]}")
+    if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice that noise asks for
+        weighting = snapshot["weighting"]
+        said.append(f"{at} {weighting[0].lower()}{weighting[1:]}")
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
         describes = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -30,6 +31,8 @@ _UNREADABLE = (
     BadZipFile,
 )
 """What numpy, h5py and scipy raise for a file that isn't what its name says."""
+_HEAD = 1000
+"""Lines of a text among which the first line of numbers is looked for."""
 _LOGICAL = {"true": 1.0, "false": 0.0}
 
 
@@ -70,9 +73,7 @@ def read_table(path: Path | str) -> Table:
 
 def _read_text(path: Path) -> Table:
     """Read columns under a line of names; lines before it are skipped, '#' may precede it."""
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    numbered = [(k + 1, line.strip().lstrip("#%").strip()) for k, line in enumerate(lines)]
-    numbered = [(k, line) for k, line in numbered if line]
+    numbered = _numbered(path)
     first = next((i for i, (_, line) in enumerate(numbered) if _looks_numeric(line)), None)
     if first is None:
         raise InputError(f"{path}: expected lines of numbers, found none")
@@ -80,17 +81,43 @@ def _read_text(path: Path) -> Table:
     names = _split(numbered[first - 1][1], separator) if first else []
     while names and not names[-1]:
         names.pop()  # of a separator at the end of the line
-    rows = [(k, _split(line, separator)) for k, line in numbered[first:]]
-    width = len(rows[0][1])
-    if len(names) != width - (not rows[0][1][-1]) and len(names) != width:
-        names = [str(k + 1) for k in range(width)]  # to be called by their number
-    for k, row in rows:
-        if len(row) - len(names) not in (0, 1) or any(row[len(names) :]):
-            raise InputError(f"{path}, line {k}: expected {len(names)} values, got {len(row)}")
-    values = np.array(
-        [[_number(v, decimal, path, k) for v in row[: len(names)]] for k, row in rows]
-    )
+    row = _split(numbered[first][1], separator)
+    if len(names) != len(row) - (not row[-1]) and len(names) != len(row):
+        names = [str(k + 1) for k in range(len(row))]  # to be called by their number
+    values = _numbers_at_once(path, numbered[first][0], separator)
+    if values is None or values.shape[1] != len(names):
+        values = _numbers_by_line(path, numbered[first][0], separator, decimal, len(names))
     return {name: values[:, k] for k, name in enumerate(names)}
+
+
+def _numbered(path: Path, begin: int = 1, end: int | None = _HEAD) -> list[tuple[int, str]]:
+    """Numbers and content of the lines that hold something, from one to another."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        lines = islice(enumerate(file, start=1), begin - 1, end)
+        stripped = ((k, line.strip().lstrip("#%").strip()) for k, line in lines)
+        return [(k, line) for k, line in stripped if line]
+
+
+def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArray | None:
+    """(n, m) of a table of nothing but numbers, fast; None if there is anything else."""
+    try:
+        return np.loadtxt(
+            path, delimiter=separator, comments=None, skiprows=begin - 1, ndmin=2,
+            encoding="utf-8-sig",
+        )  # fmt: skip
+    except ValueError:  # words, gaps, decimal commas, or lines of different lengths
+        return None
+
+
+def _numbers_by_line(
+    path: Path, begin: int, separator: str | None, decimal: str, width: int
+) -> FloatArray:
+    """(n, width) line by line, to say in which of them something else stands."""
+    rows = [(k, _split(line, separator)) for k, line in _numbered(path, begin, None)]
+    for k, row in rows:
+        if len(row) - width not in (0, 1) or any(row[width:]):
+            raise InputError(f"{path}, line {k}: expected {width} values, got {len(row)}")
+    return np.array([[_number(v, decimal, path, k) for v in row[:width]] for k, row in rows])
 
 
 def _looks_numeric(line: str) -> bool:

@@ -15,8 +15,8 @@ images are in px, positions and fields in mm. rms is per component.
     line) [-, compression positive], ``has_pattern``, ``outcome``, ``outcome_why``,
     ``iterations`` (on the full image), ``iterations_all_levels``, ``pixels``,
     ``residual_rms`` [grey levels], ``residual_of_full_scale``, ``residual_correlation``,
-    ``chi_square``, ``agreement`` (a sentence), ``leftover_px`` (of what the ansatz can't
-    describe, estimated from the images), ``condition_number``, ``undetermined``,
+    ``chi_square``, ``agreement`` and ``weighting`` (sentences), ``leftover_px`` (of what the
+    ansatz can't describe, estimated from the images), ``condition_number``, ``undetermined``,
     ``errors_px`` (``noise`` and ``leftover``: rms standard deviation of ``v0``, ``fluctuation``
     and ``displacement`` over the part with holes), ``local`` (``source``, ``points``, ``lost``,
     ``w_rms_px``, ``sd_px``, ``w_beyond_noise_px``), ``modes``, ``pattern_reading`` and
@@ -120,6 +120,7 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "residual_correlation": frame.agreement.correlation,
         "chi_square": frame.agreement.chi_square,
         "agreement": frame.agreement.sentence,
+        "weighting": result.weighting.sentence,
         "leftover_px": seen.leftover_px,
         "condition_number": seen.condition_number,
         "undetermined": seen.undetermined,

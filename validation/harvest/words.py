@@ -225,7 +225,7 @@ def notes(summary: Summary) -> list[str]:
             ended = f"the correlation ended as “{frame['outcome']}”: {frame['outcome_why']}"
             said.append(f"{at} {ended}")
         said += [f"{at} {_sentence(warning)}" for warning in frame["warnings"]]
-        said.append(f"{at} {frame['agreement']}")
+        said += [f"{at} {frame['agreement']}", f"{at} {_sentence(frame['weighting'])}"]
     noise = summary["noise"]
     share = "" if noise["of_full_scale"] is None else (
         f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip

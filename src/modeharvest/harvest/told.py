@@ -16,7 +16,7 @@ from modeharvest.harvest.measure import Measured
 from modeharvest.harvest.optics import Optics
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import Prepared
-from modeharvest.idic.agreement import Agreement, autocorrelation
+from modeharvest.idic.agreement import Agreement, autocorrelation, lags_for
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.error_bars import (
     FieldErrors,
@@ -32,6 +32,7 @@ from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.pyramid import eroded
+from modeharvest.idic.speckle_width import speckle_width
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.harvest.run import Harvest, HarvestedFrame, HarvestTruth, PartSpectrum
 from modeharvest.validation.harvest.timeline import Moment, find_buckling, mean_strain
@@ -234,9 +235,10 @@ def _agreement(
     offset = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
     residual = np.where(used, reference - np.float32(gain) * back - np.float32(offset), np.nan)
     rms = float(np.sqrt(np.nanmean(np.square(residual, dtype=np.float64))))
+    lags = lags_for(speckle_width(reference, used))
     return Agreement.of(
-        rms, autocorrelation(residual), int(used.sum()), result.ansatz.size, prepared.noise.sd,
-        order=order,
+        rms, autocorrelation(residual, lags), int(used.sum()), result.ansatz.size,
+        prepared.noise.sd, order=order, lags_px=lags,
     )  # fmt: skip
 
 
