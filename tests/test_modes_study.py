@@ -111,7 +111,7 @@ def subject() -> Subject:
     case = StudyCase()
     assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
-    return Subject(case.experiment, imaging, case.correlation, Solution.read(PAPER))
+    return Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 
 
 def scaled(solution: Solution, factor: float) -> Solution:

@@ -55,7 +55,7 @@ def subject() -> Subject:
     case = StudyCase()
     assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
-    return Subject(case.experiment, imaging, case.correlation, Solution.read(PAPER))
+    return Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 
 
 @pytest.fixture(scope="module")
@@ -204,10 +204,10 @@ def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
     """And softer with one, if only a little where w is short against a speckle."""
     scene = Scene.open(folder, subject.describe(folder, 0.128))
     result = scene.correlate()
-    seen = noise_causes.Seen.of(scene, result, scene.pair())
+    seen = noise_causes.compared(scene, result, scene.pair())
     # Chosen at the end itself, not a step before it.
     assert seen.used.sum() == pytest.approx(result.pixels, rel=0.01)
-    explained = seen.explained(result)
+    explained = noise_causes.explained(seen, result)
     left = result.residual(explained.reference, explained.deformed)[seen.used]
     assert np.abs(left).max() < 1e-6  # float32
     stiff, soft = (np.sqrt(np.diag(s.softness(result))) for s in (explained, seen))

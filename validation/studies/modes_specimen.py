@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.error_bars import leftover_covariance
+from modeharvest.idic.compared import Compared
 from modeharvest.idic.families.equivalents import mode_equivalent
-from modeharvest.idic.pyramid import eroded
 from modeharvest.idic.result import Result
 from modeharvest.validation.metrics import describe
 from modeharvest.validation.studies.modes_buckling import simulate_pattern
@@ -62,7 +61,9 @@ def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     row = _told(described, solution) | _told_of_lattice(lattice)
     if row["first"] == "none":
         return row
-    subject = Subject(described.experiment, described.imaging, described.correlation, solution)
+    subject = Subject(
+        described.experiment, described.imaging, described.correlation, lambda: solution
+    )
     scene = Scene.open(own, subject.describe(own, row["strain"]))
     try:
         return row | _measured(scene, lattice, own)
@@ -191,10 +192,9 @@ def _sd(result: Result, covariance: FloatArray, pitch: float) -> FloatArray:
 
 def _leftover_sd(scene: Scene, result: Result) -> FloatArray:
     """The same by what the ansatz leaves over, cell by cell."""
-    used = eroded(scene.mask(), scene.how.edge_px)
-    pitch = scene.specimen.pitch
-    covariance = leftover_covariance(result, *scene.pair(), used, pitch, scene.how.order)
-    return _sd(result, covariance, pitch)
+    pitch, how = scene.specimen.pitch, scene.how.options()
+    seen = Compared.of(result, scene.pair(), scene.masks(), how.edge_px, how.order)
+    return _sd(result, seen.leftover_covariance(result, pitch), pitch)
 
 
 def _units(pitch: float) -> FloatArray:

@@ -19,7 +19,7 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies import noise_findings as told
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.noise_causes import LADDER, Seen, covariances
+from modeharvest.validation.studies.noise_causes import LADDER, compared, covariances
 from modeharvest.validation.studies.noise_fields import PARTS, Points
 from modeharvest.validation.studies.study import Findings, require_different
 from modeharvest.validation.studies.subject import Images, Scene, Subject
@@ -164,7 +164,7 @@ def _without_noise(scene: Scene, result: Result, seed: int) -> dict[str, Any]:
 
 def _give(scene: Scene, result: Result, images: Images) -> float:
     """Rms over the points of u's standard deviation by the covariance H⁻¹ [mm]."""
-    soft = Seen.of(scene, result, images).softness(result)
+    soft = compared(scene, result, images).softness(result)
     return float(np.sqrt((_told_fields(scene, result, soft)[:, PARTS["u"]] ** 2).mean()))
 
 

@@ -20,16 +20,14 @@ gradient of g's own noise is no longer small against the speckle's.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.idic.error_bars import noise_covariance, softness
-from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.pyramid import FULL, prepare
+from modeharvest.idic.compared import Compared
+from modeharvest.idic.error_bars import noise_covariance
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import landed
 from modeharvest.validation.studies.subject import Images, Scene
 
 FloatArray = NDArray[np.float64]
@@ -45,72 +43,17 @@ _WEAK = 0.01
 """Noise of the examples [fraction of full scale]; only its linear effect is taken."""
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a result was found with.
+def compared(scene: Scene, result: Result, images: Images) -> Compared:
+    """What a correlation of images of this scene compared at its end."""
+    options = scene.how.options()
+    return Compared.of(result, images, scene.masks(), options.edge_px, options.order)
 
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) f, and g continued into its holes [grey levels].
-    used
-        (rows, cols) True on the pixels that count.
-    order
-        Of the spline.
-    """
 
-    reference: NDArray[np.float32]
-    deformed: NDArray[np.float32]
-    used: NDArray[np.bool_]
-    order: int
-
-    @classmethod
-    def of(cls, scene: Scene, result: Result, images: Images) -> Seen:
-        """What a correlation of images of this scene compared at its end."""
-        options, grid = scene.how.options(), result.grid
-        pair = prepare(*images, grid, *scene.masks(), FULL, options.edge_px, options.order)
-        used, everything = pair.mask, Assembly(result.ansatz, grid, pair.mask)
-        if pair.allowed is not None:
-            a = result.unknowns
-            used = landed(everything, a, pair.reference, pair.deformed, pair.allowed)
-        row, col = np.indices(grid.shape, dtype=np.float64)
-        deformed = pair.deformed.sample(row, col)[0].astype(np.float32)
-        return cls(pair.reference, deformed, used, options.order)
-
-    def explained(self, result: Result) -> Seen:
-        """The same without a residual: f is what g says that it is."""
-        left = result.residual(self.reference, self.deformed, self.order)
-        f = np.where(self.used, self.reference - left, self.reference).astype(np.float32)
-        return replace(self, reference=f)
-
-    def softness(self, result: Result) -> FloatArray:
-        """(n, n) H⁻¹."""
-        return softness(result, self.reference, self.deformed, self.used, self.order)
-
-    def by_noise_of_g(self, result: Result, cell: float, seed: int) -> FloatArray:
-        """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone.
-
-        Parameters
-        ----------
-        result
-            Of these images.
-        cell
-            Edge of the blocks that are pushed independently [mm].
-        seed
-            Of the examples.
-        """
-        found = noise_covariance(
-            result, self.reference, self.deformed, self._noises(seed), self.used, cell,
-            self.order, result.inverse,
-        )  # fmt: skip
-        return np.asarray(found / _WEAK**2, dtype=np.float64)
-
-    def _noises(self, seed: int) -> Iterator[Images]:
-        rng = np.random.default_rng([seed, EXAMPLES])
-        none = np.zeros_like(self.reference)
-        for _ in range(EXAMPLES):
-            noise = rng.standard_normal(none.shape, dtype=np.float32)
-            yield none, np.float32(_WEAK) * noise
+def explained(seen: Compared, result: Result) -> Compared:
+    """The same without a residual: f is what g says that it is."""
+    left = result.residual(seen.reference, seen.deformed, seen.order)
+    f = np.where(seen.used, seen.reference - left, seen.reference).astype(np.float32)
+    return replace(seen, reference=f)
 
 
 def covariances(scene: Scene, result: Result, seed: int) -> dict[str, FloatArray]:
@@ -129,15 +72,15 @@ def covariances(scene: Scene, result: Result, seed: int) -> dict[str, FloatArray
         For each of ``CAUSES`` and ``SOFTENED``; infinite on the diagonal where the images say
         nothing.
     """
-    seen, cell = Seen.of(scene, result, scene.pair()), scene.specimen.pitch
+    seen, cell = compared(scene, result, scene.pair()), scene.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
     at = np.ix_(~lost, ~lost)
     inverse, soft = result.inverse[at], seen.softness(result)[at]
     M = np.linalg.inv(inverse)
     # Noise in f pushes by s²M, noise in g by what its examples do.
     V0, V = (
-        M + M @ images.by_noise_of_g(result, cell, seed)[at] @ M
-        for images in (seen.explained(result), seen)
+        M + M @ _by_noise_of_g(images, result, cell, seed)[at] @ M
+        for images in (explained(seen, result), seen)
     )
     known = {
         "bound": 2.0 * inverse,
@@ -151,3 +94,20 @@ def covariances(scene: Scene, result: Result, seed: int) -> dict[str, FloatArray
         found[name] = np.diag(np.where(lost, np.inf, 0.0))
         found[name][at] = covariance
     return found
+
+
+def _by_noise_of_g(seen: Compared, result: Result, cell: float, seed: int) -> FloatArray:
+    """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone, pushing every cell independently."""
+    found = noise_covariance(
+        result, seen.reference, seen.deformed, _noises(seen.reference, seed), seen.used, cell,
+        seen.order, result.inverse,
+    )  # fmt: skip
+    return np.asarray(found / _WEAK**2, dtype=np.float64)
+
+
+def _noises(like: NDArray[np.float32], seed: int) -> Iterator[Images]:
+    rng = np.random.default_rng([seed, EXAMPLES])
+    none = np.zeros_like(like)
+    for _ in range(EXAMPLES):
+        noise = rng.standard_normal(none.shape, dtype=np.float32)
+        yield none, np.float32(_WEAK) * noise

@@ -10,8 +10,9 @@ In a study's folder::
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +54,20 @@ class Subject:
         How it is imaged.
     correlation
         How it is correlated.
-    solution
-        The exact displacements.
+    load
+        Gives the exact displacements; called when they are first needed, because simulating them
+        takes long and not every study asks for them.
     """
 
     experiment: Experiment
     imaging: ImagingSpec
     correlation: Identification
-    solution: Solution
+    load: Callable[[], Solution]
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The exact displacements."""
+        return self.load()
 
     def describe(
         self,

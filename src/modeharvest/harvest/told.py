@@ -18,13 +18,12 @@ from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.agreement import Agreement, autocorrelation, lags_for
 from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.compared import Compared
 from modeharvest.idic.error_bars import (
     FieldErrors,
     field_errors,
-    leftover_covariance,
     noise_covariance,
     softened,
-    softness,
 )
 from modeharvest.idic.families.pattern import read_pattern
 from modeharvest.idic.fields.measured_spectrum import measured_spectrum
@@ -181,14 +180,16 @@ def covariances(
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
     if blur > 0.0:
         images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
-    used = eroded(pair.mask, _EDGE_PX)
-    soft = softness(result, *images, used, order)
+    seen = Compared.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX, order)
+    soft = seen.softness(result)
     by_noise = softened(result, noise_sd, soft)
     try:
-        by_leftover = leftover_covariance(result, *images, used, cell, order, soft)
+        by_leftover = seen.leftover_covariance(result, cell, soft)
         if blur > 0.0:
-            examples = _noises(pair, blur, noise_sd)
-            by_noise = noise_covariance(result, *images, examples, used, cell, order, soft)
+            by_noise = noise_covariance(
+                result, seen.reference, seen.deformed, _noises(pair, blur, noise_sd), seen.used,
+                cell, order, soft,
+            )  # fmt: skip
     except InputError as error:
         return by_noise, None, (f"No error bars for what the ansatz leaves over: {error}.",)
     return by_noise, by_leftover, ()

@@ -62,14 +62,17 @@ class StudyPipeline:
     command: str = "modeharvest study STUDY --out DIR"
 
     def subject(self) -> Subject:
-        """What is measured: simulated, or read from a file; leaves ``solution.h5``."""
-        case, path = self.case, self.folder / "solution.h5"
+        """What is measured."""
+        case = self.case
+        return Subject(case.experiment, case.imaging, case.correlation, self._solution)
+
+    def _solution(self) -> Solution:
+        """The exact displacements, simulated or read from a file; leaves ``solution.h5``."""
         if self.solution is None:
-            solution = Run(case, self.folder, self.progress).fem()
-        else:
-            solution = Solution.read(self.solution)
-            solution.write(path)
-        return Subject(case.experiment, case.imaging, case.correlation, solution)
+            return Run(self.case, self.folder, self.progress).fem()
+        solution = Solution.read(self.solution)
+        solution.write(self.folder / "solution.h5")
+        return solution
 
     def all(self) -> dict[str, Any]:
         """Run what is missing of the study; returns the content of ``summary.json``.
@@ -85,10 +88,8 @@ class StudyPipeline:
         _claim(folder, self.case.kind)
         self.workers.get_ready(study.function, folder)
         clock = _Clock()
-        subject = self.subject()
-        clock.lap("solution")
-        cases = study.prepare(subject, folder, self.progress)
-        clock.lap("images")
+        cases = study.prepare(self.subject(), folder, self.progress)
+        clock.lap("solution and images")
         campaign = Campaign(study.function, cases, folder)
         table = campaign.run(self.workers, named(self.progress, f"study: {len(cases)} cases"))
         clock.lap("cases")
