@@ -25,10 +25,10 @@ from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wa
 from modeharvest.validation.lattice.mode_table import ModeRow
 from modeharvest.validation.studies import modes_specimen
 from modeharvest.validation.studies.modes import Modes
-from modeharvest.validation.studies.modes_buckling import CLOSE, PatternCells, simulate_pattern
 from modeharvest.validation.studies.modes_description import Description
 from modeharvest.validation.studies.modes_findings import findings
 from modeharvest.validation.studies.modes_lattice import LatticeMode
+from modeharvest.validation.studies.modes_pattern import PatternCells, buckle
 from modeharvest.validation.studies.modes_specimen import likeness, one_specimen
 from modeharvest.validation.studies.subject import Subject
 
@@ -144,7 +144,7 @@ def measured(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> tupl
         ratios=(0.6,), pitches=(3.8,), materials=(), gradings_x=(), gradings_y=(), divisions=8
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(modes_specimen, "simulate_pattern", simulated)
+        patch.setattr(modes_specimen, "buckle", simulated)
         patch.setattr(
             LatticeMode, "of", lambda specimen, material, divisions: lattice_mode(specimen.pitch)
         )
@@ -228,11 +228,12 @@ def test_a_specimen_is_compressed_to_the_pattern_asked_for() -> None:
     """Its critical strain is that of another walk; the pattern is as large as asked."""
     from mpi4py import MPI
 
+    from modeharvest.fem.pattern_branch import CLOSE
     from modeharvest.fem.simulate import simulate
 
     specimen = Specimen(2, 2, diameter=1.6, bulk_x=0.9, bulk_y=0.9)
     experiment = Experiment(specimen, mesh_size=0.4, branches=("primary",))
-    found = simulate_pattern(experiment, 0.1, 0.28)
+    found = buckle(experiment, 0.1, 0.28)
     beyond = found.info["critical"]["strain"] + 0.002
     walked = simulate(replace(experiment, strains=(0.02, beyond)), comm=MPI.COMM_SELF)
     assert found.info["outcome"] == "complete"

@@ -23,9 +23,9 @@ from modeharvest.idic.compared import Compared
 from modeharvest.idic.families.equivalents import mode_equivalent
 from modeharvest.idic.result import Result
 from modeharvest.validation.metrics import describe
-from modeharvest.validation.studies.modes_buckling import simulate_pattern
 from modeharvest.validation.studies.modes_description import Description, folder_of
 from modeharvest.validation.studies.modes_lattice import LatticeMode
+from modeharvest.validation.studies.modes_pattern import buckle
 from modeharvest.validation.studies.subject import Scene, Subject
 from modeharvest.validation.truth import Comparison, compare
 
@@ -77,7 +77,7 @@ def _solution(described: Description, folder: Path) -> Solution:
     if not path.is_file():
         if described.given:
             raise InputError(f"expected the base's solution at {path}, found none; run it again")
-        simulate_pattern(described.experiment, described.amplitude, described.largest).write(path)
+        buckle(described.experiment, described.amplitude, described.largest).write(path)
     return Solution.read(path)
 
 

@@ -1,4 +1,4 @@
-"""A specimen compressed until its pattern is as strong as wanted (needs dolfinx).
+"""A specimen compressed until its pattern is as strong as wanted.
 
 :func:`modeharvest.fem.simulate.simulate` is told its strains beforehand, and walks the unstable
 primary path up to them as well: that costs most where ligaments are thin.
@@ -6,49 +6,55 @@ primary path up to them as well: that costs most where ligaments are thin.
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from modeharvest import __version__
-from modeharvest.errors import MissingDependencyError
+from modeharvest.fem.continuation import State, Walker, hermite_weights
+from modeharvest.fem.corrector import Constraint
+from modeharvest.fem.critical import Critical, locate_critical
+from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.families.quadrature import Quadrature
-
-if TYPE_CHECKING:  # these need dolfinx
-    from modeharvest.fem.continuation import State, Walker
-    from modeharvest.fem.critical import Critical
-    from modeharvest.fem.stability import Mode
+from modeharvest.fem.stability import Mode
 
 FloatArray = NDArray[np.float64]
 
-NO_DOLFINX = (
-    "simulating specimens needs dolfinx >= 0.9, which is not on PyPI; with conda-forge: 'conda "
-    "install fenics-dolfinx=0.11 petsc=*=real* python-gmsh', or use 'scripts/env' of the repository"
-)
 CLOSE = 0.02
 """How near to the wanted amplitude is near enough [-]."""
 _FIRST, _SHORTEST = 0.25, 0.01  # steps along the branch, in shares of the wanted amplitude
 _WALKS = 3  # with shorter and shorter steps
-_QUADRATURE = 4
-"""Points per direction: the pattern's waves are long against the elements."""
 
 
-def simulate_pattern(experiment: Experiment, wanted: float, largest: float) -> Solution:
+class Pattern(Protocol):
+    """What is looked for in nodal displacements (n, 2) [mm]."""
+
+    def share(self, displacement: FloatArray) -> float:
+        """How much of a field is the pattern, between -1 and 1; its sign is the pattern's."""
+
+    def amplitude(self, displacement: FloatArray) -> float:
+        """The pattern's amplitude [mm]."""
+
+
+def simulate_pattern(
+    experiment: Experiment, mesh: Mesh, pattern: Pattern, wanted: float, largest: float
+) -> Solution:
     """Compress a perfect specimen until it buckles, and follow it until its pattern is so strong.
 
     Parameters
     ----------
     experiment
-        Specimen, material, mesh, edges and path options; strains and branches are not used.
+        Specimen, material, edges and path options; strains and branches are not used.
+    mesh
+        Of the specimen.
+    pattern
+        What is to become so strong.
     wanted
-        The pattern's amplitude to be reached, see :func:`pattern_amplitude` [mm].
+        The pattern's amplitude to be reached [mm].
     largest
         Nominal strain up to which to look for the first critical point [-].
 
@@ -57,34 +63,19 @@ def simulate_pattern(experiment: Experiment, wanted: float, largest: float) -> S
     Solution
         With one snapshot, on the branch that leaves the primary path at its first critical point.
         Without such a point it is the last stable state, and ``info["critical"]`` is None; else
-        that has the ``strain`` and ``pattern_overlap_by_cell``, see :func:`pattern_share`.
-        ``info["outcome"]`` says in words what happened.
-
-    Raises
-    ------
-    MissingDependencyError
-        If dolfinx is not there.
+        that has the ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's
+        share. ``info["outcome"]`` says in words what happened.
     """
-    try:
-        from mpi4py import MPI
-
-        from modeharvest.fem.continuation import Walker
-        from modeharvest.fem.equilibrium import Loading, Structure
-        from modeharvest.fem.meshing import mesh_specimen
-    except ImportError as error:
-        raise MissingDependencyError(NO_DOLFINX) from error
     spec = experiment.specimen
-    mesh = mesh_specimen(spec, experiment.mesh_size)
     loading = Loading(spec.half_size[0], spec.length, experiment.edges)
     walker = Walker(Structure(mesh, experiment.material, loading, MPI.COMM_SELF), experiment.path)
     state, critical, outcome = _until_critical(walker, largest)
     info = None
     if critical is not None:
-        cells = PatternCells(mesh, spec)
-        share = cells.share(walker.structure.nodal(critical.modes[0].vector))
+        share = pattern.share(walker.structure.nodal(critical.modes[0].vector))
         info = {"strain": critical.strain, "pattern_overlap_by_cell": abs(share)}
         oriented = critical.modes[0] if share > 0 else critical.modes[0].reversed()
-        state, reached = _follow(walker, state, critical, oriented, cells, wanted)
+        state, reached = _follow(walker, state, critical, oriented, pattern, wanted)
         if abs(reached / wanted - 1.0) > CLOSE:
             outcome = (
                 f"the branch could be followed to a pattern of {reached / spec.pitch:.3f} l only, "
@@ -93,61 +84,12 @@ def simulate_pattern(experiment: Experiment, wanted: float, largest: float) -> S
     return _solution(walker, mesh, experiment, state, {"critical": info, "outcome": outcome})
 
 
-class PatternCells:
-    """Projections of a displacement on the square pattern, unit cell by unit cell.
-
-    Parameters
-    ----------
-    mesh
-        Of the displacement.
-    specimen
-        Whose pattern, :meth:`modeharvest.fem.specimen.Specimen.pattern`.
-    """
-
-    def __init__(self, mesh: Mesh, specimen: Specimen) -> None:
-        self._rule = rule = Quadrature(mesh, _QUADRATURE)
-        half = np.array(specimen.cellular_half_size)
-        self._shape = specimen.holes_x, specimen.holes_y
-        place = np.floor((rule.positions + half) / specimen.pitch).astype(np.int64)
-        self._inside = np.all((place >= 0) & (place < self._shape), axis=1)
-        self._cell = np.ravel_multi_index(tuple(place[self._inside].T), self._shape)
-        self._pattern = specimen.pattern(rule.positions)
-        self._own = self._products(self._pattern)
-
-    def _products(self, values: FloatArray) -> FloatArray:
-        """(holes_x, holes_y) integral of values (q, 2) times the pattern over each cell."""
-        density = self._rule.weights * (values * self._pattern).sum(axis=1)
-        cells = np.bincount(self._cell, density[self._inside])
-        return np.asarray(cells.reshape(self._shape), np.float64)
-
-    def share(self, displacement: FloatArray) -> float:
-        """How much of a nodal field (n, 2) is the pattern, whatever its amplitude in each cell.
-
-        The root of the share of ∫ |u|² that lies in the span of the pattern's restrictions to
-        single cells, between 0 and 1, with the sign of the overlap with the whole pattern.
-        """
-        u = self._rule.values(displacement)
-        mixed = self._products(u)
-        share = math.sqrt(np.sum(mixed**2 / self._own) / self._rule.product(u, u))
-        return math.copysign(share, mixed.sum())
-
-    def amplitude(self, displacement: FloatArray) -> float:
-        """The pattern's amplitude in a nodal displacement (n, 2), where it is largest [mm].
-
-        In each 2 x 2 cells the projection on the pattern: what has the lattice's own period, and
-        what is linear, has none there.
-        """
-        cells = self._products(self._rule.values(displacement)) / self._own
-        blocks = sliding_window_view(cells, tuple(min(2, n) for n in self._shape))
-        return float(np.abs(blocks.mean(axis=(2, 3))).max())
-
-
 def _follow(
     walker: Walker,
     stable: State,
     critical: Critical,
     mode: Mode,
-    cells: PatternCells,
+    pattern: Pattern,
     wanted: float,
 ) -> tuple[State, float]:
     """Along the branch, step by step of the mode's amplitude, to a pattern of a wanted amplitude.
@@ -155,8 +97,6 @@ def _follow(
     The mode's amplitude is prescribed and the strain is free, so that a branch may turn back.
     Returns the last state, ``stable`` if there is none, and the pattern's amplitude there [mm].
     """
-    from modeharvest.fem.corrector import Constraint
-
     structure = walker.structure
     largest = structure.largest(mode.vector)  # amplitudes are largest displacements
     weights = largest * mode.weighted
@@ -174,7 +114,7 @@ def _follow(
         points.append(
             _Point(amplitude, found.strain, strain_rate, found.u, strain_rate * found.tangent)
         )
-        state, reached = found, cells.amplitude(structure.nodal(found.u))
+        state, reached = found, pattern.amplitude(structure.nodal(found.u))
         if abs(reached / wanted - 1.0) < CLOSE:
             break
         step = amplitude * float(np.clip(wanted / reached - 1.0, -0.5, 1.0))
@@ -193,8 +133,6 @@ class _Point(NamedTuple):
 
 def _predicted(points: list[_Point], amplitude: float) -> tuple[float, Any]:
     """Strain and displacement at an amplitude, from the last two points and their rates."""
-    from modeharvest.fem.continuation import hermite_weights
-
     b = points[-1]
     if len(points) == 1:
         step = amplitude - b.amplitude
@@ -211,8 +149,6 @@ def _until_critical(walker: Walker, largest: float) -> tuple[State, Critical | N
     Where no bifurcation is found between the last two states, steps were too long to stay on the
     path: it is walked again from the stable one with shorter steps.
     """
-    from modeharvest.fem.critical import locate_critical
-
     path = [walker.start()]
     for _ in range(_WALKS):
         reached = walker.primary(path, (largest,), until_unstable=True)
