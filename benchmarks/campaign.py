@@ -81,7 +81,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
     from modeharvest.case import shipped_solution  # here: workers import this file, too
     from modeharvest.fem.field import Solution
     from modeharvest.studies.case import StudyCase
-    from modeharvest.validation.studies.robustness import Robustness
+    from modeharvest.validation.studies.robustness.study import Robustness
     from modeharvest.validation.studies.subject import Subject
 
     path, case = shipped_solution("paper-virtual"), StudyCase()

@@ -28,7 +28,7 @@ from modeharvest.idic.correlate import CorrelationOptions, correlate
 from modeharvest.idic.pyramid import FULL
 from modeharvest.idic.result import Result
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
-from modeharvest.validation.studies.noise_statistics import Pairs, Share
+from modeharvest.validation.studies.noise.statistics import Pairs, Share
 
 FloatArray = NDArray[np.float64]
 

@@ -23,13 +23,13 @@ from modeharvest.idic.fourier import square_family
 from modeharvest.studies.case import StudyCase, read_study
 from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wave_sum
 from modeharvest.validation.lattice.mode_table import ModeRow
-from modeharvest.validation.studies import modes_specimen
-from modeharvest.validation.studies.modes import Modes
-from modeharvest.validation.studies.modes_description import Description
-from modeharvest.validation.studies.modes_findings import findings
-from modeharvest.validation.studies.modes_lattice import LatticeMode
-from modeharvest.validation.studies.modes_pattern import PatternCells, buckle
-from modeharvest.validation.studies.modes_specimen import likeness, one_specimen
+from modeharvest.validation.studies.modes import specimen as modes_specimen
+from modeharvest.validation.studies.modes.description import Description
+from modeharvest.validation.studies.modes.findings import findings
+from modeharvest.validation.studies.modes.lattice import LatticeMode
+from modeharvest.validation.studies.modes.pattern import PatternCells, buckle
+from modeharvest.validation.studies.modes.specimen import likeness, one_specimen
+from modeharvest.validation.studies.modes.study import Modes
 from modeharvest.validation.studies.subject import Subject
 
 FloatArray = NDArray[np.float64]

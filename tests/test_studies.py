@@ -26,14 +26,14 @@ from modeharvest.studies.case import StudyCase, read_study, shipped_studies
 from modeharvest.studies.pipeline import StudyPipeline
 from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.case_run import run_case
-from modeharvest.validation.studies import noise_causes
-from modeharvest.validation.studies import robustness_findings as told
-from modeharvest.validation.studies.factors import FACTORS, Setting
-from modeharvest.validation.studies.noise import Noise, one_realisation
-from modeharvest.validation.studies.noise_statistics import Pairs
-from modeharvest.validation.studies.robustness import Robustness, one_start
+from modeharvest.validation.studies.noise import causes as noise_causes
+from modeharvest.validation.studies.noise.statistics import Pairs
+from modeharvest.validation.studies.noise.study import Noise, one_realisation
+from modeharvest.validation.studies.robustness import findings as told
+from modeharvest.validation.studies.robustness.study import Robustness, one_start
 from modeharvest.validation.studies.subject import Scene, Subject
-from modeharvest.validation.studies.systematic import Systematic, one_level
+from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
+from modeharvest.validation.studies.systematic.study import Systematic, one_level
 
 PAPER = shipped_solution("paper-virtual")
 TINY = """

@@ -15,7 +15,8 @@ def study(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="STUDY", help="robustness, noise or systematic; or a TOML file of your own."
+            metavar="STUDY",
+            help="robustness, noise, systematic, modes or resolution; or a TOML file of your own.",
         ),
     ],
     out: Annotated[

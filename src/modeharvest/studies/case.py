@@ -3,7 +3,7 @@
 ::
 
     title = "..."
-    [study]        # kind = "robustness", "noise", "systematic" or "resolution", and its options
+    [study]        # kind = "robustness", "noise", "systematic", "modes" or "resolution"; options
     [experiment]   # the subject, as in every virtual experiment: see modeharvest.case
     [imaging]
     [correlation]
@@ -29,11 +29,11 @@ from modeharvest.case import Case
 from modeharvest.case_file import checked, kind_of, nearest, of_kind, read_tables
 from modeharvest.errors import InputError
 from modeharvest.validation.resolution.study import Resolution
-from modeharvest.validation.studies.modes import Modes
-from modeharvest.validation.studies.noise import Noise
-from modeharvest.validation.studies.robustness import Robustness
+from modeharvest.validation.studies.modes.study import Modes
+from modeharvest.validation.studies.noise.study import Noise
+from modeharvest.validation.studies.robustness.study import Robustness
 from modeharvest.validation.studies.study import Study
-from modeharvest.validation.studies.systematic import Systematic
+from modeharvest.validation.studies.systematic.study import Systematic
 
 KINDS: dict[str, type[Any]] = {
     "robustness": Robustness,

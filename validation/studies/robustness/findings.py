@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from modeharvest.validation.page import short
-from modeharvest.validation.studies.robustness_plots import (
+from modeharvest.validation.studies.robustness.plots import (
     OUTLIER_PERCENT,
     PAPER,
     SAME_PX,
@@ -27,8 +27,9 @@ def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
     Parameters
     ----------
     table
-        A row for each case of :func:`modeharvest.validation.studies.robustness.one_start`. One
-        that failed counts as one that did not arrive.
+        A row for each case of
+        :func:`modeharvest.validation.studies.robustness.study.one_start`. One that failed counts
+        as one that did not arrive.
     radius
         That of the paper's question [-].
     seeds

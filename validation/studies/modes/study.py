@@ -15,9 +15,9 @@ from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.lattice.independence import MATERIALS
-from modeharvest.validation.studies import modes_findings as told
-from modeharvest.validation.studies.modes_description import Description
-from modeharvest.validation.studies.modes_specimen import one_specimen
+from modeharvest.validation.studies.modes import findings as told
+from modeharvest.validation.studies.modes.description import Description
+from modeharvest.validation.studies.modes.specimen import one_specimen
 from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject
 

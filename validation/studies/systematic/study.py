@@ -16,11 +16,11 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
-from modeharvest.validation.studies import systematic_findings as told
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.factors import FACTORS, Setting
 from modeharvest.validation.studies.study import Findings, require_different
 from modeharvest.validation.studies.subject import Scene, Subject
+from modeharvest.validation.studies.systematic import findings as told
+from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Systematic:
     strain
         Of the deformed image [-].
     factors
-        What to change: names in :data:`modeharvest.validation.studies.factors.FACTORS`.
+        What to change: names in :data:`modeharvest.validation.studies.systematic.factors.FACTORS`.
     levels
         Other levels than a factor's own, by its name: numbers, or names where it has names.
     seeds_of_speckle

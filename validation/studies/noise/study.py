@@ -17,10 +17,10 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
-from modeharvest.validation.studies import noise_findings as told
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.noise_causes import LADDER, compared, covariances
-from modeharvest.validation.studies.noise_fields import PARTS, Points
+from modeharvest.validation.studies.noise import findings as told
+from modeharvest.validation.studies.noise.causes import LADDER, compared, covariances
+from modeharvest.validation.studies.noise.fields import PARTS, Points
 from modeharvest.validation.studies.study import Findings, require_different
 from modeharvest.validation.studies.subject import Images, Scene, Subject
 
@@ -133,7 +133,7 @@ def one_realisation(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     dict
         ``unknowns``; ``told``, their standard deviations by the result's own covariance given
         the noise, followed by those of the fields at
-        :class:`~modeharvest.validation.studies.noise_fields.Points`. Without noise a list of
+        :class:`~modeharvest.validation.studies.noise.fields.Points`. Without noise a list of
         them for each of the ``LADDER``, for noise of 1, and what the truth says. ``give_mm``, how
         far the displacement gives way by the cost's own curvature, without noise and in the first
         realisation of each level.

@@ -7,22 +7,22 @@ from collections.abc import Iterable
 import pandas as pd
 
 from modeharvest.validation.page import short
-from modeharvest.validation.studies.noise_causes import CAUSES, SOFTENED
-from modeharvest.validation.studies.noise_fields import Points
-from modeharvest.validation.studies.noise_levels import (
+from modeharvest.validation.studies.noise.causes import CAUSES, SOFTENED
+from modeharvest.validation.studies.noise.fields import Points
+from modeharvest.validation.studies.noise.levels import (
     Levels,
     WithoutNoise,
     against,
     read_levels,
 )
-from modeharvest.validation.studies.noise_plots import (
+from modeharvest.validation.studies.noise.plots import (
     draw_bars,
     draw_causes,
     draw_levels,
     draw_maps,
     draw_unknowns,
 )
-from modeharvest.validation.studies.noise_tables import (
+from modeharvest.validation.studies.noise.tables import (
     WORDS,
     causes_table,
     maps_table,
@@ -40,7 +40,7 @@ def findings(table: pd.DataFrame, scene: Scene, seeds: str) -> Findings:
     Parameters
     ----------
     table
-        A row for each case of :func:`modeharvest.validation.studies.noise.one_realisation`.
+        A row for each case of :func:`modeharvest.validation.studies.noise.study.one_realisation`.
     scene
         The pair of images.
     seeds

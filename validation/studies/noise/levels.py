@@ -10,9 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.validation.studies.noise_causes import LADDER
-from modeharvest.validation.studies.noise_fields import PARTS, Points
-from modeharvest.validation.studies.noise_statistics import Pairs
+from modeharvest.validation.studies.noise.causes import LADDER
+from modeharvest.validation.studies.noise.fields import PARTS, Points
+from modeharvest.validation.studies.noise.statistics import Pairs
 
 FloatArray = NDArray[np.float64]
 Levels = Mapping[float, Mapping[str, Pairs]]
@@ -28,7 +28,7 @@ class Told:
     unknowns
         (..., n), each in its own unit.
     fields
-        (..., points, 7) [mm], see :data:`~modeharvest.validation.studies.noise_fields.PARTS`.
+        (..., points, 7) [mm], see :data:`~modeharvest.validation.studies.noise.fields.PARTS`.
     """
 
     unknowns: FloatArray

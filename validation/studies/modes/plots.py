@@ -167,7 +167,7 @@ class Patterns:
 
     @classmethod
     def read(cls, folder: Path) -> Patterns:
-        """Of what :func:`~modeharvest.validation.studies.modes_specimen.one_specimen` left."""
+        """Of what :func:`~modeharvest.validation.studies.modes.specimen.one_specimen` left."""
         solution = Solution.read(folder / "solution.h5")
         result, best = (Result.read(folder / f"{name}.json") for name in ("result", "best"))
         (snapshot,) = solution.snapshots

@@ -23,9 +23,9 @@ from modeharvest.idic.compared import Compared
 from modeharvest.idic.families.equivalents import mode_equivalent
 from modeharvest.idic.result import Result
 from modeharvest.validation.metrics import describe
-from modeharvest.validation.studies.modes_description import Description, folder_of
-from modeharvest.validation.studies.modes_lattice import LatticeMode
-from modeharvest.validation.studies.modes_pattern import buckle
+from modeharvest.validation.studies.modes.description import Description, folder_of
+from modeharvest.validation.studies.modes.lattice import LatticeMode
+from modeharvest.validation.studies.modes.pattern import buckle
 from modeharvest.validation.studies.subject import Scene, Subject
 from modeharvest.validation.truth import Comparison, compare
 
@@ -43,7 +43,7 @@ def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Parameters
     ----------
     case
-        One of :meth:`modeharvest.validation.studies.modes.Modes.prepare`.
+        One of :meth:`modeharvest.validation.studies.modes.study.Modes.prepare`.
     folder
         Of the study.
 

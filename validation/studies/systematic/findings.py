@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from modeharvest.validation.page import short
-from modeharvest.validation.studies.factors import FACTORS
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
+from modeharvest.validation.studies.systematic.factors import FACTORS
 from modeharvest.validation.style import BLUE, GOLD, GREEN, MUTED, figure, style
 
 ERRORS = {
@@ -39,7 +39,7 @@ def findings(
     Parameters
     ----------
     table
-        A row for each case of :func:`modeharvest.validation.studies.systematic.one_level`.
+        A row for each case of :func:`modeharvest.validation.studies.systematic.study.one_level`.
     bases
         The level of each factor that the base has; None where it has none.
     px

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from modeharvest.validation.page import short
-from modeharvest.validation.studies import modes_plots as plots
-from modeharvest.validation.studies.modes_description import folder_of
-from modeharvest.validation.studies.modes_specimen import PARAMETERS
+from modeharvest.validation.studies.modes import plots
+from modeharvest.validation.studies.modes.description import folder_of
+from modeharvest.validation.studies.modes.specimen import PARAMETERS
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
 
 IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
@@ -27,7 +27,7 @@ def findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:
     ----------
     table
         A row for each case of
-        :func:`modeharvest.validation.studies.modes_specimen.one_specimen`.
+        :func:`modeharvest.validation.studies.modes.specimen.one_specimen`.
     folder
         Of the study, where the specimens are.
     seeds

@@ -16,7 +16,7 @@ from modeharvest.errors import InputError
 from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
-from modeharvest.validation.studies import robustness_findings as told
+from modeharvest.validation.studies.robustness import findings as told
 from modeharvest.validation.studies.study import Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Scene, Subject
 

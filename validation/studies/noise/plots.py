@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from modeharvest.validation.studies.noise_fields import PARTS, Points
-from modeharvest.validation.studies.noise_statistics import Pairs, Share
+from modeharvest.validation.studies.noise.fields import PARTS, Points
+from modeharvest.validation.studies.noise.statistics import Pairs, Share
 from modeharvest.validation.studies.study import Plot
 from modeharvest.validation.style import (
     BLUE,

@@ -20,7 +20,7 @@ from modeharvest.idic.setup import Identification
 from modeharvest.imaging.imageset import image_key
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.stages import digest
-from modeharvest.validation.studies.modes_pattern import PatternCells
+from modeharvest.validation.studies.modes.pattern import PatternCells
 from modeharvest.validation.studies.subject import Subject
 
 _MATERIALS = {kind.__name__: kind for kind in (Ogden, TwoTermI1)}

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from modeharvest.validation.studies.noise_causes import CAUSES
-from modeharvest.validation.studies.noise_fields import PARTS, Points
-from modeharvest.validation.studies.noise_levels import Levels, WithoutNoise
-from modeharvest.validation.studies.noise_statistics import Share
+from modeharvest.validation.studies.noise.causes import CAUSES
+from modeharvest.validation.studies.noise.fields import PARTS, Points
+from modeharvest.validation.studies.noise.levels import Levels, WithoutNoise
+from modeharvest.validation.studies.noise.statistics import Share
 from modeharvest.validation.studies.subject import Scene
 
 WORDS = {

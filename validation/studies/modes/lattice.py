@@ -15,7 +15,7 @@ from modeharvest.idic.families.overlap import overlap
 from modeharvest.idic.families.quadrature import Quadrature
 from modeharvest.idic.fourier import ModeFamily
 from modeharvest.validation.lattice.independence import Lattice, PatternMode, pattern_mode
-from modeharvest.validation.studies.modes_pattern import NO_DOLFINX
+from modeharvest.validation.studies.modes.pattern import NO_DOLFINX
 
 FloatArray = NDArray[np.float64]
 

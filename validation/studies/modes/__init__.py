@@ -1,0 +1,1 @@
+"""Modes measured on specimens that differ, against those of infinite lattices."""

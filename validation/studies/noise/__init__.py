@@ -1,0 +1,1 @@
+"""What noise does: bias, scatter, error bars."""

@@ -1,0 +1,1 @@
+"""What is wrong without any noise: one option at a time."""
