@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,16 @@ import pandas as pd
 from modeharvest.validation.page import short
 from modeharvest.validation.studies.modes import plots
 from modeharvest.validation.studies.modes.description import folder_of
-from modeharvest.validation.studies.modes.specimen import PARAMETERS
+from modeharvest.validation.studies.modes.tables import (
+    WAVES,
+    alike,
+    buckling,
+    deviations,
+    misses,
+    parameters,
+    summed_up,
+)
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
-
-IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
-"""Eq. (mode) with a solid junction at the origin, phases in shares of l."""
-_WAVES = list(PARAMETERS[1:5])
 
 
 def findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:
@@ -62,81 +65,6 @@ def _of_sizes(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["varied"].isin(["base", "d/l"])]
 
 
-_BUCKLING = {
-    "smallest_ratio": "d/l from", "largest_ratio": "to", "first": "buckles first into",
-    "pattern_share": "pattern’s share of that mode", "critical_strain": "critical strain [%]",
-    "lattice_first": "infinite lattice: first", "lattice_pattern_strain": "pattern critical at [%]",
-    "strain": "measured at [%]", "unstable_pivots": "negative pivots there",
-    "amplitude": "rms of v₁φ₁ [l]", "simulation": "simulation",
-}  # fmt: skip
-_LIKENESS = {
-    "overlap_lattice": "with the infinite lattice: measured", "best_overlap_lattice": "best fit",
-    "lattice_overlap_ideal": "Eq. (mode)", "overlap_truth": "with the specimen: measured",
-    "best_overlap_truth": "best fit ", "w_px": "truth − IDIC [px]",
-    "best_px": "truth − best fit [px]", "lost_px": "IDIC − best fit [px]",
-    "iterations": "iterations", "outcome": "outcome",
-}  # fmt: skip
-
-
-def buckling(ran: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: into what it buckles, and when."""
-    percent = {name: 100.0 * ran[name] for name in _BUCKLING if name.endswith("strain")}
-    return _renamed(ran.assign(**percent), _BUCKLING)
-
-
-def alike(seen: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: overlaps of its mode, and errors of its displacement."""
-    return _renamed(seen, _LIKENESS)
-
-
-def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
-    names = {"varied": "varied", "level": "level", **columns}
-    return rows.reindex(columns=list(names)).rename(columns=names)
-
-
-def summed_up(seen: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: a₁, and how far its wave vectors and phases are from Eq. (mode)."""
-    off, best = 100.0 * deviations(seen), 100.0 * deviations(seen, "best_")
-    sd = 100.0 * seen[[f"{name}_sd_leftover" for name in PARAMETERS]].set_axis(PARAMETERS, axis=1)
-    phases = list(PARAMETERS[5:])
-    return pd.DataFrame({
-        "varied": seen["varied"], "level": seen["level"], "a₁": seen["a1"],
-        "± 2 sd": 0.02 * sd["a1"], "best fit": seen["best_a1"],
-        "infinite lattice": seen["lattice_a1"],
-        "wave vectors off by up to [%]": off[_WAVES].abs().max(axis=1),
-        "± 2 sd ": 2.0 * sd[_WAVES].max(axis=1), "best fit ": best[_WAVES].abs().max(axis=1),
-        "phases off by up to [% of l]": off[phases].abs().max(axis=1),
-        "± 2 sd  ": 2.0 * sd[phases].max(axis=1),
-        "best fit  ": best[phases].abs().max(axis=1).round(6),
-    })  # fmt: skip
-
-
-def parameters(seen: pd.DataFrame) -> pd.DataFrame:
-    """A row for each parameter of each specimen, phases in shares of l."""
-    rows = [
-        {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
-         "Eq. (mode)": ideal, "measured": row[name],
-         "± 2 sd by what is left over": 2.0 * row[f"{name}_sd_leftover"],
-         "± 2 sd by 1 % of noise": 2.0 * row[f"{name}_sd_noise"],
-         "best fit": row[f"best_{name}"],
-         "infinite lattice": row["lattice_a1"] if name == "a1" else ideal}
-        for _, row in seen.iterrows() for name, ideal in zip(PARAMETERS, IDEAL, strict=True)
-    ]  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def deviations(seen: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
-    """Parameters less those of Eq. (mode), phases in shares of l."""
-    values = seen[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
-    return pd.DataFrame(values, seen.index, list(PARAMETERS))
-
-
-def misses(seen: pd.DataFrame) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(specimens, 7) measured less best fit, in standard deviations by what is left over."""
-    sd = seen[[f"{name}_sd_leftover" for name in PARAMETERS]].to_numpy(np.float64)
-    return np.asarray((deviations(seen) - deviations(seen, "best_")).to_numpy() / sd)
-
-
 def _percent(values: Any) -> str:
     """The largest size of some values, no smaller than anyone cares for."""
     return f"{max(0.001, 100.0 * float(np.max(np.abs(values)))):.2g} %"
@@ -153,7 +81,7 @@ def _keys(seen: pd.DataFrame, sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
         return ()
     span = f"d/l from {sizes['ratio'].min():.3g} to {sizes['ratio'].max():.3g}"
     return (
-        KeyNumber("wave vectors", _percent(deviations(sizes)[_WAVES]), "",
+        KeyNumber("wave vectors", _percent(deviations(sizes)[WAVES]), "",
                   f"furthest from Eq. (mode) of all measured; {span}"),
         KeyNumber("a₁", _percent(deviations(sizes)["a1"]), "", f"furthest from 1; {span}"),
         KeyNumber("overlap", f"{sizes['overlap_lattice'].min():.4f}", "",
@@ -180,9 +108,9 @@ def _of_parameters(sizes: pd.DataFrame) -> list[str]:
     return [
         f"On {specimens} with d/l from {sizes['ratio'].min():.3g} to "
         f"{sizes['ratio'].max():.3g} the measured wave vectors are within "
-        f"{_percent(off[_WAVES])} of Eq. (mode), a₁ within {_percent(off['a1'])} of 1, the "
+        f"{_percent(off[WAVES])} of Eq. (mode), a₁ within {_percent(off['a1'])} of 1, the "
         f"phases within {_percent(off[['a6', 'a7']])} of l.",
-        f"The best fits to the specimens’ own displacements are within {_percent(best[_WAVES])}, "
+        f"The best fits to the specimens’ own displacements are within {_percent(best[WAVES])}, "
         f"{_percent(best['a1'])} and {_percent(best[['a6', 'a7']])}: that much is the specimens’. "
         f"The measurement adds {short(float(sizes['lost_px'].min()))} to "
         f"{short(float(sizes['lost_px'].max()))} px rms, and {int((np.abs(apart) <= 2).sum())} of "
@@ -229,7 +157,7 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
     return [
         f"Graded specimens, d/l from {part['smallest_ratio'].min():.3g} to "
         f"{part['largest_ratio'].max():.3g}: one family with v₁ modulated has "
-        f"wave vectors within {_percent(off[_WAVES])} and an overlap with the specimen’s own "
+        f"wave vectors within {_percent(off[WAVES])} and an overlap with the specimen’s own "
         f"pattern of {_between(part['overlap_truth'])}, least where {worst['varied']} by "
         f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); truth − best fit is "
         f"up to {short(float(part['best_px'].max()))} px (base: "

@@ -19,6 +19,8 @@ from modeharvest.fem.field import Mesh, Solution
 from modeharvest.idic.result import Result
 from modeharvest.validation.outline import Outline
 from modeharvest.validation.plots_fields import Scale
+from modeharvest.validation.studies.modes.specimen import PARAMETERS
+from modeharvest.validation.studies.modes.tables import IDEAL
 from modeharvest.validation.studies.study import Plot
 from modeharvest.validation.style import (
     BLUE,
@@ -36,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 _WAVE_VECTORS = {"a2": BLUE, "a3": GREEN, "a4": GOLD, "a5": RED}
 _PHASES = {"a6": BLUE, "a7": RED}
-_IDEAL = {"a1": 1.0, "a2": 1.0, "a3": 1.0, "a4": -1.0, "a5": 1.0, "a6": 0.0, "a7": 0.0}
+_IDEAL = dict(zip(PARAMETERS, IDEAL, strict=True))
 """Eq. (mode) with a solid junction at the origin; phases in shares of l."""
 _FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # triangles of a T6
 _PATTERN_END, _LEFT_END = 0.15, 0.03  # of the colours, in l
