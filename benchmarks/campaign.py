@@ -87,7 +87,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
     path, case = shipped_solution("paper-virtual"), StudyCase()
     assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)
-    subject = Subject(case.experiment, imaging, case.correlation, Solution.read(path))
+    subject = Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
     study = Robustness(starts=starts, radii=(), strain_errors=())
     found = {}
     for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
