@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 
 def square(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     """Wait, tell on what process, fail where told to."""
@@ -19,12 +21,41 @@ def square(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
 
 
 def dies_once(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
-    """Kill its own worker, -9, the first time that x is 2."""
+    """Kill its own worker, -9, the first time that x is 2; leave a line for each time it is run."""
     mark = folder / "died"
+    with (folder / "runs").open("a") as runs:
+        runs.write(f"{case['x']}\n")
     if case["x"] == 2 and not mark.exists():
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return {"x_again": case["x"]}
+
+
+def duel(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
+    """Case 0 kills, -9, the worker of case 1 as often as told, which succeeds when left alone."""
+    name = folder / "victim"
+    if case["x"] == 1:
+        name.write_text(str(os.getpid()))
+        while not (folder / "over").exists():
+            time.sleep(0.01)
+        return {"pid": os.getpid()}
+    killed: set[str] = set()
+    while len(killed) < case["kills"]:
+        time.sleep(0.01)
+        pid = name.read_text() if name.exists() else ""
+        if pid and pid not in killed:
+            os.kill(int(pid), signal.SIGKILL)
+            killed.add(pid)
+    (folder / "over").touch()
+    return {"pid": os.getpid()}
+
+
+def listening(case: Mapping[str, Any], folder: Path) -> dict[str, list[str]]:
+    """Tell all addresses at which the campaign's processes listen."""
+    run = psutil.Process(case["x"])
+    processes = [run, *run.children(recursive=True)]
+    connections = [c for process in processes for c in process.net_connections("inet")]
+    return {"at": [c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN]}
 
 
 def dies(case: Mapping[str, Any], folder: Path) -> dict[str, int]:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from distributed import default_client
 
 from modeharvest import __version__
 from modeharvest.errors import InputError
@@ -102,12 +103,12 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
     scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     elsewhere = Workers(scheduler=scheduler)
-    elsewhere.get_ready("campaign_cases:square", tmp_path)
+    elsewhere.require_ready("campaign_cases:square", tmp_path)
     table = squares(tmp_path, x=[1, 2, 3], bad=[3]).run(elsewhere)
     assert list(table["square"].dropna()) == [1, 4]
     assert os.getpid() not in set(table["process"].dropna())
     with pytest.raises(InputError, match=r"no_such:f, but the one at tcp.* says .*install"):
-        elsewhere.get_ready("no_such:f", tmp_path)
+        elsewhere.require_ready("no_such:f", tmp_path)
 
     # Of another version, or where the folder is not.
     for said, message in (
@@ -116,7 +117,7 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
     ):
         monkeypatch.setattr(workers, "introduce", lambda function, mark, said=said: said)
         with pytest.raises(InputError, match=message):
-            elsewhere.get_ready("campaign_cases:square", tmp_path)
+            elsewhere.require_ready("campaign_cases:square", tmp_path)
     monkeypatch.undo()
 
     # It dies in the fifth of eight cases.
@@ -172,6 +173,38 @@ def test_a_worker_killed_costs_nothing(tmp_path: Path) -> None:
     assert table["error"].eq("").all()
 
 
+def test_a_result_whose_worker_died_is_kept_and_no_lost_scheduler(tmp_path: Path) -> None:
+    """A campaign that is slow to hear of a case while the worker that ran it dies."""
+    cases = grid({"x": 0}, x=list(range(4)))
+    campaign = Campaign("campaign_cases:dies_once", cases, tmp_path)
+
+    def slow(done: float, total: float, what: str) -> None:
+        """Look away from the first case on until dask says that another's result is lost."""
+        while done == 1 and campaign.missing() and "lost" not in states():
+            time.sleep(0.002)
+
+    def states() -> set[str]:
+        return {state.status for state in list(default_client().futures.values())}
+
+    table = campaign.run(Workers(1), slow)
+    assert table["error"].eq("").all()
+    assert sorted((tmp_path / "runs").read_text().split()) == ["0", "1", "2", "2", "3"]
+
+
+def test_a_connection_that_breaks_is_made_anew(tmp_path: Path) -> None:
+    broken = []
+
+    def cut(done: float, total: float, what: str) -> None:
+        if done == 1 and not broken:
+            client = default_client()
+            client.loop.add_callback(client.scheduler_comm.comm.abort)
+            broken.append(client)
+
+    table = squares(tmp_path, x=[1, 2, 3, 4], wait=[0.1]).run(Workers(1), cut)
+    assert broken
+    assert list(table["square"]) == [1, 4, 9, 16]
+
+
 def test_a_case_that_kills_every_worker_is_one_line_of_the_table(tmp_path: Path) -> None:
     campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=[3, 4, 5]), tmp_path)
     table = campaign.run()
@@ -179,6 +212,20 @@ def test_a_case_that_kills_every_worker_is_one_line_of_the_table(tmp_path: Path)
     assert table["error"][1] == (
         "KilledWorker: its workers died; it may need more memory than they are given"
     )
+
+
+def test_a_case_is_not_blamed_for_what_ran_beside_it(tmp_path: Path) -> None:
+    """Its worker is killed as often as dask allows, and then it is run alone."""
+    cases = grid({"x": 0, "kills": 2}, x=[0, 1])
+    table = Campaign("campaign_cases:duel", cases, tmp_path).run()
+    assert table["error"].eq("").all()
+
+
+def test_a_campaign_opens_nothing_beyond_this_machine(tmp_path: Path) -> None:
+    cases = ({"x": os.getpid()},)
+    (at,) = Campaign("campaign_cases:listening", cases, tmp_path).run(Workers(1))["at"]
+    assert at, "dask's processes talk over TCP"
+    assert set(at) == {"127.0.0.1"}
 
 
 def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,10 @@ from modeharvest.validation.case_run import (
 from modeharvest.validation.workers import Workers
 
 __all__ = ["Campaign", "Case", "Workers", "grid"]
+
+_KILLED = "KilledWorker: its workers died; it may need more memory than they are given"
+_ATTEMPTS = 3
+"""Connections in a row that may break before a case is done."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +106,9 @@ class Campaign:
         missing = self.missing()
         done = len(self.cases) - len(missing)
         progress(done, len(self.cases), "campaign")
-        if missing:
-            with (workers or Workers()).client(self.function, self.folder) as client:
-                for _ in self._finished(client, missing):
-                    done += 1
-                    progress(done, len(self.cases), "campaign")
+        for _ in self._settled(missing, workers or Workers()):
+            done += 1
+            progress(done, len(self.cases), "campaign")
         table = self.table()
         _write(table, self.folder)
         return table
@@ -130,27 +134,95 @@ class Campaign:
         found = record.get("result") or {}
         return {**case, "seconds": record.get("seconds"), "error": last, **found}
 
-    def _finished(self, client: Any, missing: Sequence[Case]) -> Iterator[Case]:
-        """The cases as they get done; one whose worker dies again and again is stored as failed."""
-        from distributed import as_completed
+    def _settled(self, cases: Sequence[Case], workers: Workers) -> Iterator[Case]:
+        """The cases as they get done, or fail for certain.
+
+        A connection that breaks is made anew. Only where that fails is the scheduler gone:
+        whatever dask says of a case, no other conclusion is drawn from it.
+        """
+        left, in_vain = list(cases), 0
+        while left:
+            cut_off: list[Case] = []
+            with ExitStack() as stack:
+                try:
+                    client = stack.enter_context(workers.client(self.function, self.folder))
+                except InputError as error:
+                    if len(left) == len(cases):  # it never was there, or cannot do the work
+                        raise
+                    raise InputError(self._gone(error)) from error
+                for case, outcome in self._tried(client, left):
+                    if outcome is _Outcome.CUT_OFF:
+                        cut_off.append(case)
+                    else:
+                        yield case
+            in_vain = in_vain + 1 if len(cut_off) == len(left) else 0
+            if in_vain == _ATTEMPTS:
+                raise InputError(self._gone(f"{in_vain} connections to it broke"))
+            left = cut_off
+
+    def _gone(self, how: object) -> str:
+        """What is said when a scheduler doesn't come back."""
+        done = len(self.cases) - len(self.missing())
+        return (
+            f"expected the dask scheduler to stay until all cases are done, but it went away; "
+            f"{done} of {len(self.cases)} are done and kept: start it anew and run the same again "
+            f"({how})"
+        )
+
+    def _tried(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
+        """Each case with what became of it, in the end never KILLED.
+
+        A worker may have died of what it ran beside a case, or just before: those whose worker
+        died are tried again, each alone, and only then stored as failed.
+        """
+        killed = []
+        for case, outcome in self._submitted(client, cases):
+            if outcome is _Outcome.KILLED:
+                killed.append(case)
+            else:
+                yield case, outcome
+        for suspect in killed:
+            for case, outcome in self._submitted(client, [suspect]):
+                if outcome is _Outcome.KILLED:
+                    store(self.path(case), case, None, _KILLED, 0.0)
+                yield case, outcome
+
+    def _submitted(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
+        """Run cases side by side; each with its outcome, as they come."""
+        from distributed import KilledWorker, as_completed
 
         folder = str(self.folder.resolve())  # workers elsewhere have another current one
         futures = {
             client.submit(run_case, self.function, case, folder, __version__, pure=False): case
-            for case in missing
+            for case in cases
         }
-        for future in as_completed(futures):  # type: ignore[no-untyped-call]
-            case = futures[future]
-            if future.status == "error":
-                store(self.path(case), case, None, _said(future.exception()), 0.0)
-            elif future.status != "finished":
-                done = len(self.cases) - len(self.missing())
-                raise InputError(
-                    f"expected the dask scheduler to stay until all cases are done, but it went "
-                    f"away; {done} of {len(self.cases)} are done and kept: start it anew and run "
-                    "the same again"
-                )
-            yield case
+        completed = as_completed(list(futures))  # type: ignore[no-untyped-call]
+        for future in completed:
+            if future.status not in ("finished", "error", "cancelled"):
+                # The worker that held its result has died: dask asks another for it.
+                completed.add(future)  # type: ignore[no-untyped-call]
+                continue
+            case = futures.pop(future)  # and dask may forget its result
+            if future.status == "cancelled":
+                yield case, _Outcome.CUT_OFF
+            elif future.status == "finished":
+                yield case, _Outcome.SETTLED
+            elif isinstance(failure := future.exception(), KilledWorker):
+                yield case, _Outcome.KILLED
+            else:
+                store(self.path(case), case, None, f"{type(failure).__name__}: {failure}", 0.0)
+                yield case, _Outcome.SETTLED
+
+
+class _Outcome(Enum):
+    """What becomes of a case that was handed to dask."""
+
+    SETTLED = auto()
+    """Its result, or its failure, is stored."""
+    KILLED = auto()
+    """Its worker died, more than once."""
+    CUT_OFF = auto()
+    """The connection to the scheduler broke."""
 
 
 def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
@@ -176,15 +248,6 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
             raise InputError(f"expected different values of {name!r}, got {list(values)}")
     combinations = itertools.product(*axes.values())
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)
-
-
-def _said(failure: BaseException) -> str:
-    """Why a case could not even fail by itself."""
-    from distributed import KilledWorker
-
-    if isinstance(failure, KilledWorker):
-        return "KilledWorker: its workers died; it may need more memory than they are given"
-    return f"{type(failure).__name__}: {failure}"
 
 
 def _write(table: pd.DataFrame, folder: Path) -> None:

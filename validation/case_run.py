@@ -43,7 +43,9 @@ def result_path(function: str, case: Case, folder: Path) -> Path:
 
 
 def run_case(function: str, case: Case, folder: str, version: str) -> None:
-    """Run one case in a worker and store what becomes of it.
+    """Run one case in a worker and store what becomes of it; nothing if it is stored as done.
+
+    Dask has a case run again whose worker dies before the campaign has heard that it is done.
 
     Parameters
     ----------
@@ -63,6 +65,9 @@ def run_case(function: str, case: Case, folder: str, version: str) -> None:
     """
     if version != __version__:
         raise InputError(f"expected a worker with modeharvest {version}, got {__version__}")
+    path = result_path(function, case, Path(folder))
+    if read_result(path).get("error") == "":
+        return
     numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
     begin = time.perf_counter()
     result, error = None, ""
@@ -70,7 +75,6 @@ def run_case(function: str, case: Case, folder: str, version: str) -> None:
         result = dict(named(function)(case, Path(folder)))
     except Exception:  # a case may fail in any way: that is its result
         error = traceback.format_exc()
-    path = result_path(function, case, Path(folder))
     store(path, case, result, error, time.perf_counter() - begin)
 
 

@@ -1,8 +1,8 @@
 """Who runs a campaign's cases: processes of this machine, or those of a dask scheduler.
 
-Processes of this machine are forks of one server process, which imports what they need while the
-parent imports dask: a campaign of short cases must not wait for its workers. Workers elsewhere
-are asked at once whether they can do the work at all.
+Processes of this machine are those of dask's own ``LocalCluster``. They listen on 127.0.0.1 only,
+have no dashboard, and no timeout takes a slow one for a dead one: a process that has ended is known
+by its end. Workers elsewhere are asked at once whether they can do the work at all.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import logging
 import multiprocessing
 import os
 import signal
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -31,8 +30,26 @@ _LIBRARIES = ("OMP", "MKL", "OPENBLAS")
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
 """A worker has one thread: cores are shared out by cases. numba is told in each case, because
 this stands in the parent's own environment for a while, where numba must not change its mind."""
-_SERVED = ("distributed.nanny", "modeharvest.validation.case_run")
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
+_LOOPBACK = "127.0.0.1"
+_NEVER = "1000 days"
+_LOCAL: dict[str, object] = {
+    # Forks of one server process, that has imported dask: three times as quick as new processes.
+    "distributed.worker.multiprocessing-method": "forkserver" if _FORKS else "spawn",
+    "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
+    # Nobody need be reached through a network: who does not answer is slow. By default dask gives
+    # up a worker whose case keeps the interpreter for five minutes, and for good one that is not
+    # back 15 s after its process was killed.
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.deploy.lost-worker-timeout": _NEVER,
+    "distributed.comm.timeouts.connect": "10 minutes",
+    "distributed.comm.timeouts.tcp": "1 hour",
+    # A case whose worker dies is tried once more beside others, then alone: see Campaign.
+    "distributed.scheduler.allowed-failures": 1,
+    # Nothing to look at by HTTP.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
 
 
 @dataclass(frozen=True)
@@ -66,8 +83,8 @@ class Workers:
                 f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}"
             ) from error
 
-    def get_ready(self, function: str, folder: Path) -> None:
-        """Have the workers ready by when they are needed; what takes long can be done meanwhile.
+    def require_ready(self, function: str, folder: Path) -> None:
+        """Recognise workers elsewhere that can't do the work, before anything is computed for them.
 
         Parameters
         ----------
@@ -82,7 +99,6 @@ class Workers:
             If the scheduler is not there, or its workers can't do the work.
         """
         if self.scheduler is None:
-            _start_server(function)
             return
         with _client_of(self.scheduler) as client:
             _require_able(client, self.scheduler, function, folder)
@@ -94,7 +110,7 @@ class Workers:
         Parameters
         ----------
         function, folder
-            As for :meth:`get_ready`.
+            As for :meth:`require_ready`.
 
         Raises
         ------
@@ -102,7 +118,7 @@ class Workers:
             If the scheduler is not there, or its workers can't do the work.
         """
         if self.scheduler is None:
-            with _processes(function, self.count, self.memory) as client:
+            with _processes(self.count, self.memory) as client:
                 yield client
             return
         with _client_of(self.scheduler) as client:
@@ -111,10 +127,9 @@ class Workers:
 
 
 @contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Variables set for a while; dask's own changes are undone with them."""
+def _environment_kept() -> Iterator[None]:
+    """Whatever becomes of the environment's variables in here, dask's changes, is undone."""
     before = dict(os.environ)
-    os.environ.update(variables)
     try:
         yield
     finally:
@@ -125,6 +140,10 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
     """Processes begun in here never hear Ctrl-C, which is for this one; it hears it afterwards."""
+    if not _FORKS:
+        yield
+        return
+    resource_tracker.ensure_running()  # its own start would let interrupts through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -132,43 +151,29 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_server(function: str) -> None:
-    """Start the process that workers are forks of; it goes on importing what they need."""
-    if not _FORKS:
-        return
-    modules = list(_SERVED)
-    if "mpi4py.MPI" not in sys.modules:  # of this process, so the function's module has no MPI:
-        modules.append(function.partition(":")[0])  # once begun, it can't be forked
-    multiprocessing.get_context("forkserver").set_forkserver_preload(modules)
-    resource_tracker.ensure_running()  # which the server needs and which lets interrupts through
-    with _environment(_ONE_THREAD), _interrupts_held():
-        forkserver.ensure_running()
-
-
 @contextmanager
-def _processes(function: str, count: int, memory: str) -> Iterator[Any]:
+def _processes(count: int, memory: str) -> Iterator[Any]:
     """A client of processes of this machine."""
-    _start_server(function)
     import dask
     from distributed import Client, LocalCluster
 
-    options = {
-        "distributed.worker.multiprocessing-method": "forkserver" if _FORKS else "spawn",
-        "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
-    }
-    with (
-        _environment({}),
-        dask.config.set(options),
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=count,
-            threads_per_worker=1,
-            memory_limit=memory,
-            dashboard_address=":0",  # any free port: campaigns may run side by side
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,  # type: ignore[no-untyped-call]
-    ):
-        yield client
+    with ExitStack() as stack:
+        stack.enter_context(_environment_kept())
+        stack.enter_context(dask.config.set(_LOCAL))
+        with _interrupts_held():
+            cluster = stack.enter_context(
+                LocalCluster(  # type: ignore[no-untyped-call]
+                    n_workers=count,
+                    threads_per_worker=1,
+                    memory_limit=memory,
+                    host=_LOOPBACK,
+                    # A free port, as campaigns may run side by side; None would take 8787.
+                    dashboard_address=f"{_LOOPBACK}:0",
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                )
+            )
+        yield stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
 
 
 @contextmanager

@@ -86,7 +86,7 @@ class StudyPipeline:
         folder, study = self.folder.resolve(), self.case.study
         require_writable(folder)
         _claim(folder, self.case.kind)
-        self.workers.get_ready(study.function, folder)
+        self.workers.require_ready(study.function, folder)
         clock = _Clock()
         cases = study.prepare(self.subject(), folder, self.progress)
         clock.lap("solution and images")
