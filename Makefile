@@ -3,6 +3,8 @@
 
 ENV := scripts/env
 OUT := out/demo
+# On all cores, each with its own part of the files; who is done takes over from the others.
+PYTEST := python -m pytest -n logical --maxprocesses 8 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help demo lattices test lint test-next bench shipped clean
@@ -19,7 +21,7 @@ lattices: ## Analyse the infinite lattices that are shipped in out/lattices (min
 	  $(ENV) modeharvest modes $$case --out out/lattices/$$case || exit; done
 
 test: lint ## Lint, type-check and run the tests: all that must pass before a commit
-	$(ENV) python -m pytest
+	$(ENV) $(PYTEST)
 
 lint: ## Check style, types and the direction of imports
 	$(ENV) ruff check .
@@ -28,7 +30,7 @@ lint: ## Check style, types and the direction of imports
 	$(ENV) lint-imports
 
 test-next: ## Run the tests on the next dolfinx (Debian unstable, in a root of its own)
-	$(ENV) --next python -m pytest
+	$(ENV) --next $(PYTEST)
 
 bench: ## Run every program in benchmarks/ (minutes; ratios within one run are what counts)
 	for program in benchmarks/*.py; do $(ENV) python $$program || exit; done

@@ -39,6 +39,14 @@ def _dolfinx_is_missing() -> bool:
     return not required and importlib.util.find_spec("dolfinx") is None
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """One thread for kernels where several processes share out the tests."""
+    if hasattr(config, "workerinput"):
+        import numba
+
+        numba.set_num_threads(1)
+
+
 def pytest_pycollect_makemodule(
     module_path: Path, parent: pytest.Collector
 ) -> pytest.Module | None:
