@@ -6,22 +6,19 @@ Lengths are millimetres. What the copies of a cell must do to fit together is ch
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import gmsh
-import meshio
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import Mesh, read_any_mesh
 from modeharvest.fem.lattices import UnitCell
 from modeharvest.fem.meshing import gmsh_options, quiet_gmsh
 from modeharvest.fem.triangles import sound_t6
+from modeharvest.reading import require_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -59,8 +56,7 @@ def read_cell(
         well; isn't plane; has elements inside out, or is not periodic.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"expected a cell (mesh or geometry) at {path}, found no such file")
+    require_file(path, "a cell (mesh or geometry)", "draw or export one")
     is_geometry = path.suffix.lower() in GEOMETRY
     if size is not None and not is_geometry:
         raise InputError(
@@ -70,7 +66,7 @@ def read_cell(
         with quiet_gmsh():
             _merge(path)
             return _from_model(lattice, size, is_geometry, str(path))
-    source = _read_meshio(path)
+    source = read_any_mesh(path)
     cells: Cells = {}
     for block in source.cells:
         rows = [cells[block.type]] if block.type in cells else []
@@ -226,16 +222,6 @@ def _current_mesh() -> tuple[FloatArray, Cells]:
             cells.setdefault(name, []).append(place.astype(np.int64))
     points = coordinates.reshape(-1, 3)[order]
     return points, {name: np.vstack(blocks) for name, blocks in cells.items()}
-
-
-def _read_meshio(path: Path) -> Any:
-    said = io.StringIO()
-    try:
-        with redirect_stdout(said), redirect_stderr(said):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
-        reason = " ".join((said.getvalue() or str(error)).split())
-        raise InputError(f"expected a mesh that meshio reads at {path}, got: {reason}") from error
 
 
 def _unit_cell(

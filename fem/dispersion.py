@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from modeharvest.errors import InputError
 from modeharvest.files import atomic, atomic_hdf5
 from modeharvest.progress import Progress, silent
+from modeharvest.reading import open_hdf5
 
 if TYPE_CHECKING:  # their modules need dolfinx
     from modeharvest.fem.bloch import BlochWaves
@@ -183,16 +184,13 @@ class Dispersion:
         InputError
             If there is no such file, or it is none of these.
         """
-        try:
-            with h5py.File(path) as file:
-                arrays = {n: file[n][()] for n in ("waves", "distances", "loads", "eigenvalues")}
-                labels = tuple(str(label) for label in file.attrs["labels"])
-                stops = tuple(int(k) for k in file["stops"])
-                groups = file.get("zone", {}).values()
-                zone = tuple(_read_map(group) for group in groups)
-        except (OSError, KeyError) as error:
-            raise InputError(f"expected a dispersion file at {path}, got: {error}") from error
-        return cls(labels, stops, **arrays, zone=zone)
+        with open_hdf5(path, "a dispersion file (HDF5)") as file:
+            arrays = {n: file[n][()] for n in ("waves", "distances", "loads", "eigenvalues")}
+            labels = tuple(str(label) for label in file.attrs["labels"])
+            stops = tuple(int(k) for k in file["stops"])
+            groups = file.get("zone", {}).values()
+            zone = tuple(_read_map(group) for group in groups)
+            return cls(labels, stops, **arrays, zone=zone)
 
 
 def _read_map(group: h5py.Group) -> ZoneMap:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.files import atomic, atomic_hdf5
+from modeharvest.reading import open_hdf5, reading, reason
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -177,29 +178,12 @@ class Solution:
         InputError
             If the file is missing, cut short or of another format.
         """
-        if not Path(path).is_file():
-            raise InputError(
-                f"expected a solution (HDF5) at {path}, found no such file; make it with "
-                "'modeharvest fem'"
-            )
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise InputError(
-                        f"expected a {FORMAT} file at {path}, got format "
-                        f"{file.attrs.get('format')!r}; make it again with 'modeharvest fem'"
-                    )
-                mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
-                groups = file.get("snapshots", {})
-                snapshots = tuple(_read_snapshot(groups[name]) for name in sorted(groups))
-                return cls(mesh, snapshots, json.loads(file.attrs["info"]))
-        except InputError:
-            raise
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(
-                f"expected a solution (HDF5) at {path}, got: {error}; "
-                "make it again with 'modeharvest fem'"
-            ) from error
+        remedy = "make it again with 'modeharvest fem'"
+        with open_hdf5(path, "a solution (HDF5)", remedy, FORMAT) as file:
+            mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
+            groups = file.get("snapshots", {})
+            snapshots = tuple(_read_snapshot(groups[name]) for name in sorted(groups))
+            return cls(mesh, snapshots, dict(json.loads(file.attrs["info"])))
 
     def write_vtu(self, path: Path | str) -> None:
         """Write mesh and all displacements as VTU for ParaView, atomically."""
@@ -229,6 +213,17 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
     )
 
 
+def read_any_mesh(path: Path | str) -> meshio.Mesh:
+    """Read a mesh file of any format that meshio knows; whatever is wrong with it is InputError."""
+    said = io.StringIO()
+    with reading(path, "a mesh that meshio reads", "export it again"):
+        try:
+            with redirect_stdout(said), redirect_stderr(said):
+                return meshio.read(path)
+        except (Exception, SystemExit) as error:  # meshio prints why, and may exit
+            raise ValueError(said.getvalue() or reason(error)) from error
+
+
 def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:
     """Take the mesh and displacement of any solver whose file meshio reads.
 
@@ -246,13 +241,7 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     InputError
         If the file can't be read, has no such cells or several types of them, or no such field.
     """
-    said = io.StringIO()
-    try:
-        with redirect_stdout(said), redirect_stderr(said):
-            source = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
-        reason = " ".join((said.getvalue() or str(error)).split())
-        raise InputError(f"expected a mesh that meshio reads at {path}, got: {reason}") from error
+    source = read_any_mesh(path)
     types = sorted({block.type for block in source.cells})
     found = [e for e, name in _MESHIO_NAME.items() if name in types]
     if not found:

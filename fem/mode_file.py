@@ -34,6 +34,7 @@ from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.modes import NORMALISATION, Branch, BranchState, ModeSet
 from modeharvest.files import atomic, atomic_hdf5
+from modeharvest.reading import open_hdf5
 
 FloatArray = NDArray[np.float64]
 
@@ -75,24 +76,11 @@ def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
     InputError
         If the file is missing, cut short, of another format or inconsistent.
     """
-    if not Path(path).is_file():
-        raise InputError(
-            f"expected modes (HDF5) at {path}, found no such file; make it with 'modeharvest modes'"
-        )
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise InputError(f"the format is {file.attrs.get('format')!r}, not {FORMAT}")
-            modes = _read_set(file)
-            groups = file.get("branches", {})
-            branches = tuple(_read_branch(groups[name], modes) for name in sorted(groups))
-            return modes, branches
-    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"expected modes (HDF5) at {path}, got: {reason}; make it again with "
-            "'modeharvest modes'"
-        ) from error
+    with open_hdf5(path, "modes (HDF5)", "make it again with 'modeharvest modes'", FORMAT) as file:
+        modes = _read_set(file)
+        groups = file.get("branches", {})
+        branches = tuple(_read_branch(groups[name], modes) for name in sorted(groups))
+        return modes, branches
 
 
 def write_vtu(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.files import read_json, write_json
+from modeharvest.files import read_record, write_json
 from modeharvest.idic.agreement import LAGS_PX, Agreement
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.gauss_newton import Iteration, Outcome
@@ -19,6 +19,7 @@ from modeharvest.idic.serialise import result_fields, result_to_dict
 from modeharvest.idic.weighting import SLOPE_NOISE, Weighting
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.reading import reading
 
 FloatArray = NDArray[np.float64]
 
@@ -283,17 +284,9 @@ class Result:
         InputError
             If the file is missing, cut short or of another format.
         """
-        content = read_json(path)
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise InputError(f"expected a {FORMAT} file at {path}; correlate again")
-        try:
-            return cls(**result_fields(content))
-        except InputError:
-            raise
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise InputError(
-                f"expected a complete {FORMAT} file at {path}, got: {error!r}; correlate again"
-            ) from error
+        what, remedy = f"a complete {FORMAT} file", "correlate again"
+        with reading(path, what, remedy):
+            return cls(**result_fields(read_record(path, FORMAT, what, remedy)))
 
 
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:

@@ -14,12 +14,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # Sums may be reordered, so that they are vectorised; NaN and infinity keep their meaning.
 _RELAXED = {"contract", "reassoc", "nsz", "arcp"}
+_kept = True
 
 
 def compiled(
     *, parallel: bool = False, inline: bool = False, relaxed: bool = False
 ) -> Callable[[F], F]:
-    """Compile a kernel at its first call; the machine code is cached on disk.
+    """Compile a kernel at its first call; the machine code is cached on disk, if that is allowed.
 
     Parameters
     ----------
@@ -31,12 +32,24 @@ def compiled(
         Let the compiler reorder sums and divide as numpy does; by default floating-point
         arithmetic is strict, and division by zero an error.
     """
-    options: dict[str, Any] = {
-        "cache": True, "parallel": parallel, "forceinline": inline, "nogil": True,
-    }  # fmt: skip
+    options: dict[str, Any] = {"parallel": parallel, "forceinline": inline, "nogil": True}
     if relaxed:
         options |= {"fastmath": _RELAXED, "error_model": "numpy"}
-    return cast(Callable[[F], F], cast(Any, numba.njit)(**options))
+
+    def decorate(kernel: F) -> F:
+        global _kept
+        try:
+            return cast(F, numba.njit(kernel, cache=True, **options))
+        except RuntimeError:  # no folder for it can be written to
+            _kept = False
+            return cast(F, numba.njit(kernel, **options))
+
+    return decorate
+
+
+def are_kept() -> bool:
+    """Whether compiled kernels are found again by the next process."""
+    return _kept
 
 
 def readable(values: NDArray[Any]) -> NDArray[Any]:

@@ -38,20 +38,20 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json, write_json
-from modeharvest.imaging.distortion.undistort import CameraDistortion
+from modeharvest.files import read_json, read_record, write_json
 from modeharvest.imaging.exposure import Camera
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.integrate import Scene
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.imaging.isoparametric import Located, locate
 from modeharvest.imaging.render import Truth, render_deformed, render_reference
-from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.set_key import FORMAT, image_key, sha256_of
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle import Speckle
 from modeharvest.imaging.truth import read_truth, write_truth
 from modeharvest.progress import Progress, silent
+from modeharvest.reading import reading
+from modeharvest.typed import made
 from modeharvest.versions import versions
 
 FloatArray = NDArray[np.float64]
@@ -83,37 +83,29 @@ class ImageSet:
     @classmethod
     def read(cls, folder: Path | str) -> ImageSet:
         """Open a set; InputError if it isn't there or isn't finished."""
-        folder = Path(folder)
-        if not (folder / SIDECAR).is_file():
-            raise InputError(
-                f"expected a finished image set in {folder}, found no {SIDECAR}; "
-                "make it with 'modeharvest image'"
-            )
-        info = read_json(folder / SIDECAR)
-        if not isinstance(info, dict) or info.get("format") != FORMAT:
-            raise InputError(f"expected {FORMAT} in {folder / SIDECAR}, make the set again")
-        return cls(folder, info)
+        what, remedy = "a finished image set", "make it with 'modeharvest image'"
+        path = Path(folder) / SIDECAR
+        with reading(path, what, remedy):
+            images = cls(Path(folder), read_record(path, FORMAT, what, remedy))
+            _ = images.grid, images.spec, images.max_residual_px
+            for entry in (images.info["reference"], *map(images._snapshot, images.strains)):
+                _ = [str(entry[name]) for name in ("image", "camera_image", "mask")]
+            return images
 
     @property
     def grid(self) -> PixelGrid:
         """The pixels of all images of the set."""
-        return PixelGrid(**self.info["grid"])
+        return made(PixelGrid, self.info["grid"])
 
     @property
     def spec(self) -> ImagingSpec:
         """How the set was imaged."""
-        values = dict(self.info["spec"])
-        speckle, lens = dict(values["speckle"]), values.get("distortion")
-        speckle["ink"] = Ink(**speckle["ink"]) if speckle.get("ink") else None
-        values["speckle"] = SpeckleSpec(**speckle)
-        values["sensor"] = Sensor(**values.get("sensor", {}))
-        values["distortion"] = CameraDistortion(**lens) if isinstance(lens, dict) else lens
-        return ImagingSpec(**values)
+        return made(ImagingSpec, self.info["spec"])
 
     @property
     def strains(self) -> tuple[float, ...]:
         """Nominal strains of the deformed images [-]."""
-        return tuple(s["nominal_strain"] for s in self.info["snapshots"])
+        return tuple(float(s["nominal_strain"]) for s in self.info["snapshots"])
 
     @property
     def max_residual_px(self) -> float:

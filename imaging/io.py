@@ -10,9 +10,12 @@ import skimage.color
 import skimage.io
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from modeharvest.errors import InputError
 from modeharvest.files import atomic
+from modeharvest.memory import require_memory
+from modeharvest.reading import reading
 
 BoolArray = NDArray[np.bool_]
 
@@ -135,20 +138,15 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
 
 
 def _read(path: Path) -> NDArray[Any]:
-    if not path.is_file():
-        raise InputError(f"expected an image at {path}, found no such file")
-    if path.stat().st_size == 0:
-        raise InputError(f"expected an image at {path}, got an empty file cut short at 0 bytes")
-    try:
+    remedy = "the file may be cut short, make or copy it again"
+    with reading(path, "a whole TIFF, PNG or JPEG image", remedy):
         if path.suffix.lower() in _TIFF:
-            return np.asarray(tifffile.imread(path))
+            with tifffile.TiffFile(path) as file:
+                require_memory(file.series[0].nbytes, "an image", "crop it")
+                return np.asarray(file.asarray())
+        with Image.open(path) as picture:
+            require_memory(float(np.prod(picture.size)) * 4.0, "an image", "crop it")
         return np.asarray(skimage.io.imread(path))
-    except Exception as error:  # every format has its own exceptions for a damaged file
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"expected a whole TIFF, PNG or JPEG image at {path}, got: {reason}; "
-            "the file may be cut short, make or copy it again"
-        ) from error
 
 
 def _grey(raw: NDArray[Any], path: Path | str) -> NDArray[Any]:

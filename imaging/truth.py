@@ -18,13 +18,12 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from modeharvest.errors import InputError
 from modeharvest.files import atomic_hdf5
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.render import Truth
+from modeharvest.reading import open_hdf5
 
 FORMAT = "modeharvest-truth-1"
 
@@ -58,19 +57,7 @@ def write_truth(path: Path | str, truth: Truth, nominal_strain: float, grid: Pix
 
 def read_truth(path: Path | str) -> Truth:
     """Read what :func:`write_truth` wrote; InputError if missing, cut short or another format."""
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise InputError(
-                    f"expected a {FORMAT} file at {path}, got format "
-                    f"{file.attrs.get('format')!r}; make it again with 'modeharvest image'"
-                )
-            planes = {name: np.asarray(file[name]) for name in _CONTENT}
-            return Truth(
-                **{n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()}
-            )
-    except (OSError, KeyError) as error:
-        raise InputError(
-            f"expected a truth file (HDF5) at {path}, got: {error}; "
-            "make it again with 'modeharvest image'"
-        ) from error
+    remedy = "make it again with 'modeharvest image'"
+    with open_hdf5(path, "a truth file (HDF5)", remedy, FORMAT) as file:
+        planes = {name: np.asarray(file[name]) for name in _CONTENT}
+        return Truth(**{n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()})

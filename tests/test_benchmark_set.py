@@ -142,9 +142,9 @@ def test_distorted_images_are_refused(both: tuple[Path, Path], tmp_path: Path) -
 
 def test_other_folders_are_not_taken_for_the_truth(copies: tuple[Path, Path]) -> None:
     public, truth = copies
-    with pytest.raises(InputError, match="public folder, without truth"):
+    with pytest.raises(InputError, match=r"public folder.* without truth"):
         BenchmarkTruth.read(public)
-    with pytest.raises(InputError, match=r"found no benchmark\.json"):
+    with pytest.raises(InputError, match=r"images/benchmark\.json, found no such file"):
         BenchmarkTruth.read(truth / "images")
     made.solution(made.affine).write(truth / "solution.h5")
     with pytest.raises(InputError, match="the solution that benchmark"):

@@ -180,12 +180,12 @@ def test_a_file_that_is_no_field_is_named(truth: BenchmarkTruth, tmp_path: Path)
     (tmp_path / "units.csv").write_text("x,y,u,v\n1,2,3,4\n", "utf-8")
     (tmp_path / "folder.csv").mkdir()
     for path, words in (
-        (tmp_path / "a.mat", r"a\.mat: can't be read as \.mat"),
+        (tmp_path / "a.mat", r"expected a MAT file at .*a\.mat"),
         (tmp_path / "a.xyz", r"a\.xyz: expected one of .*\.vtu, got '\.xyz'"),
         (tmp_path / "a.csv", r"a\.csv: expected lines of numbers"),
         (tmp_path / "folder.csv", r"folder\.csv, found a folder"),
         (tmp_path / "units.csv", "give --unit px or mm"),
-        (tmp_path / "a.vtu", r"a\.vtu: can't be read as \.vtu"),
+        (tmp_path / "a.vtu", r"expected a mesh that meshio reads at .*a\.vtu"),
         (tmp_path / "b.vtu", "found no such file"),
         (tmp_path / "c.csv", "found no such file"),
     ):

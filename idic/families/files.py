@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from modeharvest.errors import InputError
-from modeharvest.files import read_json, write_json
+from modeharvest.files import read_record, write_json
 from modeharvest.idic.families.automatic import FoundFamily
 from modeharvest.idic.families.lattice_spectrum import LatticeSpectrum
 from modeharvest.idic.fourier import ModeFamily
+from modeharvest.reading import reading
 
 FORMAT = "modeharvest-family-1"
+_WHAT = f"a whole {FORMAT} file"
 
 _CONVENTIONS = {
     "field": "u(x) = amplitude * sum over waves of (A, B) * sin(pi/pitch * (kx*x + ky*y + c))",
@@ -88,8 +90,8 @@ def write_family(
 
 def read_family(path: Path | str) -> FoundFamily:
     """Read what :func:`write_family` wrote; InputError if it is damaged or something else."""
-    content = _content(path)
-    try:
+    with reading(path, _WHAT):
+        content = read_record(path, FORMAT, _WHAT, "make it again")
         family = ModeFamily(
             str(content["name"]),
             np.array(content["matrix"], dtype=np.float64),
@@ -107,16 +109,14 @@ def read_family(path: Path | str) -> FoundFamily:
             tuple(str(sentence) for sentence in content["sentences"]),
             dict(content["info"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise _damaged(path, error) from error
 
 
 def read_spectrum(path: Path | str) -> LatticeSpectrum | None:
     """Read the Fourier coefficients in a family's file; None if there are none."""
-    content = _content(path).get("spectrum")
-    if content is None:
-        return None
-    try:
+    with reading(path, _WHAT):
+        content = read_record(path, FORMAT, _WHAT, "make it again").get("spectrum")
+        if content is None:
+            return None
         parts = np.array(content["coefficients"], dtype=np.float64)
         x, y = content["translation"]
         return LatticeSpectrum(
@@ -128,8 +128,6 @@ def read_spectrum(path: Path | str) -> LatticeSpectrum | None:
             float(content["material"]),
             (float(x), float(y)),
         )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise _damaged(path, error) from error
 
 
 def _spectrum_to_dict(spectrum: LatticeSpectrum) -> dict[str, Any]:
@@ -144,16 +142,3 @@ def _spectrum_to_dict(spectrum: LatticeSpectrum) -> dict[str, Any]:
         "xi": spectrum.xi.tolist(),
         "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
     }
-
-
-def _content(path: Path | str) -> dict[str, Any]:
-    content = read_json(path)
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        got = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise InputError(f"expected a {FORMAT} file at {path}, got {got!r}; make it again")
-    return content
-
-
-def _damaged(path: Path | str, error: Exception) -> InputError:
-    reason = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-    return InputError(f"expected a whole {FORMAT} file at {path}, got {reason}; make it again")

@@ -3,34 +3,33 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
 from modeharvest.errors import InputError
+from modeharvest.memory import available_bytes, require_memory
+from modeharvest.reading import open_hdf5, reading
 
 FloatArray = NDArray[np.float64]
 Table = dict[str, FloatArray]
 
 _MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    NotImplementedError,
-    MatReadError,
-    BadZipFile,
-)
-"""What numpy, h5py and scipy raise for a file that isn't what its name says."""
+_WHAT, _REMEDY = "a displacement field", "export it again, best as CSV"
+_MAT_SIDE = Path(__file__).with_name("mat_side.py")
+_MAT_SECONDS = 300.0
+"""After which a MAT file is taken for one that makes its parser run for ever."""
+_BYTES_OF_TEXT = 10.0
+"""Most that a character of a table of numbers becomes in memory."""
 _HEAD = 1000
 """Lines of a text among which the first line of numbers is looked for."""
 _LOGICAL = {"true": 1.0, "false": 0.0}
@@ -51,28 +50,22 @@ def read_table(path: Path | str) -> Table:
         If the file is missing, not of its kind, or holds no numbers.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"expected a displacement field in {path}, found no such file")
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(
-            f"{path}: expected one of {', '.join(sorted(_READERS))}, got {path.suffix!r}; "
-            "save the field as CSV"
-        )
-    try:
+    with reading(path, f"{_WHAT} ({path.suffix})", _REMEDY):
+        reader = _READERS.get(path.suffix.lower())
+        if reader is None:
+            raise InputError(
+                f"{path}: expected one of {', '.join(sorted(_READERS))}, got {path.suffix!r}; "
+                "save the field as CSV"
+            )
         table = reader(path)
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: can't be read as {path.suffix}: {reason}") from error
-    if not table:
-        raise InputError(f"{path}: expected numeric variables, found none")
-    return table
+        if not table:
+            raise InputError(f"{path}: expected numeric variables, found none")
+        return table
 
 
 def _read_text(path: Path) -> Table:
     """Read columns under a line of names; lines before it are skipped, '#' may precede it."""
+    require_memory(_BYTES_OF_TEXT * path.stat().st_size, f"the table {path}", "thin it out")
     numbered = _numbered(path)
     first = next((i for i, (_, line) in enumerate(numbered) if _looks_numeric(line)), None)
     if first is None:
@@ -163,13 +156,16 @@ def _number(text: str, decimal: str, path: Path, line: int) -> float:
 
 
 def _read_npz(path: Path) -> Table:
+    with ZipFile(path) as archive:
+        size = float(sum(part.file_size for part in archive.infolist()))
+    require_memory(size, f"the table {path}", "thin it out")
     with np.load(path, allow_pickle=False) as file:
         return _numeric({name: file[name] for name in file.files})
 
 
 def _read_hdf5(path: Path) -> Table:
     found: dict[str, Any] = {}
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path, _WHAT, _REMEDY) as file:
         file.visititems(
             lambda n, o: found.update({n: o[()]}) if isinstance(o, h5py.Dataset) else None
         )
@@ -179,20 +175,32 @@ def _read_hdf5(path: Path) -> Table:
 def _read_mat(path: Path) -> Table:
     if h5py.is_hdf5(path):  # version 7.3, in which MATLAB's columns are HDF5's rows
         return {name: array.T for name, array in _read_hdf5(path).items()}
-    content = loadmat(path, simplify_cells=True)
-    return _numeric(_by_last_name(_flattened(content)))
+    return _numeric(_by_last_name(read_mat(path)))
 
 
-def _flattened(content: dict[str, Any], above: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in content.items():
-        if name.startswith("__"):
-            continue
-        if isinstance(value, dict):
-            flat.update(_flattened(value, f"{above}{name}/"))
-        else:
-            flat[above + name] = value
-    return flat
+def read_mat(path: Path) -> dict[str, NDArray[Any]]:
+    """Numeric and text variables of a MAT file before version 7.3, by their path in structures.
+
+    Read by a child: a damaged file makes scipy's parser crash the process that it runs in.
+
+    Raises
+    ------
+    InputError
+        If the parser gives up, crashes, or doesn't end.
+    """
+    with reading(path, "a MAT file", _REMEDY), tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "read.npz"
+        command = [sys.executable, "-P", _MAT_SIDE, path.resolve(), target, available_bytes()]
+        done = subprocess.run(
+            list(map(str, command)), capture_output=True, text=True, timeout=_MAT_SECONDS,
+            errors="replace", check=False,
+        )  # fmt: skip
+        if done.returncode < 0:
+            raise ValueError(f"a file that makes its parser crash (signal {-done.returncode})")
+        if done.returncode:
+            raise ValueError((done.stderr.strip().splitlines() or ["nothing"])[-1])
+        with np.load(target, allow_pickle=False) as file:
+            return {str(name): file[f"arr_{k}"] for k, name in enumerate(file["names"])}
 
 
 def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:

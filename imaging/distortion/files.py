@@ -24,6 +24,8 @@ from modeharvest.imaging.distortion.undistort import (
     PolynomialDistortion,
     SampledDistortion,
 )
+from modeharvest.reading import reading
+from modeharvest.typed import made
 
 AnyDistortion = PolynomialDistortion | CameraDistortion | SampledDistortion
 
@@ -64,10 +66,10 @@ def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix == ".json":
-        return _from_json(read_json(path), path)
-    try:
-        text = path.read_text("utf-8")
+    with reading(path, "a distortion", "calibrate the lens again"):
+        if suffix == ".json":
+            return _from_json(read_json(path), path)
+        text = path.read_text("utf-8-sig")
         if suffix == ".xml":
             root = ElementTree.fromstring(text)
             if root.tag == "ParameterList":
@@ -75,9 +77,7 @@ def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
             return _camera({child.tag: _numbers(child) for child in root}, path)
         if suffix in (".yml", ".yaml"):
             return _camera(_opencv_yaml(text), path)
-    except (OSError, UnicodeDecodeError, ElementTree.ParseError) as error:
-        raise InputError(f"expected a distortion at {path}, got: {error}") from error
-    raise InputError(f"expected a distortion as .json, .xml, .yml or .yaml, got {path}")
+        raise InputError(f"expected a distortion as .json, .xml, .yml or .yaml, got {path}")
 
 
 def _from_json(content: Any, path: Path) -> AnyDistortion:
@@ -91,21 +91,14 @@ def _from_json(content: Any, path: Path) -> AnyDistortion:
     if "kind" not in content:  # OpenCV's storage can be JSON, too
         entries = {k: v.get("data") for k, v in content.items() if isinstance(v, dict)}
         return _camera(entries, path)
-    kind = kinds.get(content["kind"])
-    if kind is None:
+    if not isinstance(content["kind"], str) or content["kind"] not in kinds:
         raise InputError(
             f"expected a distortion of a kind among {list(kinds)} at {path}, "
             f"got {content['kind']!r}"
         )
-    try:
-        found: AnyDistortion = kind(
-            **{k: v for k, v in content.items() if k not in ("kind", "frame")}
-        )
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"expected the numbers of a {content['kind']} distortion at {path}, "
-                         f"got: {error}") from error  # fmt: skip
+    values = {k: v for k, v in content.items() if k not in ("kind", "frame")}
+    kind = kinds[content["kind"]]
+    found: AnyDistortion = made(kind, values) if kind is CameraDistortion else kind(**values)
     return found
 
 
@@ -142,7 +135,7 @@ def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:
         )
     fx, _, cx, _, fy, cy, *_ = (float(number) for number in matrix)
     lens = dict(zip(_ORDER, map(float, coefficients), strict=False))
-    return CameraDistortion(fx, fy, cx, cy, **lens)
+    return made(CameraDistortion, {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens})
 
 
 def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> CameraDistortion:
@@ -164,9 +157,5 @@ def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> Came
             f"{entries.get('FS', 0.0)}"
         )
     names = ("fx", "fy", "cx", "cy", *_ORDER)
-    try:
-        return CameraDistortion(
-            **{n: float(entries[n.upper()]) for n in names if n.upper() in entries}
-        )
-    except (TypeError, ValueError) as error:
-        raise InputError(f"expected FX, FY, CX, CY and K1 ... at {path}, got: {error}") from error
+    lens = {n: float(entries[n.upper()]) for n in names if n.upper() in entries}
+    return made(CameraDistortion, lens)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from modeharvest.errors import InputError
+from modeharvest.memory import require_memory
+from modeharvest.reading import reading
 
 TIFF = {".tif", ".tiff"}
 _ORIENTATION = 274
@@ -48,23 +50,12 @@ def read_stored(path: Path) -> Stored:
     InputError
         One line: the file is missing, empty, damaged, or its numbers can't be read unchanged.
     """
-    if not path.is_file():
-        raise InputError(f"expected a photograph at {path}, found no such file")
-    if path.stat().st_size == 0:
-        raise InputError(f"expected a photograph at {path}, got an empty file; copy it again")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # how Pillow tells of files cut short
-            stored = _read_tiff(path) if path.suffix.lower() in TIFF else _read_other(path)
-    except InputError:
-        raise
-    except Exception as error:  # every format has its own exceptions for a damaged file
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"expected a whole TIFF, PNG or JPEG at {path}, got a damaged file: {reason}; copy it "
-            "or take it again"
-        ) from error
-    return _checked(stored, path)
+    remedy = "if it is a damaged file, copy it or take it again"
+    with reading(path, "a photograph (TIFF, PNG or JPEG)", remedy), warnings.catch_warnings():
+        warnings.simplefilter("error")  # how Pillow tells of files cut short
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its size is looked at
+        is_tiff = path.suffix.lower() in TIFF
+        return _checked(_read_tiff(path) if is_tiff else _read_other(path), path)
 
 
 def _checked(stored: Stored, path: Path) -> Stored:
@@ -87,6 +78,7 @@ def _read_tiff(path: Path) -> Stored:
     with tifffile.TiffFile(path) as file:
         page, count = file.pages.first, len(file.pages)
         notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
+        _require_memory(page.nbytes)
         try:
             levels = np.asarray(page.asarray())
         except (ValueError, ImportError) as error:
@@ -107,6 +99,11 @@ def _read_tiff(path: Path) -> Stored:
         return Stored(turned, (*notes, *said))
 
 
+def _require_memory(stored: float) -> None:
+    """A header of a few bytes can declare any size."""
+    require_memory(2.0 * stored, "a photograph", "crop it")
+
+
 def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> Stored:
     if page.samplesperpixel > 1 and page.bitspersample != 8:
         # Pillow would drop the lower bits without a word.
@@ -122,6 +119,7 @@ def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> Stored:
 
 def _read_other(path: Path) -> Stored:
     with Image.open(path) as picture:
+        _require_memory(4.0 * picture.width * picture.height)
         if picture.format == "PNG" and _png_is_deep_colour(path):
             raise InputError(
                 f"expected 8-bit colour, or grey of up to 16 bits, in the PNG {path}, got 16-bit "

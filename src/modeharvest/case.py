@@ -35,7 +35,6 @@ from modeharvest.case_file import (
     is_lattice,
     kind_of,
     of_kind,
-    plain,
     read_tables,
     shipped_cases,
     shipped_solution,
@@ -46,6 +45,7 @@ from modeharvest.idic.setup import Identification
 from modeharvest.imaging.calibration_target import CalibrationTarget
 from modeharvest.imaging.distortion.undistort import CameraDistortion
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.typed import plain
 
 __all__ = ["Case", "TwinCase", "case_text", "read_case", "shipped_cases", "shipped_solution"]
 

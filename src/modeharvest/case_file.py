@@ -6,18 +6,19 @@ table are theirs. This module reads such files and finds the ones that come with
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from modeharvest.errors import InputError
 from modeharvest.fem.materials import Ogden, TwoTermI1
+from modeharvest.reading import reading
+from modeharvest.typed import CHECKS, made, nearest, plain, require_types, sentence
 
 MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
 _SHIPPED = resources.files("modeharvest") / "cases"
@@ -26,7 +27,7 @@ _SHIPPED = resources.files("modeharvest") / "cases"
 class CaseModel(BaseModel):
     """What all kinds of cases have in common: no unknown keys, unchangeable, a title."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = CHECKS
 
     title: str = ""
 
@@ -83,16 +84,24 @@ def read_tables(name: str | Path) -> dict[str, Any]:
     """
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
-        try:
-            text = path.read_text("utf-8")
-        except OSError as error:
-            raise InputError(f"expected a case file at {path}, got: {error.strerror}") from error
-    else:
-        text = case_text(str(name))
+        with reading(path, "a case file", "'modeharvest cases NAME' prints one"):
+            return _tables(path)
+    return tomllib.loads(case_text(str(name)))
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    """What a TOML file holds; the mark that some editors put at its beginning is all right."""
+    content = path.read_bytes()
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(content.decode("utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name}: not valid TOML: {error}") from error
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}: expected UTF-8, as TOML has to be, got a byte 0x{content[error.start]:02x} "
+            f"in line {line}; save it as UTF-8"
+        ) from error
 
 
 def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) -> CaseType:
@@ -104,9 +113,13 @@ def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) 
         If a key is unknown (the nearest known one is suggested) or a value is out of its range.
     """
     try:
-        return model.model_validate(dict(tables))
+        case = model.model_validate(dict(tables))
+        require_types(tables, case)
     except ValidationError as error:
-        raise InputError(f"{name}: {_sentence(error, model)}") from error
+        raise InputError(f"{name}: {sentence(error, model)}") from error
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    return case
 
 
 def of_kind(table: Mapping[str, Any], kinds: Mapping[str, type[Any]], where: str) -> Any:
@@ -119,61 +132,16 @@ def of_kind(table: Mapping[str, Any], kinds: Mapping[str, type[Any]], where: str
     """
     constants = dict(table)
     kind = constants.pop("kind", next(iter(kinds)))
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise InputError(f"expected a {where} kind among {list(kinds)}, got {kind!r}")
     known = [f.name for f in fields(kinds[kind])]
     for name in constants:
         if name not in known:
             raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
-    try:
-        return TypeAdapter(kinds[kind]).validate_python(constants)
-    except ValidationError as error:
-        raise InputError(_sentence(error, None)) from error
+    return made(kinds[kind], constants)
 
 
 def kind_of(thing: object, kinds: Mapping[str, type[Any]]) -> dict[str, Any]:
     """The table of which ``of_kind`` makes this thing again."""
     names = {cls: kind for kind, cls in kinds.items()}
     return {"kind": names.get(type(thing), type(thing).__name__), **plain(thing)}
-
-
-def plain(value: Any) -> Any:
-    """A dataclass as plain JSON values; anything else as it is."""
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
-
-
-def _sentence(error: ValidationError, model: type[CaseModel] | None) -> str:
-    """The first fault, in one line: where, what came, what was expected."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if isinstance(first.get("ctx", {}).get("error"), InputError):
-        return f"[{where}] {first['ctx']['error']}" if where else str(first["ctx"]["error"])
-    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _known_keys(model, first["loc"][:-1])
-        return f"unknown key {where}{nearest(str(first['loc'][-1]), known)}"
-    if first["type"] == "missing":
-        return f"expected {where}, got none"
-    return f"{where}: {first['msg']}, got {first['input']!r}"
-
-
-def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[str]:
-    """The keys that the table at this place of a case may have."""
-    place = model
-    for part in table:
-        if not isinstance(part, int):  # a place in a list of tables
-            place = _table_type(place, part)
-    if place is None:
-        return []
-    return [f.name for f in fields(place)] if is_dataclass(place) else list(place.model_fields)
-
-
-def _table_type(place: type[Any] | None, name: str) -> type[Any] | None:
-    """The dataclass of a table within another; None if it has none of its own."""
-    hint = None if place is None else get_type_hints(place).get(name)
-    return next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)  # type: ignore[return-value]
-
-
-def nearest(name: str, known: list[str]) -> str:
-    """A hint at what was probably meant, or at all there is."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; known are: {', '.join(known)}"

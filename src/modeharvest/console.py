@@ -17,13 +17,18 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+_NOT_KEPT = (
+    "every time: neither the package's folder nor the home folder can be written to; "
+    "NUMBA_CACHE_DIR may name one that can"
+)
+
 
 class ProgressBars:
     """A progress listener that draws bars while it is open; use it in a ``with`` block."""
 
     def __init__(self, console: Console) -> None:
         self._bars = Progress(
-            TextColumn("{task.description:<28}"),
+            TextColumn("{task.description:<28}", markup=False),  # it may name a user's file
             BarColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
@@ -58,15 +63,16 @@ def compilation_announced(console: Console) -> Iterator[None]:
     """Say once, in one line, when a kernel has to be compiled because none is in the cache yet."""
     from numba.core import event  # here: --help needn't wait for it
 
+    from modeharvest.imaging.compiled import are_kept
+
     class Notice(event.Listener):
         told = False
 
         def on_start(self, event: Any) -> None:
             if not self.told:
                 self.told = True
-                console.print(
-                    "compiling kernels for this machine: some seconds, once; they are kept on disk"
-                )
+                kept = "once; they are kept on disk" if are_kept() else _NOT_KEPT
+                console.print(f"compiling kernels for this machine: some seconds, {kept}")
 
         def on_end(self, event: Any) -> None:
             pass

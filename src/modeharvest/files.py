@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 
 from modeharvest.errors import InputError
+from modeharvest.reading import reading
 
 
 @contextmanager
@@ -75,8 +76,31 @@ def write_json(path: Path | str, content: Any) -> None:
 
 
 def read_json(path: Path | str) -> Any:
-    """Read JSON; raises InputError if the file is missing or cut short."""
-    try:
-        return json.loads(Path(path).read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"expected a JSON file at {path}, got: {error}") from error
+    """Read JSON; raises InputError if the file is missing, cut short or nested too deeply."""
+    with reading(path, "a JSON file"):
+        return json.loads(Path(path).read_text("utf-8-sig"))
+
+
+def read_record(path: Path | str, form: str, what: str, remedy: str) -> dict[str, Any]:
+    """Read a JSON object whose ``format`` is ``form``.
+
+    Parameters
+    ----------
+    path
+        The file.
+    form
+        What its key ``format`` has to say.
+    what, remedy
+        For the message: what is expected there, and what to do.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, or of another format.
+    """
+    with reading(path, what, remedy):
+        content = read_json(path)
+        got = content.get("format") if isinstance(content, dict) else type(content).__name__
+        if got != form:
+            raise InputError(f"expected {form} in {path}, got {got!r}; {remedy}")
+        return dict(content)

@@ -244,7 +244,7 @@ def print_grading(grading: Grading, out: Path | str) -> None:
     console.print("rms: per component; 50 % and 95 % of the points err by less (length)")
     for note in grading.notes:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
-    console.print(f"report: {Path(out) / 'report.html'}")
+    console.print(f"report: {Path(out) / 'report.html'}", markup=False, soft_wrap=True)
 
 
 def _cells(grading: Grading, graded: Score) -> dict[str, str]:

@@ -32,7 +32,7 @@ def print_experiment(summary: dict[str, Any], out: Path) -> None:
     if summary["expected"]:
         missed = [row["quantity"] for row in summary["expected"] if not row["ok"]]
         console.print(f"expected values missed: {', '.join(missed) or 'none'}")
-    console.print(f"report: {out / 'report.html'}")
+    console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
 
 
 def critical_line(strain: float | None) -> str:
@@ -44,7 +44,7 @@ def critical_line(strain: float | None) -> str:
 
 def _snapshots(summary: dict[str, Any]) -> Table:
     """What was found at each strain, a column each."""
-    table = Table(title=str(summary.get("title", "")), title_justify="left")
+    table = Table(title=escape(str(summary.get("title", ""))), title_justify="left")
     table.add_column("quantity")
     for s in summary["snapshots"]:
         table.add_column(f"{100 * s['nominal_strain']:.2f} %", justify="right")

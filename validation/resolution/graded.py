@@ -98,4 +98,4 @@ def print_star_grading(grading: StarGrading, out: Path | str) -> None:
     console.print(table)
     for note in grading.notes:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
-    console.print(f"report: {Path(out) / 'report.html'}")
+    console.print(f"report: {Path(out) / 'report.html'}", markup=False, soft_wrap=True)

@@ -20,16 +20,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from modeharvest import __version__
 from modeharvest.errors import InputError
-from modeharvest.files import atomic, read_json, write_json
+from modeharvest.files import atomic, read_json, read_record, write_json
 from modeharvest.imaging.io import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
 from modeharvest.progress import Progress, silent
+from modeharvest.reading import reading
 from modeharvest.stages import digest, file_digest
+from modeharvest.typed import made
 from modeharvest.validation.resolution.star import Star, StarImages, fine_speckle
 from modeharvest.validation.resolution.star_words import readme
 from modeharvest.validation.scoring.benchmark_words import RETURNED
@@ -86,9 +87,6 @@ class StarSpec:
             )
 
 
-_SPEC = TypeAdapter(StarSpec)
-
-
 @dataclass(frozen=True, eq=False)
 class StarSet:
     """A star set in its folder.
@@ -117,16 +115,10 @@ class StarSet:
             If there is none.
         """
         path = Path(folder) / SIDECAR
-        if not path.is_file():
-            raise InputError(
-                f"expected a star set in {folder}, found no {SIDECAR}; 'modeharvest benchmark "
-                "star' makes one"
-            )
-        info = read_json(path)
-        got = info.get("format") if isinstance(info, dict) else None
-        if got != FORMAT:
-            raise InputError(f"expected {FORMAT} in {path}, got {got}; make the set again")
-        return cls(Path(folder), _SPEC.validate_python(info["spec"]), info)
+        what, remedy = "a star set", "'modeharvest benchmark star' makes one"
+        with reading(path, what, remedy):
+            info = read_record(path, FORMAT, what, remedy)
+            return cls(Path(folder), made(StarSpec, info["spec"]), info | {"id": str(info["id"])})
 
     @property
     def id(self) -> str:

@@ -28,11 +28,13 @@ from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.files import atomic, read_json, write_json
+from modeharvest.files import atomic, read_json, read_record, write_json
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec
 from modeharvest.imaging.isoparametric import interpolate, locate
 from modeharvest.imaging.pointwise import locate_points
+from modeharvest.reading import reading
+from modeharvest.typed import made
 from modeharvest.validation.scoring.benchmark_words import RETURNED, readme
 
 FloatArray = NDArray[np.float64]
@@ -68,23 +70,20 @@ class BenchmarkTruth:
         InputError
             If it is none, or its solution is not the one that the images were made of.
         """
-        folder = Path(folder)
-        if not (folder / SIDECAR).is_file():
-            raise InputError(
-                f"expected the truth of a benchmark in {folder}, found no {SIDECAR}; "
-                "'modeharvest benchmark make' leaves it beside the public folder"
-            )
-        info = read_json(folder / SIDECAR)
-        got = info.get("format") if isinstance(info, dict) else None
-        if got != TRUTH_FORMAT:
-            hint = "it is the public folder, without truth" if got == FORMAT else "make it again"
-            raise InputError(f"expected {TRUTH_FORMAT} in {folder / SIDECAR}, got {got}; {hint}")
-        if _digest(folder / SOLUTION) != info["solution_sha256"]:
-            raise InputError(
-                f"expected in {folder / SOLUTION} the solution that benchmark {info['id']} was "
-                "made of, got another one or none; make the benchmark again"
-            )
-        return cls(folder, info)
+        folder, what = Path(folder), "the truth of a benchmark"
+        remedy = (
+            "'modeharvest benchmark make' leaves it beside the public folder, which has a "
+            f"{SIDECAR} without truth"
+        )
+        with reading(folder / SIDECAR, what, remedy):
+            known = cls(folder, read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy))
+            _ = known.grid, known.specimen, known.strains, known.id
+            if _digest(folder / SOLUTION) != known.info["solution_sha256"]:
+                raise InputError(
+                    f"expected in {folder / SOLUTION} the solution that benchmark {known.id} was "
+                    "made of, got another one or none; make the benchmark again"
+                )
+            return known
 
     @property
     def id(self) -> str:
@@ -94,17 +93,17 @@ class BenchmarkTruth:
     @property
     def grid(self) -> PixelGrid:
         """The images' pixels."""
-        return PixelGrid(**self.info["grid"])
+        return made(PixelGrid, self.info["grid"])
 
     @property
     def specimen(self) -> Specimen:
         """The undeformed geometry."""
-        return Specimen(**self.info["specimen"])
+        return made(Specimen, self.info["specimen"])
 
     @property
     def strains(self) -> tuple[float, ...]:
         """Nominal strains of the deformed images [-]."""
-        return tuple(self.info["strains"])
+        return tuple(map(float, self.info["strains"]))
 
     @cached_property
     def solution(self) -> Solution:

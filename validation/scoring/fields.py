@@ -5,22 +5,20 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import h5py
-import meshio
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
 from modeharvest.errors import InputError
+from modeharvest.fem.field import read_any_mesh
 from modeharvest.idic.fields.files import read_field
 from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.fields.tables import read_mat
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.reading import open_hdf5, reading
 
 _VTK = {".vtk", ".vtu", ".vtp"}
 _TEXT = {".csv", ".txt", ".dat", ".tsv"}
@@ -119,8 +117,9 @@ def _in_options(message: str) -> str:
 def claimed_benchmark(path: Path) -> str | None:
     """The id that a file itself says it belongs to; None if it says none or can't be read."""
     try:
-        return _claim(path)
-    except (OSError, ValueError, KeyError, NotImplementedError, MatReadError):
+        with reading(path, "a displacement field"):
+            return _claim(path)
+    except InputError:
         return None  # whoever reads the field itself says what is wrong
 
 
@@ -135,10 +134,10 @@ def _claim(path: Path) -> str | None:
         with np.load(path, allow_pickle=False) as file:
             said = f"benchmark {file['benchmark']}"
     elif h5py.is_hdf5(path):
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path, "a displacement field") as file:
             said = f"benchmark {file.attrs['benchmark']}"
     elif suffix == ".mat":
-        said = f"benchmark {loadmat(path, variable_names=['benchmark'])['benchmark'].ravel()[0]}"
+        said = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
     found = _ID.search(said)
     return found.group(1).lower() if found else None
 
@@ -157,18 +156,13 @@ def _read_vtk(path: Path, grid: PixelGrid, **how: Any) -> LocalField:
 
 def _points_of_vtk(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
     """(4, n) x, y, u, v."""
-    said = StringIO()
-    try:
-        with redirect_stdout(said), redirect_stderr(said):
-            mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio raises anything, prints, and may exit
-        reason = " ".join((said.getvalue() or str(error)).split())
-        raise InputError(f"{path}: can't be read as {path.suffix}: {reason}") from error
-    vectors = {
-        name: np.asarray(values, dtype=np.float64)
-        for name, values in mesh.point_data.items()
-        if np.ndim(values) == 2 and np.shape(values)[1] in (2, 3)
-    }
+    with reading(path, f"a displacement field ({path.suffix})", "save it as CSV"):
+        mesh = read_any_mesh(path)
+        vectors = {
+            name: np.asarray(values, dtype=np.float64)
+            for name, values in mesh.point_data.items()
+            if np.ndim(values) == 2 and np.shape(values)[1] in (2, 3)
+        }
     named = [name for name in vectors if name.lower() in _VECTORS] or list(vectors)
     if len(named) != 1:
         raise InputError(

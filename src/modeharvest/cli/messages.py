@@ -1,16 +1,25 @@
-"""What goes to stderr: progress bars, warnings, errors."""
+"""What goes to stderr: progress bars, warnings, errors; and the exit codes of errors."""
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
+import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich.console import Console
 from rich.markup import escape
 
 from modeharvest.console import ProgressBars, compilation_announced
+from modeharvest.errors import InputError, MissingDependencyError
 
 console = Console(stderr=True)
+
+UNUSABLE, FAULT, INTERRUPTED, UNREAD = 2, 70, 130, 1
+"""Exit codes: of input or an environment that can't be used; of a fault in the program (EX_SOFTWARE
+of sysexits.h); after Ctrl-C; where nobody reads what is printed (as in ``| head``)."""
 
 
 class InterruptionError(Exception):
@@ -19,18 +28,9 @@ class InterruptionError(Exception):
 
 @contextmanager
 def bars() -> Iterator[ProgressBars]:
-    """Progress bars for the work of a ``with`` block, which Ctrl-C ends.
-
-    Raises
-    ------
-    InterruptionError
-        In place of KeyboardInterrupt.
-    """
-    try:
-        with ProgressBars(console) as drawn, compilation_announced(console):
-            yield drawn
-    except KeyboardInterrupt as error:
-        raise InterruptionError from error
+    """Progress bars for the work of a ``with`` block."""
+    with ProgressBars(console) as drawn, compilation_announced(console):
+        yield drawn
 
 
 def warn(message: str) -> None:
@@ -38,7 +38,53 @@ def warn(message: str) -> None:
     console.print(f"[yellow]warning:[/yellow] {escape(message)}", highlight=False)
 
 
-def tell_error(error: Exception) -> None:
-    """Print an error's message in one line."""
-    message = " ".join(str(error).split())
-    console.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
+def tell(error: BaseException) -> int:
+    """Say in one line why a command ended early; returns the exit code.
+
+    Nothing leads to a traceback on the terminal: what nobody thought of goes to a file.
+    """
+    if isinstance(error, BrokenPipeError):
+        return UNREAD
+    if isinstance(error, (InterruptionError, KeyboardInterrupt)):
+        _print("interrupted; run the same command again to continue where it stopped")
+        return INTERRUPTED
+    _print(f"[red]error:[/red] {escape(_line(error))}")
+    return UNUSABLE if isinstance(error, _FORESEEN) else FAULT
+
+
+_FORESEEN = (
+    InputError, MissingDependencyError, MemoryError, OSError, UnicodeError, RecursionError,
+)  # fmt: skip
+
+
+def _print(line: str) -> None:
+    with suppress(OSError):  # stderr may be full or closed, too
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _line(error: BaseException) -> str:
+    """An error in one line."""
+    if isinstance(error, (InputError, MissingDependencyError)):
+        return " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return "the memory is full; take larger pixels or elements, or fewer unknowns"
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return f"the operating system refuses: {where}{error.strerror}"
+    what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    if isinstance(error, _FORESEEN):
+        return what
+    return f"a fault in modeharvest itself ({what:.200}); please report it with {_log(error)}"
+
+
+def _log(error: BaseException) -> str:
+    """Write an error's traceback to a new file; returns its name."""
+    text = f"{' '.join(map(repr, sys.argv))}\n{sys.version}\n\n"
+    text += "".join(traceback.format_exception(error))
+    try:
+        handle, name = tempfile.mkstemp(".log", "modeharvest-")
+        with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(text)
+    except OSError:
+        return f"what could be written to no file: {text}"
+    return name

@@ -1,20 +1,24 @@
-"""The root of the command line: its commands, and what becomes of errors."""
+"""The root of the command line: its commands, and the net under them that catches all errors."""
 
 from __future__ import annotations
 
+import functools
 import os
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from modeharvest import __version__
 from modeharvest.cli import benchmark, cases, experiment, lattice, messages, photographs, study
-from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.ranks import is_first
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 app = typer.Typer(
     help=(
@@ -24,7 +28,10 @@ app = typer.Typer(
         "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold], or, for the modes "
         "of an infinite lattice, [bold]modeharvest modes square-lattice --out out/square[/bold]"
     ),
-    epilog="Exit codes: 0 done, 2 the input can't be used (one line says why), 130 interrupted.",
+    epilog=(
+        "Exit codes: 0 done, 2 the input can't be used (one line says why), 70 a fault in the "
+        "program (one line names a log), 130 interrupted."
+    ),
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -47,11 +54,26 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
     "How good a measurement is": (study.study, benchmark.score),
     "To begin with": (cases.cases,),
 }
+
+
+def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, whose interruptions the command-line library leaves to us."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> None:
+        try:
+            command(*arguments, **options)
+        except KeyboardInterrupt as error:
+            raise messages.InterruptionError from error
+
+    return run
+
+
 for family, commands in _FAMILIES.items():
     for command in commands:
-        app.command(rich_help_panel=family)(command)
+        app.command(rich_help_panel=family)(_interruptible(command))
 for command in (benchmark.make, benchmark.star, benchmark.resolution):
-    benchmark_app.command()(command)
+    benchmark_app.command()(_interruptible(command))
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 
 
@@ -72,6 +94,8 @@ def _common(
 
 def main() -> None:
     """Entry point of the ``modeharvest`` command."""
+    _open_streams()
+    sys.unraisablehook = _keep_interruption
     if is_first():
         _run()
     else:  # under mpirun one speaks for all
@@ -82,12 +106,43 @@ def main() -> None:
 
 def _run() -> None:
     try:
-        app()
-    except (InputError, MissingDependencyError) as error:
-        messages.tell_error(error)
-        sys.exit(2)
-    except messages.InterruptionError:
-        messages.console.print(
-            "interrupted; run the same command again to continue where it stopped"
-        )
-        sys.exit(130)
+        try:
+            app()
+        finally:
+            sys.stdout.flush()  # a full disk shows now or never
+    except SystemExit:
+        raise
+    except BaseException as error:
+        _drop_output()
+        sys.exit(messages.tell(error))
+
+
+def _open_streams() -> None:
+    """Have all three streams, whatever the caller has closed, and no character they can't print.
+
+    A closed one's number would go to the next file opened, and what libraries print into that.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        pass
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        if hasattr(stream := getattr(sys, name), "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _drop_output() -> None:
+    """Have what is left to be printed to a full or closed stdout not fail once more at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _keep_interruption(ignored: UnraisableHookArgs) -> None:
+    """Ctrl-C during a destructor or a callback, where Python can only print it, comes again."""
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    else:
+        sys.__unraisablehook__(ignored)

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from modeharvest.case_file import CaseModel, checked, plain, read_tables
+from modeharvest.case_file import CaseModel, checked, read_tables
 from modeharvest.errors import InputError
 from modeharvest.harvest.options import LocalTable, Measurement, NoiseTable
+from modeharvest.typed import plain
 
 Corners = tuple[tuple[float, float], ...]
 

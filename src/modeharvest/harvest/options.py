@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from modeharvest.case_file import nearest
 from modeharvest.errors import InputError
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import CorrelationOptions
+from modeharvest.typed import nearest
 
 LOCAL = ("none", "pyvale", "file")
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest import __version__
-from modeharvest.case_file import plain
 from modeharvest.errors import InputError
 from modeharvest.files import read_json, require_writable, write_json
 from modeharvest.harvest.experiment import Experiment, read_experiment
@@ -37,6 +36,7 @@ from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import Stages, digest, file_digest
+from modeharvest.typed import plain
 from modeharvest.validation.harvest.report import write_harvest_report
 from modeharvest.validation.harvest.run import Harvest, HarvestTruth
 from modeharvest.validation.harvest.summary import harvest_summary

@@ -45,7 +45,7 @@ def print_harvest(summary: dict[str, Any], out: Path) -> None:
                 f"[yellow]warning:[/yellow] {escape(frame['name'])}: {escape(warning)}",
                 soft_wrap=True,
             )
-    console.print(f"report: {out / 'report.html'}")
+    console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
 
 
 def _skipped(summary: dict[str, Any]) -> list[tuple[str, str]]:

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.case import TwinCase
-from modeharvest.case_file import plain
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, read_json, write_json
@@ -36,6 +35,7 @@ from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_
 from modeharvest.imaging.io import write_image
 from modeharvest.progress import Progress, silent
 from modeharvest.stages import digest
+from modeharvest.typed import plain
 
 FloatArray = NDArray[np.float64]
 

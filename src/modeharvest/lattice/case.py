@@ -31,9 +31,7 @@ from modeharvest.case_file import (
     checked,
     is_lattice,
     kind_of,
-    nearest,
     of_kind,
-    plain,
     read_tables,
 )
 from modeharvest.errors import InputError
@@ -41,6 +39,7 @@ from modeharvest.fem.materials import Material, Ogden
 from modeharvest.lattice.kinds import LATTICES, Lattice, SquareLattice
 from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan, Search
 from modeharvest.progress import Progress, silent
+from modeharvest.typed import nearest, plain
 from modeharvest.validation.lattice.independence import LOADINGS, RATIOS
 from modeharvest.validation.lattice.independence import MATERIALS as MATERIALS_BY_NAME
 from modeharvest.validation.lattice.independence import Lattice as StudiedLattice

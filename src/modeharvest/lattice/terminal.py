@@ -34,7 +34,7 @@ def print_lattice(summary: dict[str, Any], out: Path) -> None:
         console.print(escape(line), soft_wrap=True)
     for note in summary["notes"]:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True)
-    console.print(f"report: {out / 'report.html'}")
+    console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
 
 
 def _critical(critical: dict[str, Any], outcome: str) -> list[str]:

@@ -26,8 +26,9 @@ from typing import Any, Self
 from pydantic import field_validator, model_validator
 
 from modeharvest.case import Case
-from modeharvest.case_file import checked, kind_of, nearest, of_kind, read_tables
+from modeharvest.case_file import checked, kind_of, of_kind, read_tables
 from modeharvest.errors import InputError
+from modeharvest.typed import nearest
 from modeharvest.validation.resolution.study import Resolution
 from modeharvest.validation.studies.modes.study import Modes
 from modeharvest.validation.studies.noise.study import Noise

@@ -54,7 +54,7 @@ def print_study(summary: dict[str, Any], out: Path) -> None:
         console.print(f"- {escape(sentence)}", soft_wrap=True)
     for failure in summary["failed"]:
         console.print(
-            f"[yellow]failed:[/yellow] cases/{failure['file']}: {escape(failure['error'])}",
+            f"[yellow]failed:[/yellow] cases/{failure['file']}: {escape(str(failure['error']))}",
             soft_wrap=True,
         )
     seconds = summary["timings_s"]
@@ -62,4 +62,4 @@ def print_study(summary: dict[str, Any], out: Path) -> None:
         f"{summary['cases']} cases, {summary['seconds_of_all_cases']:.0f} s of work; this run "
         f"took {sum(seconds.values()):.0f} s"
     )
-    console.print(f"report: {out / 'report.html'}")
+    console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
