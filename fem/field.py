@@ -12,10 +12,8 @@ corners, then (Q9) the centre; this is the order of VTK, gmsh and meshio.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.files import atomic, atomic_hdf5
-from modeharvest.reading import open_hdf5, reading, reason
+from modeharvest.reading import open_hdf5, read_in_child, reading
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -214,14 +212,20 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
 
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:
-    """Read a mesh file of any format that meshio knows; whatever is wrong with it is InputError."""
-    said = io.StringIO()
-    with reading(path, "a mesh that meshio reads", "export it again"):
-        try:
-            with redirect_stdout(said), redirect_stderr(said):
-                return meshio.read(path)
-        except (Exception, SystemExit) as error:  # meshio prints why, and may exit
-            raise ValueError(said.getvalue() or reason(error)) from error
+    """Points, cells and nodal fields of a file of any format that meshio knows.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, in one line.
+    """
+    what, remedy = "a mesh that meshio reads", "export it again"
+    found = read_in_child("mesh", path, what, remedy)
+    with reading(path, what, remedy):
+        named = [(name.split("/", 2), values) for name, values in found.items()]
+        cells = [(name[2], values) for name, values in named if name[0] == "cells"]
+        fields = {"/".join(name[1:]): v for name, v in named if name[0] == "point_data"}
+        return meshio.Mesh(found["points"], cells, point_data=fields)
 
 
 def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:

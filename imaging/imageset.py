@@ -88,8 +88,11 @@ class ImageSet:
         with reading(path, what, remedy):
             images = cls(Path(folder), read_record(path, FORMAT, what, remedy))
             _ = images.grid, images.spec, images.max_residual_px
+            states = [images._snapshot(strain)["truth"] for strain in images.strains]
             for entry in (images.info["reference"], *map(images._snapshot, images.strains)):
-                _ = [str(entry[name]) for name in ("image", "camera_image", "mask")]
+                states += [entry[name] for name in ("image", "camera_image", "mask")]
+            if not all(isinstance(name, str) for name in states):
+                raise InputError(f"expected names of files, got {states}")
             return images
 
     @property

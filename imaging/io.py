@@ -14,8 +14,7 @@ from PIL import Image
 
 from modeharvest.errors import InputError
 from modeharvest.files import atomic
-from modeharvest.memory import require_memory
-from modeharvest.reading import reading
+from modeharvest.reading import reading, require_plausible
 
 BoolArray = NDArray[np.bool_]
 
@@ -142,10 +141,10 @@ def _read(path: Path) -> NDArray[Any]:
     with reading(path, "a whole TIFF, PNG or JPEG image", remedy):
         if path.suffix.lower() in _TIFF:
             with tifffile.TiffFile(path) as file:
-                require_memory(file.series[0].nbytes, "an image", "crop it")
+                require_plausible(path, file.series[0].nbytes)
                 return np.asarray(file.asarray())
         with Image.open(path) as picture:
-            require_memory(float(np.prod(picture.size)) * 4.0, "an image", "crop it")
+            require_plausible(path, float(picture.width) * picture.height)
         return np.asarray(skimage.io.imread(path))
 
 

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from modeharvest.errors import InputError
 from modeharvest.files import atomic_hdf5
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.render import Truth
@@ -27,6 +29,8 @@ from modeharvest.reading import open_hdf5
 
 FORMAT = "modeharvest-truth-1"
 
+_TYPES = {"element": np.int32, "deformed_displacement": np.float32, "residual_px": np.float32}
+"""Of the planes that aren't float64."""
 _CONTENT = {
     "displacement": ("mm", "displacement (x, y) at the reference image's pixels"),
     "reference_point": ("mm", "reference point (x, y) shown by the deformed image's pixels"),
@@ -59,5 +63,11 @@ def read_truth(path: Path | str) -> Truth:
     """Read what :func:`write_truth` wrote; InputError if missing, cut short or another format."""
     remedy = "make it again with 'modeharvest image'"
     with open_hdf5(path, "a truth file (HDF5)", remedy, FORMAT) as file:
-        planes = {name: np.asarray(file[name]) for name in _CONTENT}
+        planes: dict[str, Any] = {
+            n: np.asarray(file[n], dtype=_TYPES.get(n, np.float64)) for n in _CONTENT
+        }
+        size = planes["element"].shape
+        for name, plane in planes.items():
+            if len(size) != 2 or plane.shape not in (size, (2, *size)):
+                raise InputError(f"expected {name} of (2 x) rows x cols, got {plane.shape}")
         return Truth(**{n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()})

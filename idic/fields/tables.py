@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -17,17 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
-from modeharvest.memory import available_bytes, require_memory
-from modeharvest.reading import open_hdf5, reading
+from modeharvest.memory import require_memory
+from modeharvest.reading import open_hdf5, read_in_child, reading, require_plausible
 
 FloatArray = NDArray[np.float64]
 Table = dict[str, FloatArray]
 
 _MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
 _WHAT, _REMEDY = "a displacement field", "export it again, best as CSV"
-_MAT_SIDE = Path(__file__).with_name("mat_side.py")
-_MAT_SECONDS = 300.0
-"""After which a MAT file is taken for one that makes its parser run for ever."""
 _BYTES_OF_TEXT = 10.0
 """Most that a character of a table of numbers becomes in memory."""
 _HEAD = 1000
@@ -156,10 +150,11 @@ def _number(text: str, decimal: str, path: Path, line: int) -> float:
 
 
 def _read_npz(path: Path) -> Table:
-    with ZipFile(path) as archive:
-        size = float(sum(part.file_size for part in archive.infolist()))
-    require_memory(size, f"the table {path}", "thin it out")
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream:  # which numpy doesn't close if the archive is damaged
+        with ZipFile(stream) as archive:
+            require_plausible(path, float(sum(part.file_size for part in archive.infolist())))
+        stream.seek(0)
+        file = np.load(stream, allow_pickle=False)
         return _numeric({name: file[name] for name in file.files})
 
 
@@ -179,28 +174,8 @@ def _read_mat(path: Path) -> Table:
 
 
 def read_mat(path: Path) -> dict[str, NDArray[Any]]:
-    """Numeric and text variables of a MAT file before version 7.3, by their path in structures.
-
-    Read by a child: a damaged file makes scipy's parser crash the process that it runs in.
-
-    Raises
-    ------
-    InputError
-        If the parser gives up, crashes, or doesn't end.
-    """
-    with reading(path, "a MAT file", _REMEDY), tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "read.npz"
-        command = [sys.executable, "-P", _MAT_SIDE, path.resolve(), target, available_bytes()]
-        done = subprocess.run(
-            list(map(str, command)), capture_output=True, text=True, timeout=_MAT_SECONDS,
-            errors="replace", check=False,
-        )  # fmt: skip
-        if done.returncode < 0:
-            raise ValueError(f"a file that makes its parser crash (signal {-done.returncode})")
-        if done.returncode:
-            raise ValueError((done.stderr.strip().splitlines() or ["nothing"])[-1])
-        with np.load(target, allow_pickle=False) as file:
-            return {str(name): file[f"arr_{k}"] for k, name in enumerate(file["names"])}
+    """Numbers and texts of a MAT file before version 7.3, by their path in structures."""
+    return read_in_child("mat", path, "a MAT file", _REMEDY)
 
 
 def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ read by Pillow.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from modeharvest.errors import InputError
-from modeharvest.memory import require_memory
-from modeharvest.reading import reading
+from modeharvest.reading import reading, require_plausible
 
 TIFF = {".tif", ".tiff"}
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
 _ORIENTATION = 274
 """The tag of TIFF and of Exif."""
 
@@ -78,7 +79,7 @@ def _read_tiff(path: Path) -> Stored:
     with tifffile.TiffFile(path) as file:
         page, count = file.pages.first, len(file.pages)
         notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
-        _require_memory(page.nbytes)
+        require_plausible(path, page.nbytes)
         try:
             levels = np.asarray(page.asarray())
         except (ValueError, ImportError) as error:
@@ -99,11 +100,6 @@ def _read_tiff(path: Path) -> Stored:
         return Stored(turned, (*notes, *said))
 
 
-def _require_memory(stored: float) -> None:
-    """A header of a few bytes can declare any size."""
-    require_memory(2.0 * stored, "a photograph", "crop it")
-
-
 def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> Stored:
     if page.samplesperpixel > 1 and page.bitspersample != 8:
         # Pillow would drop the lower bits without a word.
@@ -119,7 +115,7 @@ def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> Stored:
 
 def _read_other(path: Path) -> Stored:
     with Image.open(path) as picture:
-        _require_memory(4.0 * picture.width * picture.height)
+        require_plausible(path, float(picture.width) * picture.height)
         if picture.format == "PNG" and _png_is_deep_colour(path):
             raise InputError(
                 f"expected 8-bit colour, or grey of up to 16 bits, in the PNG {path}, got 16-bit "

@@ -1,21 +1,31 @@
 """Files that others made: whatever is wrong with one is told in one line that names it.
 
 The libraries that read formats raise anything for a damaged file. What a reader does with them
-stands in a ``with reading(...)`` block, which turns all of it into InputError, and HDF5 is opened
-by :func:`open_hdf5`, which refuses files that would read others or fill the memory.
+stands in a ``with reading(...)`` block, which turns all of it into InputError. HDF5 is opened by
+:func:`open_hdf5`, which refuses files that would read others or fill the memory; what can't be
+trusted even so is read by :func:`read_in_child`.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
+from modeharvest import child
 from modeharvest.errors import InputError
 from modeharvest.memory import require_memory
+
+_CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
+"""After which a file is taken for one that makes its parser run for ever."""
 
 
 @contextmanager
@@ -42,9 +52,8 @@ def reading(path: Path | str, what: str, remedy: str = "make it again") -> Itera
     try:
         yield path
     except InputError as error:
-        if str(path) in str(error):
-            raise
-        raise InputError(f"{path}: {error}") from error
+        line = " ".join(str(error).split())
+        raise InputError(line if str(path) in line else f"{path}: {line}") from error
     except Exception as error:  # every format and library has exceptions of its own
         raise InputError(f"expected {what} at {path}, got: {reason(error)}; {remedy}") from error
 
@@ -93,31 +102,82 @@ def open_hdf5(
     with reading(path, what, remedy) as path, h5py.File(path, "r") as file:
         if form is not None and (got := file.attrs.get("format")) != form:
             raise InputError(f"expected a {form} file at {path}, got format {got!r}; {remedy}")
-        _require_self_contained(file)
+        _require_self_contained(file, path)
         yield file
 
 
-def _require_self_contained(file: h5py.File) -> None:
+def require_plausible(path: Path, declared: float) -> None:
+    """Refuse a file that declares more than it can hold, or more than there is memory for.
+
+    Parameters
+    ----------
+    path
+        The file.
+    declared
+        What it says that it holds [bytes].
+
+    Raises
+    ------
+    InputError
+        A header of a few bytes can declare any size.
+    """
+    size = path.stat().st_size
+    if not declared <= child.BASE_BYTES / 10.0 + child.BYTES_PER_BYTE * size:
+        raise InputError(
+            f"expected a whole file at {path}, got {size} bytes that declare {declared:.3g}"
+        )
+    require_memory(declared, f"the file {path}", "take a part of it")
+
+
+def read_in_child(kind: str, path: Path | str, what: str, remedy: str) -> dict[str, NDArray[Any]]:
+    """Numbers and texts of a file, by their names, read by :mod:`modeharvest.child`.
+
+    Parameters
+    ----------
+    kind
+        "mat" or "mesh".
+    path, what, remedy
+        As for :func:`reading`.
+
+    Raises
+    ------
+    InputError
+        If the parser gives up, crashes, or doesn't end.
+    """
+    with reading(path, what, remedy) as path, tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "read.npz"
+        command = [sys.executable, "-P", child.__file__, kind, str(path.resolve()), str(target)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False,
+            timeout=_CHILD_SECONDS + path.stat().st_size * _CHILD_SECONDS_PER_BYTE,
+        )  # fmt: skip
+        if done.returncode < 0:
+            raise ValueError(f"a file that makes its parser crash (signal {-done.returncode})")
+        if done.returncode:
+            raise ValueError((done.stderr.strip().splitlines() or ["nothing"])[-1])
+        with np.load(target, allow_pickle=False) as file:
+            return {str(name): file[f"arr_{k}"] for k, name in enumerate(file["names"])}
+
+
+def _require_self_contained(file: h5py.File, path: Path) -> None:
     total = 0.0
 
-    def look_at_link(name: str, link: Any) -> None:
-        if isinstance(link, h5py.ExternalLink):
-            raise InputError(
-                f"expected all data in the file itself, got {name!r}, which is in another file: "
-                f"{link.filename}; copy it in (h5repack, h5copy)"
-            )
+    # What these return that isn't None ends the visit; what they raise would get lost in HDF5.
+    def outside(name: str, link: Any) -> str | None:
+        is_external = isinstance(link, h5py.ExternalLink)
+        return f"{name!r}, which is in another file, {link.filename!r}" if is_external else None
 
-    def look_at_object(name: str, thing: Any) -> None:
+    def stored_outside(name: str, thing: Any) -> str | None:
         nonlocal total
         if not isinstance(thing, h5py.Dataset):
-            return
-        if thing.external or thing.is_virtual:
-            raise InputError(
-                f"expected all data in the file itself, got {name!r}, whose numbers are in another "
-                "file; copy them in (h5repack)"
-            )
+            return None
         total += thing.nbytes
+        is_external = thing.external or thing.is_virtual
+        return f"{name!r}, whose numbers are in another file" if is_external else None
 
-    file.visititems_links(look_at_link)
-    file.visititems(look_at_object)
-    require_memory(total, "a file", "take a part of it")
+    found = file.visititems_links(outside) or file.visititems(stored_outside)
+    if found:
+        raise InputError(
+            f"expected all data in the file itself, got {found}; copy them in (h5repack)"
+        )
+    require_plausible(path, total)

@@ -131,7 +131,8 @@ def _claim(path: Path) -> str | None:
                 line for _, line in zip(range(50), file, strict=False) if line[0] in "#%"
             )
     elif suffix == ".npz":
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream:
+            file = np.load(stream, allow_pickle=False)
             said = f"benchmark {file['benchmark']}"
     elif h5py.is_hdf5(path):
         with open_hdf5(path, "a displacement field") as file:
