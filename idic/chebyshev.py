@@ -106,15 +106,17 @@ class ChebyshevField:
         matrix[i, j] = coefficients
         return matrix
 
-    def evaluate(self, coefficients: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Evaluate the field at positions [mm] that broadcast together.
+    def evaluate(
+        self, coefficients: ArrayLike, x: FloatArray, y: FloatArray, out: FloatArray | None = None
+    ) -> FloatArray:
+        """Evaluate the field at positions [mm] that broadcast together, into ``out`` if given.
 
         Fast on an open grid, x of shape (1, cols) and y of shape (rows, 1).
         """
         xi, eta = self.box.normalised(x, y)
         table = self.square(coefficients).T
         along_x = np.asarray(np.tensordot(table, chebyshev(xi, self.degree), axes=1), np.float64)
-        return sum_of_products(along_x, chebyshev(eta, self.degree))
+        return sum_of_products(along_x, chebyshev(eta, self.degree), out)
 
     def basis(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., size): every product T_i T_j at positions [mm] that broadcast together."""

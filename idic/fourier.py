@@ -253,22 +253,30 @@ class FourierMode:
 
     def waves_sum(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., 2): sum of (A, B) sin theta [-], without scale and support."""
-        per_mm = np.pi / self.half_wavelength
-        total = np.zeros((*np.broadcast_shapes(np.shape(x), np.shape(y)), 2))
-        for a, b, kx, ky, c in self.family.waves(parameters):
-            # Products of one-dimensional tables: on an open grid no sine per pixel is needed.
-            tx, ty = per_mm * kx * x, per_mm * (ky * y + c)
-            sine = sum_of_products(
-                np.stack([np.sin(tx), np.cos(tx)]), np.stack([np.cos(ty), np.sin(ty)])
-            )
-            total[..., 0] += a * sine
-            total[..., 1] += b * sine
-        return total
+        return self._weighted_sum(parameters, x, y, np.ones_like(x), np.ones_like(y))
 
     def evaluate(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., 2): phi [-] along x and y, at positions [mm] that broadcast together."""
-        envelope = self.scale * self.taper.along_x(x) * self.taper.along_y(y)
-        return envelope[..., None] * self.waves_sum(parameters, x, y)
+        taper_x, taper_y = self.scale * self.taper.along_x(x), self.taper.along_y(y)
+        return self._weighted_sum(parameters, x, y, taper_x, taper_y)
+
+    def _weighted_sum(
+        self, parameters: ArrayLike, x: FloatArray, y: FloatArray, of_x: FloatArray,
+        of_y: FloatArray,
+    ) -> FloatArray:  # fmt: skip
+        """(..., 2): sum of (A, B) sin theta, times a function of x and one of y."""
+        per_mm = np.pi / self.half_wavelength
+        waves = self.family.waves(parameters)
+        tx = [per_mm * kx * x for kx in waves[:, 2]]
+        ty = [per_mm * (ky * y + c) for ky, c in waves[:, 3:]]
+        # sin(tx + ty) in products of one-dimensional tables: on an open grid no sine per pixel.
+        along_x = of_x * np.stack([*np.sin(tx), *np.cos(tx)])
+        along_y = of_y * np.stack([*np.cos(ty), *np.sin(ty)])
+        twice = np.vstack([waves, waves]).reshape(-1, PER_WAVE, *(1,) * np.ndim(y))
+        components = np.empty((2, *np.broadcast_shapes(np.shape(x), np.shape(y))))
+        for c in (0, 1):
+            sum_of_products(along_x, twice[:, c] * along_y, components[c])
+        return np.moveaxis(components, 0, -1)
 
     def sensitivities(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., 2, m): derivatives of phi with respect to the mode's parameters."""

@@ -48,7 +48,7 @@ from modeharvest.imaging.render import Truth, render_deformed, render_reference
 from modeharvest.imaging.set_key import FORMAT, image_key, sha256_of
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import Speckle
-from modeharvest.imaging.truth import read_truth, write_truth
+from modeharvest.imaging.truth import read_displacement, read_truth, write_truth
 from modeharvest.progress import Progress, silent
 from modeharvest.reading import reading
 from modeharvest.typed import made
@@ -142,6 +142,10 @@ class ImageSet:
     def truth(self, strain: float) -> Truth:
         """Read the truth behind the deformed image at a nominal strain [-]."""
         return read_truth(self.folder / self._snapshot(strain)["truth"])
+
+    def displacement(self, strain: float) -> FloatArray:
+        """(rows, cols, 2) true displacement [mm] at the reference image's pixels, NaN off it."""
+        return read_displacement(self.folder / self._snapshot(strain)["truth"])
 
     def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
         path = self.folder / entry["camera_image" if camera else "image"]

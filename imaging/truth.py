@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.files import atomic_hdf5
@@ -61,13 +62,21 @@ def write_truth(path: Path | str, truth: Truth, nominal_strain: float, grid: Pix
 
 def read_truth(path: Path | str) -> Truth:
     """Read what :func:`write_truth` wrote; InputError if missing, cut short or another format."""
+    return Truth(**_read(path, *_CONTENT))
+
+
+def read_displacement(path: Path | str) -> NDArray[np.float64]:
+    """(rows, cols, 2) the displacement [mm] alone, in a third of the time."""
+    return np.asarray(_read(path, "displacement")["displacement"], dtype=np.float64)
+
+
+def _read(path: Path | str, *names: str) -> dict[str, NDArray[Any]]:
+    """Some of the file's arrays, components last."""
     remedy = "make it again with 'modeharvest image'"
     with open_hdf5(path, "a truth file (HDF5)", remedy, FORMAT) as file:
-        planes: dict[str, Any] = {
-            n: np.asarray(file[n], dtype=_TYPES.get(n, np.float64)) for n in _CONTENT
-        }
-        size = planes["element"].shape
+        planes = {n: np.asarray(file[n], dtype=_TYPES.get(n, np.float64)) for n in names}
+        size = file["element"].shape
         for name, plane in planes.items():
             if len(size) != 2 or plane.shape not in (size, (2, *size)):
                 raise InputError(f"expected {name} of (2 x) rows x cols, got {plane.shape}")
-        return Truth(**{n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()})
+        return {n: np.moveaxis(p, 0, -1) if p.ndim == 3 else p for n, p in planes.items()}

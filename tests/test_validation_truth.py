@@ -19,9 +19,10 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.validation import truth as truth_module
 from modeharvest.validation.metrics import describe
 from modeharvest.validation.outline import Outline
-from modeharvest.validation.truth import Comparison, pattern_size
+from modeharvest.validation.truth import Comparison, best_fit, pattern_size
 
 GRID = PixelGrid.centred(150, 130, 0.02)
 # The body that `manufactured.one_mode` is made for: a cellular part of 2.0 x 2.4 mm, l = 1 mm.
@@ -56,6 +57,28 @@ def comparison() -> Comparison:
     step[ansatz.v0_slice(1).start] = -0.004
     measured = replace(best, unknowns=best.unknowns + step)
     return Comparison(0.05, GRID, mask, truth, measured, best, np.zeros(GRID.shape))
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_the_best_fit_is_the_lowest_minimum_though_it_is_looked_for_on_few_pixels(
+    flip: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(truth_module, "_ENOUGH", 800)  # every third pixel or so
+    ansatz, mask = one_mode(), body()
+    near = ansatz.start(0.05, 1.0)
+    trapped = near.copy()
+    trapped[ansatz.phi_slice(0)][1:3] *= 2.5  # wave vectors that lead to another minimum
+    truth = ansatz.displacement(near, GRID.x, GRID.y) + beyond_the_ansatz()
+    truth = np.where(mask[..., None], truth, np.nan)
+    on_all = [fit_displacement(truth, GRID, ansatz, a, mask) for a in (near, trapped)]
+    assert on_all[1].residual_rms > 1.1 * on_all[0].residual_rms
+    starts = (trapped, near) if flip else (near, trapped)
+    found = best_fit(truth, GRID, ansatz, starts, mask)
+    assert found.pixels == on_all[0].pixels
+    assert found.residual_rms <= on_all[0].residual_rms
+    # as near as the coarser tolerance of the other, 1e-4 px
+    apart = found.displacement() - on_all[0].displacement()
+    assert np.abs(apart[mask]).max() < 1e-3 * GRID.pixel_size
 
 
 def test_rms_is_per_component_and_the_length_is_root_two_of_it() -> None:

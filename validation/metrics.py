@@ -7,6 +7,7 @@ length is sqrt(2) times that.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,12 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+
+def lengths(field: FloatArray) -> FloatArray:
+    """(...) Euclidean lengths of the vectors of a field (..., 2)."""
+    x, y = field[..., 0], field[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def describe(field: FloatArray, mask: BoolArray, unit: float = 1.0) -> dict[str, Any]:
@@ -35,14 +42,16 @@ def describe(field: FloatArray, mask: BoolArray, unit: float = 1.0) -> dict[str,
         ``mean`` and ``rms`` as (x, y); ``rms_per_component``; ``rms_length``, ``median_length``,
         ``p95_length`` and ``max_length`` of the vectors' Euclidean length.
     """
-    values = field[mask] / unit
-    length = np.hypot(values[:, 0], values[:, 1])
+    x, y = (field[..., c][mask] / unit for c in (0, 1))
+    mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
+    length = np.sqrt(x * x + y * y)
+    median, p95, largest = np.quantile(length, (0.5, 0.95, 1.0), overwrite_input=True)
     return {
-        "mean": values.mean(axis=0).tolist(),
-        "rms": np.sqrt(np.mean(values**2, axis=0)).tolist(),
-        "rms_per_component": float(np.sqrt(np.mean(values**2))),
-        "rms_length": float(np.sqrt(np.mean(length**2))),
-        "median_length": float(np.median(length)),
-        "p95_length": float(np.percentile(length, 95)),
-        "max_length": float(length.max()),
+        "mean": [float(x.mean()), float(y.mean())],
+        "rms": [math.sqrt(square) for square in mean_squares],
+        "rms_per_component": math.sqrt(0.5 * sum(mean_squares)),
+        "rms_length": math.sqrt(sum(mean_squares)),
+        "median_length": float(median),
+        "p95_length": float(p95),
+        "max_length": float(largest),
     }

@@ -19,6 +19,7 @@ from modeharvest.idic.families.pattern import Pattern
 from modeharvest.idic.families.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.validation import plots_fields as fields
+from modeharvest.validation.metrics import lengths
 from modeharvest.validation.plots_fields import Scale
 from modeharvest.validation.plots_path import draw_density, pattern_density
 from modeharvest.validation.sheet import Motion, Sheet
@@ -67,6 +68,12 @@ class Atlas:
         return Sheet.of(self.solution.mesh, self.images.grid, FINE)
 
     @cached_property
+    def material(self) -> NDArray[np.bool_]:
+        """Where there is material, on :attr:`sheet`'s grid."""
+        seen = self.sheet.average(np.where(self.comparisons[0].mask, 1.0, np.nan))
+        return np.asarray(np.isfinite(seen))
+
+    @cached_property
     def density_end(self) -> float:
         """Largest density of any snapshot's pattern [mm⁶]; all densities are drawn up to it."""
         return max((pattern_density(*pair) for pair in self.spectra), default=0.0)
@@ -78,7 +85,7 @@ class Atlas:
 
     def shape_scale(self, k: int) -> float:
         """By how much phi_1 of snapshot k is drawn, for a largest displacement of SHAPE l [mm]."""
-        largest = np.linalg.norm(self.comparisons[k].result.phi(grid=self.sheet.grid), axis=-1)
+        largest = lengths(self.comparisons[k].result.phi(grid=self.sheet.grid))
         top = float(largest.max())
         return SHAPE * self.pitch / top if top > 0 else 1.0
 
@@ -182,7 +189,7 @@ def _length_of(name: str) -> Callable[[Atlas, int], Figure]:
 
     def draw(atlas: Atlas, k: int) -> Figure:
         comparison, sheet = atlas.comparisons[k], atlas.sheet
-        length = UM * sheet.average(np.linalg.norm(getattr(comparison, name), axis=-1))
+        length = UM * sheet.average(lengths(getattr(comparison, name)))
         scale = Scale.size(length, "µm", 0.998)
         return fields.draw_field(sheet, length, scale, total(atlas, k))
 
@@ -193,7 +200,7 @@ def draw_hero(atlas: Atlas, k: int) -> Figure:
     """The deformed image of snapshot k turning into the pattern that was measured in it."""
     images, comparison, sheet = atlas.images, atlas.comparisons[k], atlas.sheet
     field = comparison.result.fluctuation(grid=sheet.grid) if atlas.has_mode else comparison.w
-    length = UM * np.linalg.norm(field, axis=-1)
+    length = UM * lengths(field)
     if not atlas.has_mode:
         length = sheet.average(length)
     end = Scale.size(_seen(atlas, length), "µm")
@@ -205,8 +212,7 @@ def draw_hero(atlas: Atlas, k: int) -> Figure:
 
 def _seen(atlas: Atlas, field: FloatArray) -> FloatArray:
     """The values where there is material: the polynomials mean nothing elsewhere."""
-    material = atlas.sheet.average(np.where(atlas.comparisons[0].mask, 1.0, np.nan))
-    return np.where(np.isfinite(material), field, np.nan)
+    return np.where(atlas.material, field, np.nan)
 
 
 PANELS = (

@@ -49,13 +49,16 @@ class Sheet:
 
     def average(self, field: FloatArray) -> FloatArray:
         """Average a field (rows, cols) of the images over the cells, NaN left out."""
-        rows, cols = self.grid.shape
-        n = self.factor
-        blocks = field[: rows * n, : cols * n].reshape(rows, n, cols, n)
-        known = np.isfinite(blocks)
-        count = known.sum(axis=(1, 3))
-        total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
+        known = np.isfinite(field)
+        count = self._sum(known.astype(np.float64))
+        total = self._sum(np.where(known, field, 0.0))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def _sum(self, field: FloatArray) -> FloatArray:
+        """Sums over the cells' pixels; rows first, which is several times faster."""
+        (rows, cols), n = self.grid.shape, self.factor
+        whole = field[: rows * n].reshape(rows, n, -1).sum(axis=1)[:, : cols * n]
+        return np.asarray(whole.reshape(rows, cols, n).sum(axis=2))
 
     def sample(self, field: FloatArray) -> FloatArray:
         """Take the middle pixel of each cell from a field (rows, cols) of the images."""

@@ -35,8 +35,10 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,14 +122,16 @@ def validate(
         The content of ``summary.json``.
     """
     begin = time.perf_counter()
-    comparisons, spectra, snapshots = [], [], []
+    comparisons = []
     for k, strain in enumerate(sorted(measured.results)):
         progress(k, len(measured.results), "compare with the truth")
-        comparison = _compare(measured, strain)
-        spectrum, pattern = _spectrum(comparison, measured.specimen)
-        comparisons.append(comparison)
-        spectra.append((spectrum, pattern))
-        snapshots.append(_snapshot(comparison, pattern, measured))
+        comparisons.append(_compare(measured, strain))
+    with ThreadPoolExecutor(os.cpu_count()) as threads:  # numpy's work, and it lets go of the GIL
+        spectra = list(threads.map(lambda c: _spectrum(c, measured.specimen), comparisons))
+        patterns = [pattern for _, pattern in spectra]
+        snapshots = list(
+            threads.map(lambda c, pattern: _snapshot(c, pattern, measured), comparisons, patterns)
+        )
 
     summary = _summary(measured, case, snapshots)
     summary["timings_s"] = {**timings_s, "validate": time.perf_counter() - begin}

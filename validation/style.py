@@ -12,18 +12,20 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
-from typing import Any
+from typing import Any, cast
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import image
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_mixed import MixedModeRenderer
+from matplotlib.backends.backend_svg import RendererSVG
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
+from PIL import Image
 
 FloatArray = NDArray[np.float64]
 
@@ -155,8 +157,14 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
         Keep every pixel as it is: for fields as fine as the pixels, whose colours would run.
     """
     buffer = io.StringIO()
+    width, height = drawn.get_size_inches()
     with style():
-        drawn.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
+        pixels = cast(Any, _WebPRenderer)(72 * width, 72 * height, buffer, image_dpi=DPI)
+        pixels.exact = exact
+        drawn.dpi = 72
+        renderer = cast(Any, MixedModeRenderer)(drawn, width, height, DPI, pixels)
+        drawn.draw(renderer)
+        renderer.finalize()
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].rstrip()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
@@ -169,11 +177,6 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     svg = re.sub(r"font: [^;\"]*?([\d.]+px)[^;\"]*", r"font-size: \1", svg)
     svg = re.sub(r" ?font-family: [^;\"]*;?", "", svg)
     svg = re.sub(r' d="([^"]*)"', _rounded, svg)
-    svg = re.sub(
-        r'href="data:image/png;base64,([^"]*)"',
-        lambda found: f'href="data:image/webp;base64,{_smaller(found.group(1), exact)}"',
-        svg,
-    )
     svg = svg.replace(INK, "currentColor").replace(MUTED, "var(--muted)")
     box = re.search(r'viewBox="[^"]*"', svg)
     assert box is not None, "matplotlib's SVG has a viewBox"
@@ -186,11 +189,23 @@ def _rounded(found: re.Match[str]) -> str:
     return ' d="' + re.sub(r"(\.\d\d)\d+", r"\1", found.group(1)).replace(" \n", " ") + '"'
 
 
-def _smaller(png: str, exact: bool) -> str:
-    """The same pixels as WebP, a half (exact) or a third of the size; both base64."""
-    pixels = image.imread(io.BytesIO(base64.b64decode(png)), format="png")
-    how = {"lossless": True, "quality": 20} if exact else {"quality": QUALITY}
-    packed = io.BytesIO()
-    image.imsave(packed, np.uint8(np.round(255 * pixels)), format="webp",
-                 pil_kwargs={"method": 2, **how})  # fmt: skip
-    return base64.b64encode(packed.getvalue()).decode()
+class _WebPRenderer(RendererSVG):
+    """Writes SVG with its pixels as WebP: a half (exact) or a third of PNG's size, and sooner."""
+
+    exact = False
+
+    def draw_image(self, gc: Any, x: float, y: float, im: Any, transform: Any = None) -> None:
+        """Write what was drawn as pixels, (rows, cols, 4) bytes, its lower left corner at x, y."""
+        assert transform is None, "what is drawn as pixels has no transform left"
+        rows, cols = im.shape[:2]
+        width, height = 72 * cols / self.image_dpi, 72 * rows / self.image_dpi
+        how = {"lossless": True, "quality": 20} if self.exact else {"quality": QUALITY}
+        packed = io.BytesIO()
+        Image.fromarray(im).save(packed, format="webp", method=2, **how)
+        place = {"x": x, "y": y + height - self.height, "width": width, "height": height}
+        attributes = {name: f"{value:.6f}" for name, value in place.items()}
+        attributes["transform"] = f"scale(1 -1) translate(0 {-height:.6f})"
+        attributes["href"] = (
+            "data:image/webp;base64," + base64.b64encode(packed.getvalue()).decode()
+        )
+        self.writer.element("image", attrib=attributes)  # type: ignore[no-untyped-call]

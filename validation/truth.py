@@ -10,6 +10,7 @@ The grey-level residual is what remains visible of all this in the images.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,14 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.gauss_newton import GaussNewtonOptions
+from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.result import Result
+from modeharvest.idic.warp import residual
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.interpolation import SplineImage
 from modeharvest.progress import Progress, silent
+from modeharvest.validation.metrics import lengths
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+_ENOUGH = 40_000
+"""Pixels of material that tell one minimum of the best fit from another."""
+_CLOSE = GaussNewtonOptions(tolerance_px=1e-5)
+"""A tenth of a correlation's tolerance: the best fit is what that is measured by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +72,22 @@ class Comparison:
     @cached_property
     def w(self) -> FloatArray:
         """(rows, cols, 2) microfluctuation field, truth - IDIC [mm]."""
-        return self.displacement - self.result.displacement()
+        return _difference(self.displacement, self.result.displacement())
 
     @cached_property
     def best_error(self) -> FloatArray:
         """(rows, cols, 2) truth - best fit [mm]: what the model can't say."""
-        return self.displacement - self.best.displacement()
+        return _difference(self.displacement, self.best.displacement())
 
-    @property
+    @cached_property
     def idic_to_best(self) -> FloatArray:
         """(rows, cols, 2) IDIC - best fit [mm]: what the measurement loses; NaN off the mask."""
         return self.best_error - self.w
+
+
+def _difference(minuend: FloatArray, subtrahend: FloatArray) -> FloatArray:
+    """Subtract in place: such arrays are large, and new ones cost more than the difference."""
+    return np.subtract(minuend, subtrahend, out=subtrahend)
 
 
 def compare(
@@ -95,17 +112,59 @@ def compare(
     progress
         Listener.
     """
-    grid, mask = images.grid, images.mask()
-    truth = images.truth(strain).displacement
-    fits = [
-        fit_displacement(truth, grid, result.ansatz, begin, mask, progress=progress)
-        for begin in (result.unknowns, start)
-    ]
-    best = min(fits, key=lambda fit: fit.residual_rms)
-    residual = result.residual(
-        images.reference(camera=camera), images.deformed(strain, camera=camera)
+    grid, mask, ansatz = images.grid, images.mask(), result.ansatz
+    truth = images.displacement(strain)
+    best = best_fit(truth, grid, ansatz, (result.unknowns, start), mask, progress)
+    left = residual(
+        Assembly(ansatz, grid, mask),
+        result.unknowns,
+        images.reference(camera=camera),
+        SplineImage.of(images.deformed(strain, camera=camera)),
     )
-    return Comparison(strain, grid, mask, truth, result, best, np.where(mask, residual, np.nan))
+    return Comparison(strain, grid, mask, truth, result, best, left.astype(np.float64))
+
+
+def best_fit(
+    displacement: FloatArray,
+    grid: PixelGrid,
+    ansatz: Ansatz,
+    starts: Sequence[FloatArray],
+    mask: BoolArray,
+    progress: Progress = silent,
+) -> Result:
+    """Fit an ansatz to a known displacement, and take the best that is reached from some starts.
+
+    Which that is, and most of the way there, is found on some tens of thousands of pixels: the
+    ansatz is smooth, and its minima are far apart.
+
+    Parameters
+    ----------
+    displacement
+        (rows, cols, 2) [mm]; may be NaN outside the mask.
+    grid
+        The pixels.
+    ansatz
+        What is fitted.
+    starts
+        (n,) unknowns each.
+    mask
+        (rows, cols) True where the displacement counts.
+    progress
+        Listener.
+    """
+    every = max(1, int(np.sqrt(mask.sum() / _ENOUGH)))
+    # As far from the first row and column as from the last: a symmetric field stays symmetric.
+    top, left = ((size - 1) % every // 2 for size in grid.shape)
+    few = np.s_[top::every, left::every]
+    rows, cols = mask[few].shape
+    (x,), (y,) = grid.to_mm([top], [left])
+    coarse = PixelGrid(rows, cols, every * grid.pixel_size, x, y)
+    reached = min(
+        (fit_displacement(displacement[few], coarse, ansatz, a, mask[few], _CLOSE) for a in starts),
+        key=lambda fit: fit.residual_rms,
+    )
+    begin = np.append(reached.unknowns, starts[0][reached.unknowns.size :])
+    return fit_displacement(displacement, grid, ansatz, begin, mask, _CLOSE, progress)
 
 
 @dataclass(frozen=True)
@@ -132,7 +191,7 @@ def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
     grid = comparison.grid
     a, b = specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]
-    length = np.linalg.norm(comparison.result.fluctuation(), axis=-1) / grid.pixel_size
+    length = lengths(comparison.result.fluctuation()) / grid.pixel_size
     outer_x, outer_y = x > a - specimen.pitch, y > b - specimen.pitch
 
     def largest(where: BoolArray) -> float:

@@ -145,16 +145,17 @@ def spectral_density(
     rows, cols = (np.flatnonzero(mask.any(axis=1 - k)) for k in range(2))
     extent = tuple(grid.pixel_size * (int(i[-1] - i[0]) + 1) for i in (cols, rows))
     part = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    u = np.where(mask[part][..., None], displacement[part], 0.0)
+    inside = mask[part]
+    u = [np.where(inside, displacement[part][..., c], 0.0) for c in range(2)]
     x, y = grid.x[part[1]], grid.y[part[0]]
-    affine = _affine(u, mask[part], x, y)
-    for i in range(2):
-        plane = affine[i, 0] + affine[i, 1] * x[None, :] + affine[i, 2] * y[:, None]
-        u[..., i] -= np.where(mask[part], plane, 0.0)
+    affine = np.stack([_affine(component, inside, x, y) for component in u])
+    for component, (constant, along_x, along_y) in zip(u, affine, strict=True):
+        plane = (constant + along_x * x)[None, :] + (along_y * y)[:, None]
+        np.subtract(component, plane, out=component, where=inside)
 
     factor = max(1, int(pitch / (bins_per_cell * grid.pixel_size)))
-    source = _binned(u, factor)[::-1]  # rows now ascend in y
-    coverage = _binned(mask[part].astype(np.float64), factor)[::-1]
+    source = np.stack([_binned(component, factor)[::-1] for component in u], axis=-1)
+    coverage = _binned(inside.astype(np.float64), factor)[::-1]  # rows now ascend in y
     h = factor * grid.pixel_size
     half = 0.5 * (factor - 1) * grid.pixel_size
     x = x[0] + half + h * np.arange(source.shape[1])
@@ -177,27 +178,26 @@ def _transform(
 
 
 def _affine(u: FloatArray, mask: BoolArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """(2, 3) least-squares fit of 1, x, y over the material; ``u`` is zero outside it."""
+    """(3,) least-squares fit of 1, x, y to a component over the material; it is zero outside."""
     per_col, per_row = mask.sum(axis=0), mask.sum(axis=1)
     xy = float(y @ (mask @ x))
     n, sx, sy = per_col.sum(), per_col @ x, per_row @ y
     normal = np.array([[n, sx, sy], [sx, per_col @ x**2, xy], [sy, xy, per_row @ y**2]])
-    col_sums, row_sums = u.sum(axis=0), u.sum(axis=1)
-    right = np.stack([col_sums.sum(axis=0), x @ col_sums, y @ row_sums])
     if np.linalg.matrix_rank(normal) < 3:
         raise InputError("expected material in more than one row and one column of the mask")
-    fit: FloatArray = np.linalg.solve(normal, right).T
+    col_sums, row_sums = u.sum(axis=0), u.sum(axis=1)
+    fit: FloatArray = np.linalg.solve(normal, [col_sums.sum(), x @ col_sums, y @ row_sums])
     return fit
 
 
 def _binned(u: FloatArray, factor: int) -> FloatArray:
-    """Averages over blocks of the first two axes, incomplete blocks filled with zeros."""
-    rows, cols = (-(-size // factor) for size in u.shape[:2])
-    full = np.zeros((rows * factor, cols * factor, *u.shape[2:]))
-    full[: u.shape[0], : u.shape[1]] = u
-    blocks = full.reshape(rows, factor, cols, factor, *u.shape[2:])
-    means: FloatArray = blocks.mean(axis=(1, 3))
-    return means
+    """Averages of (rows, cols) over blocks, incomplete ones filled with zeros."""
+    rows, cols = (-(-size // factor) for size in u.shape)
+    padded = np.zeros((rows * factor, cols * factor))
+    padded[: u.shape[0], : u.shape[1]] = u
+    # Rows first: whole rows are added faster than pieces of them.
+    summed = padded.reshape(rows, factor, -1).sum(axis=1).reshape(rows, cols, factor).sum(axis=2)
+    return np.asarray(summed / factor**2)
 
 
 def _squared(value: ComplexArray) -> FloatArray:

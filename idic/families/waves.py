@@ -190,18 +190,33 @@ def _amplitudes(
     (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of the
     field's weighted square that they explain.
     """
-    angle = 2 * np.pi / spectrum.pitch
-    waves = np.stack(
-        [
-            np.exp(1j * angle * b * spectrum.y)[:, None]
-            * np.exp(1j * angle * a * spectrum.x)[None, :]
-            for a, b in xi
-        ]
+    # Products of sines and cosines are those of sums and differences of their wave vectors, and
+    # at a wave vector a sum over all bins is two small products of matrices.
+    tapered = taper[..., None] * spectrum.source
+    projected = np.array([_sum_over(spectrum, tapered, k) for k in xi])
+    pairs = xi[:, None] - xi[None, :], xi[:, None] + xi[None, :]
+    weight = (taper * spectrum.coverage)[..., None]
+    minus, plus = (
+        np.array([_sum_over(spectrum, weight, k)[0] for k in of.reshape(-1, 2)]).reshape(
+            len(xi), -1
+        )
+        for of in pairs
     )
-    basis = np.concatenate([waves.imag, waves.real]).reshape(2 * len(xi), -1)
-    weighted = basis * (taper * spectrum.coverage).ravel()
-    right = basis @ (taper[..., None] * spectrum.source).reshape(-1, 2)
-    solution = np.linalg.solve(weighted @ basis.T, right)
-    total = float(np.sum(taper[..., None] * spectrum.source**2))
+    normal = 0.5 * np.block(
+        [[(minus - plus).real, (plus + minus).imag], [(plus - minus).imag, (minus + plus).real]]
+    )
+    right = np.concatenate([projected.imag, projected.real])
+    solution = np.linalg.solve(normal, right)
+    total = float(np.sum(tapered * spectrum.source))
     explained = float(np.sum(solution * right)) / total
     return solution[: len(xi)] + 1j * solution[len(xi) :], explained
+
+
+def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> NDArray[np.complex128]:
+    """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
+    angle_x, angle_y = 2 * np.pi / spectrum.pitch * xi
+    along_x, along_y = np.exp(1j * angle_x * spectrum.x), np.exp(1j * angle_y * spectrum.y)
+    # numpy would turn all values into complex ones.
+    up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
+    found: NDArray[np.complex128] = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
+    return found
