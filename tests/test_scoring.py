@@ -11,7 +11,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.scoring.regions import REGIONS, regions
-from modeharvest.validation.scoring.score import score
+from modeharvest.validation.scoring.score import ranked, score
 
 FloatArray = NDArray[np.float64]
 
@@ -110,14 +110,30 @@ def test_a_field_of_half_the_specimen_covers_half_of_it() -> None:
     assert graded.covered == pytest.approx(0.5, abs=0.03)
 
 
-@pytest.mark.parametrize(
-    ("factor", "words"), [(1 / PIXEL, "pixels declared as mm"), (PIXEL, "mm declared as pixels")]
-)
-def test_a_wrong_unit_is_recognised(factor: float, words: str) -> None:
+def test_points_that_are_few_stand_for_little() -> None:
+    """Four points, as far from each other as can be, and one."""
+    x, y = (np.array([-1.6, 1.6, -1.6, 1.6]), np.array([-2.9, -2.9, 2.9, 2.9]))
+    reach_px = 0.25 * SPECIMEN.pitch / PIXEL
+    for n in (4, 1):
+        field = LocalField(x[:n], y[:n], truth_at(x, y)[:n], source="few")
+        few = score(field, truth_at(x, y)[:n], LABELS, GRID, reach_px)
+        assert few.everywhere.rms_px == 0.0
+        assert few.covered <= n * np.pi * (reach_px + 1) ** 2 / MASK.sum()
+        x2, y2 = points()
+        noisy = LocalField(x2, y2, np.nan_to_num(truth_at(x2, y2)) + PIXEL, source="noisy")
+        many = score(noisy, truth_at(x2, y2), LABELS, GRID, reach_px)
+        assert ranked([few, many]) == [many, few]
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_points_given_twice_are_as_far_apart_as_once(times: int) -> None:
     x, y = points()
-    truth = truth_at(x, y)
-    with pytest.raises(InputError, match=words):
-        score(LocalField(x, y, factor * truth), truth, LABELS, GRID)
+    once = LocalField(x, y, truth_at(x, y))
+    truth = np.tile(truth_at(x, y), (times, 1))
+    more = LocalField(np.tile(x, times), np.tile(y, times), truth)
+    graded = score(more, truth, LABELS, GRID)
+    assert graded.spacing_px == pytest.approx(6.0, rel=1e-9)
+    assert graded.covered == score(once, truth_at(x, y), LABELS, GRID).covered
 
 
 def test_a_field_beside_the_specimen_is_refused() -> None:

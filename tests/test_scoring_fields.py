@@ -1,14 +1,11 @@
 """Fields from files: the truth scores zero whatever its format, a known error scores that error.
 
 Guards: every format, unit, axis and origin comes to the same; a file of another benchmark is not
-taken; what was lost is counted; common misunderstandings are recognised, honest errors aren't.
+taken; what was lost is counted. What a field may mean instead: test_scoring_conventions.py.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import h5py
@@ -21,11 +18,9 @@ from scipy.io import savemat
 from synthetic_benchmark import PIXEL, STRAIN
 
 from modeharvest.errors import InputError
-from modeharvest.idic.fields.local_field import LocalField
 from modeharvest.scoring import Declared, declarations
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.fields import read_measured
-from modeharvest.validation.scoring.mistakes import mistakes
 from modeharvest.validation.scoring.regions import regions
 from modeharvest.validation.scoring.score import Score, score
 
@@ -193,40 +188,6 @@ def test_a_file_that_is_no_field_is_named(truth: BenchmarkTruth, tmp_path: Path)
             read_measured(path, truth.grid, truth.id)
 
 
-Spoilt = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
-TURNED: dict[str, Spoilt] = {
-    "the positions were those of the deformed image": lambda x, y, u: (x + u[:, 0], y + u[:, 1], u),
-    "u led from the deformed image back": lambda x, y, u: (x + u[:, 0], y + u[:, 1], -u),
-    "u and v had the other sign": lambda x, y, u: (x, y, -u),
-    "v had the other sign": lambda x, y, u: (x, y, u * [1, -1]),
-    "u had the other sign": lambda x, y, u: (x, y, u * [-1, 1]),
-    "the y axis pointed the other way": lambda x, y, u: (x, -y, u * [1, -1]),
-    "u and v were exchanged": lambda x, y, u: (x, y, u[:, ::-1]),
-    r"centre were \(1, 1\)": lambda x, y, u: (x + PIXEL, y - PIXEL, u),
-}
-
-
-@pytest.mark.parametrize("words", TURNED)
-def test_a_misunderstanding_is_recognised(truth: BenchmarkTruth, words: str) -> None:
-    x, y, u = TURNED[words](*made.points(truth))
-    noise = 0.002 * PIXEL * np.random.default_rng(0).normal(size=u.shape)
-    said = mistakes(
-        LocalField(x, y, u + noise, source="it"), partial(truth.displacement, STRAIN), truth.grid
-    )
-    assert len(said) == 1
-    assert re.search(words, said[0]), said
-
-
-@pytest.mark.parametrize("sd_px", [0.0, 0.1, 5.0])
-def test_an_honest_error_is_no_misunderstanding(truth: BenchmarkTruth, sd_px: float) -> None:
-    x, y, u = made.points(truth)
-    noise = sd_px * PIXEL * np.random.default_rng(0).normal(size=u.shape)
-    field = LocalField(x, y, u + noise)
-    assert mistakes(field, partial(truth.displacement, STRAIN), truth.grid) == ()
-    smooth = LocalField(x, y, u + sd_px * PIXEL)
-    assert mistakes(smooth, partial(truth.displacement, STRAIN), truth.grid) == ()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -234,6 +195,7 @@ def test_an_honest_error_is_no_misunderstanding(truth: BenchmarkTruth, sd_px: fl
         ({"units": ["px"] * 3}, "expected --unit once"),
         ({"first_pixels": [2]}, "expected --first-pixel 0 or 1"),
         ({"columns": ["u"]}, "expected --column ROLE=NAME"),
+        ({"columns": ["w=c"]}, "x, y, u, v, sd_u, sd_v, sigma, valid, got 'w'"),
     ],
 )
 def test_declarations_that_do_not_fit_are_told(options: dict[str, list[str]], words: str) -> None:

@@ -187,6 +187,34 @@ def test_bad_input_is_one_line(
     assert not (tmp_path / "out" / "report.html").exists()
 
 
+def test_fields_that_cannot_be_graded_do_not_stop_the_others(
+    truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_field(tmp_path / "good.csv", noisy(truth, 0.01, "good"))
+    (tmp_path / "bad.csv").write_text("nothing", "utf-8")
+    fields = [tmp_path / "bad.csv", tmp_path / "good.csv", tmp_path / "none.csv"]
+    said, code = run(monkeypatch, tmp_path, truth, fields)
+    assert code == 2
+    for name in ("bad", "none"):
+        assert re.search(rf"error:.*{name}\.csv", said)
+    summary = json.loads((tmp_path / "out" / "scores.json").read_text("utf-8"))
+    assert [field["name"] for field in summary["fields"]] == ["good"]
+    assert list(summary["refused"]) == [str(fields[0]), str(fields[2])]
+    assert "bad.csv" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+def test_displacements_in_another_unit_are_refused(
+    truth: BenchmarkTruth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = noisy(truth, 0.05, "it")
+    for factor, words in ((1 / PIXEL, "pixels had been declared as mm"),
+                          (PIXEL, "mm had been declared as pixels")):  # fmt: skip
+        write_field(tmp_path / "it.csv", replace(field, u=factor * field.u))
+        said, code = run(monkeypatch, tmp_path, truth, [tmp_path / "it.csv"])
+        assert code == 2
+        assert words in said
+
+
 @pytest.mark.parametrize("length_px", [12.0, 30.0])
 def test_a_wave_of_error_is_found_at_its_wavelength(length_px: float) -> None:
     """On a full grid: nothing leaks but by the box's edges."""

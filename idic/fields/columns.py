@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from modeharvest.errors import InputError
 
 ROLES = ("x", "y", "u", "v")
+ALL_ROLES = (*ROLES, "sd_u", "sd_v", "sigma", "valid")
 
 _BASES: dict[str, set[str]] = {
     "x": {"x", "ss x", "subset x", "coordinate x", "coord x", "pos x", "position x", "x c", "xc",
@@ -107,11 +108,15 @@ def choose(
     columns = [column(name) for name in names]
     chosen: dict[str, Column] = {}
     for role, key in given.items():
+        if role not in ALL_ROLES:
+            raise InputError(
+                f"{where}: expected columns to be given for {', '.join(ALL_ROLES)}, got {role!r}"
+            )
         name = names[key - 1] if isinstance(key, int) and 0 < key <= len(names) else str(key)
         if name not in names:
             raise InputError(f"{where}: expected a column {key!r} for {role}, got {_listed(names)}")
         chosen[role] = column(name)
-    for role in (*ROLES, "sd_u", "sd_v", "sigma", "valid"):
+    for role in ALL_ROLES:
         candidates = [c for c in columns if c.role == role]
         if role in chosen or not candidates:
             continue

@@ -23,6 +23,7 @@ from modeharvest.case import Case, read_case
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, require_writable
+from modeharvest.idic.fields.columns import ALL_ROLES
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.scoring.benchmark import (
@@ -32,14 +33,17 @@ from modeharvest.validation.scoring.benchmark import (
     require_apart,
     require_no_lens,
 )
+from modeharvest.validation.scoring.conventions import check_conventions
 from modeharvest.validation.scoring.fields import Declared, read_measured
-from modeharvest.validation.scoring.mistakes import mistakes
 from modeharvest.validation.scoring.regions import EDGE_PX, regions
 from modeharvest.validation.scoring.report import Grading, write_grading
 from modeharvest.validation.scoring.score import PERCENTILES, Score, ranked, score
 from modeharvest.validation.scoring.spectrum import error_spectrum
 
 __all__ = ["Declared", "declarations", "grade", "make_benchmark", "print_grading"]
+
+REACH_CELLS = 0.25
+"""How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""
 
 T = TypeVar("T")
 
@@ -124,40 +128,62 @@ def grade(
     progress
         Listener.
 
+    Returns
+    -------
+    Grading
+        Of the fields that can be graded; those that can't be read, are of another benchmark or in
+        another unit than declared are in its ``refused``, each with the reason.
+
     Raises
     ------
     InputError
-        If a field can't be read, is of another benchmark or in another unit than declared.
+        If no field can be graded, or two have one name.
     """
     every = fields if isinstance(fields, Mapping) else {Path(f): Declared() for f in fields}
+    _require_names(every)
     known = BenchmarkTruth.read(truth)
     require_writable(out)
     grid = known.grid
     labels = regions(known.mask, grid, known.specimen, edge_px)
     true = partial(known.displacement, strain)
+    reach_px = REACH_CELLS * known.specimen.pitch / grid.pixel_size
     scores: list[Score] = []
     remarks: list[str] = []
+    refused: dict[str, str] = {}
     for n, (path, declared) in enumerate(every.items()):
         progress(n, len(every) + 1, f"score: {path.name}")
-        field = read_measured(path, grid, known.id, declared)
-        scores.append(score(_named_apart(field, scores), true(field.x, field.y), labels, grid))
-        remarks += mistakes(field, true, grid)
+        try:
+            field = read_measured(path, grid, known.id, declared)
+            graded = score(field, true(field.x, field.y), labels, grid, reach_px)
+            _, told = check_conventions(field, true, grid)
+        except InputError as error:
+            refused[str(path)] = str(error)
+            continue
+        scores.append(graded)
+        remarks += told
+    if not scores:
+        raise InputError("; ".join(refused.values()))
     best_first = ranked(scores)
     progress(len(every), len(every) + 1, "score: report")
     spectra = {graded.source: error_spectrum(graded, grid) for graded in best_first}
-    done = Grading(known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks))
+    done = Grading(
+        known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks), refused
+    )
     write_grading(out, done)
     progress(1, 1, "score")
     return done
 
 
-def _named_apart(field: Any, scores: Sequence[Score]) -> Any:
-    """The field; InputError if another one has its name."""
-    if any(field.source == graded.source for graded in scores):
+def _require_names(fields: Mapping[Path, Declared]) -> None:
+    """Raise InputError if there is no field, or two of one name."""
+    if not fields:
+        raise InputError("expected fields to grade, got none")
+    names = [declared.name or path.stem for path, declared in fields.items()]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
         raise InputError(
-            f"expected fields of different names, got {field.source} twice; give each a --name"
+            f"expected fields of different names, got {', '.join(twice)} twice; give each a --name"
         )
-    return field
 
 
 def declarations(
@@ -226,6 +252,10 @@ def _column(text: str) -> tuple[str, str | int]:
     role, sign, name = text.partition("=")
     if not sign or not name:
         raise InputError(f"expected --column ROLE=NAME, as u=disp_x or u=3, got {text!r}")
+    if role not in ALL_ROLES:
+        raise InputError(
+            f"expected --column for one of {', '.join(ALL_ROLES)}, got {role!r} in {text!r}"
+        )
     return role, int(name) if name.isdigit() else name
 
 

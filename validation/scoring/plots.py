@@ -91,7 +91,7 @@ class FieldMaps:
         graded, sheet = self.graded, self.maps.sheet
         if not len(graded.x):
             return np.zeros(sheet.grid.shape, dtype=np.intp)
-        reach = max(graded.spacing_px * sheet.grid.pixel_size / sheet.factor, sheet.grid.pixel_size)
+        reach = max(graded.reach_px * sheet.grid.pixel_size / sheet.factor, sheet.grid.pixel_size)
         points = np.column_stack([graded.x, graded.y])
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
         pixels = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)

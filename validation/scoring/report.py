@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,8 @@ class Grading:
         Of each field's error, by its name; None where it has none.
     remarks
         Sentences about probable mistakes in what was declared.
+    refused
+        By its file's name, why a field was not graded.
     """
 
     truth: BenchmarkTruth
@@ -67,6 +69,7 @@ class Grading:
     scores: tuple[Score, ...]
     spectra: Mapping[str, ErrorSpectrum | None]
     remarks: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def common(self) -> dict[str, RegionScore]:
@@ -88,7 +91,8 @@ class Grading:
     @property
     def notes(self) -> list[str]:
         """What a reader has to know, in sentences."""
-        told = list(self.remarks)
+        told = [f"not graded: {why}" for why in self.refused.values()]
+        told += self.remarks
         for graded in self.scores:
             if graded.covered < ENOUGH_COVERED:
                 told.append(
@@ -118,6 +122,7 @@ def summary(grading: Grading) -> dict[str, Any]:
         "percentiles": list(PERCENTILES),
         "covered_by_all": grading.common_share,
         "fields": [_plain_field(grading, graded) for graded in grading.scores],
+        "refused": dict(grading.refused),
         "remarks": grading.notes,
     }
 

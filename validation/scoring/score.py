@@ -18,10 +18,10 @@ from modeharvest.validation.scoring.regions import REGIONS
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_OTHER_UNIT = 0.05
-"""A ratio of measured to true displacement this near to the pixel size is one of units."""
 _ENOUGH_POINTS = 20_000
 """For a median or a share."""
+_SAME_PX = 1e-3
+"""Points no farther from each other are one [px]."""
 PERCENTILES = (50, 90, 95, 99)
 ENOUGH_COVERED = 0.5
 """Share of the material that a field has to cover to be ranked by its error alone [-]."""
@@ -89,9 +89,12 @@ class Score:
     off_material
         Points that lie in holes or outside the specimen: not graded.
     spacing_px
-        Of its points [px].
+        Of its points on material; of those at the same place, one counts [px].
+    reach_px
+        How far from a point its displacement stands for others: one spacing, if that is within
+        the reach given [px].
     near
-        (rows, cols) True on material within one spacing of a valid point.
+        (rows, cols) True on material within reach of a valid point.
     covered
         Share of the material that is near [-].
     x, y, error_px
@@ -103,6 +106,7 @@ class Score:
     by_region: Mapping[str, RegionScore]
     off_material: int
     spacing_px: float
+    reach_px: float
     near: BoolArray
     covered: float
     x: FloatArray
@@ -124,7 +128,13 @@ def ranked(scores: Sequence[Score]) -> list[Score]:
     )
 
 
-def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: PixelGrid) -> Score:
+def score(
+    field: LocalField,
+    truth: FloatArray,
+    labels: NDArray[np.int8],
+    grid: PixelGrid,
+    reach_px: float = float("inf"),
+) -> Score:
     """Grade a field.
 
     Parameters
@@ -137,20 +147,22 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
         (rows, cols) of :func:`modeharvest.validation.scoring.regions.regions`.
     grid
         The reference image's pixels.
+    reach_px
+        Farthest from a point that its displacement can stand for [px].
 
     Raises
     ------
     InputError
-        If no point lies on the material, or the displacements are in another unit than declared.
+        If no point lies on the material.
     """
     here = _labels_at(field.x, field.y, labels, grid)
     _require_on_specimen(field, labels, grid)
     on_material = (here >= 0) & np.isfinite(truth).all(axis=1)
     used = on_material & field.good
-    _require_unit(field, truth, used, grid)
     error = np.asarray((field.u - truth) / grid.pixel_size, dtype=np.float64)
-    spacing_px = max(1.0, _spacing_px(field, grid))
-    near = _near(field, used, spacing_px, grid) & (labels >= 0)
+    spacing_px = max(1.0, _spacing_px(field.x[on_material], field.y[on_material], grid))
+    reach_px = min(spacing_px, reach_px)
+    near = _near(field, used, reach_px, grid) & (labels >= 0)
     return Score(
         source=field.source,
         everywhere=RegionScore.of(error[on_material], field.good[on_material]),
@@ -162,6 +174,7 @@ def score(field: LocalField, truth: FloatArray, labels: NDArray[np.int8], grid: 
         },
         off_material=int((~on_material).sum()),
         spacing_px=spacing_px,
+        reach_px=reach_px,
         near=near,
         covered=float(near.sum() / (labels >= 0).sum()),
         x=field.x[used],
@@ -210,40 +223,29 @@ def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: Pixe
         )
 
 
-def _require_unit(field: LocalField, truth: FloatArray, used: BoolArray, grid: PixelGrid) -> None:
-    """Recognise pixels declared as millimetres and the reverse, by the ratio to the truth."""
-    if used.sum() < 3:
-        return
-    measured, true = field.u[used].ravel(), truth[used].ravel()
-    ratio = float(np.median(np.abs(measured)) / max(float(np.median(np.abs(true))), 1e-300))
-    for factor, words in (
-        (1.0 / grid.pixel_size, "pixels declared as mm"),
-        (grid.pixel_size, "mm declared as pixels"),
-    ):
-        if abs(ratio / factor - 1.0) < _OTHER_UNIT and abs(factor - 1.0) > 2.0 * _OTHER_UNIT:
-            raise InputError(
-                f"{field.source}: expected displacements in the declared unit, got {ratio:.4g} "
-                f"times the true ones, like {words} (a pixel is {grid.pixel_size} mm); declare "
-                "the unit that the file is in"
-            )
+def _spacing_px(x: FloatArray, y: FloatArray, grid: PixelGrid) -> float:
+    """Median distance of a point from the nearest elsewhere [px]; infinite if there is none."""
+    points = np.column_stack(grid.to_px(x, y))
+    distance = _to_nearest(points)
+    if (distance < _SAME_PX).any():  # some are there twice
+        distance = _to_nearest(np.unique(np.rint(points / _SAME_PX), axis=0) * _SAME_PX)
+    return float(np.median(distance))
 
 
-def _spacing_px(field: LocalField, grid: PixelGrid) -> float:
-    """Median distance of a point from its nearest neighbour [px]; infinite for one point."""
-    points = np.column_stack(grid.to_px(field.x, field.y))
-    points = points[np.isfinite(points).all(axis=1)]
+def _to_nearest(points: FloatArray) -> FloatArray:
+    """(m,) distances of some of n points (n, 2) from their nearest neighbours."""
     if len(points) < 2:
-        return float("inf")
+        return np.array([np.inf])
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     some = points[:: -(-len(points) // _ENOUGH_POINTS)]
-    return float(np.median(tree.query(some, k=2)[0][:, 1]))
+    return np.asarray(tree.query(some, k=2)[0][:, 1])
 
 
-def _near(field: LocalField, used: BoolArray, spacing_px: float, grid: PixelGrid) -> BoolArray:
-    """(rows, cols) True within one spacing of a used point."""
+def _near(field: LocalField, used: BoolArray, reach_px: float, grid: PixelGrid) -> BoolArray:
+    """(rows, cols) True where a used point is no farther."""
     row, col = grid.to_px(field.x[used], field.y[used])
     missed = np.ones(grid.shape, dtype=np.bool_)
     missed[np.rint(row).astype(int), np.rint(col).astype(int)] = False
     if missed.all():
         return ~missed
-    return np.asarray(ndimage.distance_transform_edt(missed) <= spacing_px)
+    return np.asarray(ndimage.distance_transform_edt(missed) <= reach_px)

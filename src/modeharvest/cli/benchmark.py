@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from modeharvest.cli.arguments import CaseName, OutFolder, SolutionFile
-from modeharvest.cli.messages import bars
+from modeharvest.cli.messages import UNUSABLE, bars, tell
+from modeharvest.errors import InputError
 
 
 def make(
@@ -66,7 +67,8 @@ def score(
     """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
 
     --unit, --y-axis and --first-pixel count for all fields, or are given once for each, in order.
-    Leaves report.html, scores.json and scores.csv in DIR.
+    Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
+    the end, and the exit code is then 2.
     """
     from modeharvest import scoring
 
@@ -74,6 +76,10 @@ def score(
     with bars() as progress:
         done = scoring.grade(declared, truth, strain, out, progress=progress)
     scoring.print_grading(done, out)
+    for why in done.refused.values():
+        tell(InputError(why))
+    if done.refused:
+        raise typer.Exit(UNUSABLE)
 
 
 def star(

@@ -1,0 +1,406 @@
+"""Convention checks: whether a field means what was declared of it, or something else.
+
+What a DIC code writes can be taken wrongly in many ways, several at once: y up for y down, u and v
+or rows and columns exchanged, a sign, deformed positions for reference ones, another origin, px for
+mm. All combinations are tried against the truth. One is told only if the errors with it are smaller
+than as declared by more than chance explains, and if it leaves nothing of what it was to explain:
+an error of any other kind (noise, bias, too small a strain) is not mistaken for a convention.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from modeharvest.errors import InputError
+from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.imaging.grid import PixelGrid
+
+FloatArray = NDArray[np.float64]
+Truth = Callable[[FloatArray, FloatArray], FloatArray]
+"""(n, 2) true displacement [mm] at positions x, y (n,) [mm]; NaN off the material."""
+
+_POINTS = 4000
+"""So many are looked at, a quarter of them where nothing is decided yet."""
+_BLOCKS = 5
+"""Along each axis: errors of points near to each other are alike, those of blocks are not."""
+_FEWEST_BLOCKS = 8
+_CHANCE = 1e-7
+"""That a right field is said to be wrong by chance, for each of a few hundred readings."""
+_SMALL_PX = 1e-3
+"""A mean error that is smaller by less is of no interest [px]."""
+_INEXACT = 0.1
+"""By how much, beyond chance, errors may differ from what a reading explains [-]: a tenth, because
+displacements that are a tenth too small may be misunderstood, too."""
+_KEPT = 6
+"""Readings that are looked at more closely."""
+
+_KEEP = np.eye(2)
+_TURN = np.diag([1.0, -1.0])
+_EXCHANGE_UP = np.array([[0.0, 1.0], [1.0, 0.0]])
+_EXCHANGE_DOWN = -_EXCHANGE_UP
+_COMPONENTS = (
+    (_KEEP, 0, ""),
+    (-_KEEP, 1, "u and v had the other sign"),
+    (_TURN, 1, "v had the other sign"),
+    (-_TURN, 1, "u had the other sign"),
+    (_EXCHANGE_UP, 1, "u and v (up) were exchanged"),
+    (_EXCHANGE_DOWN, 1, "u and v (down) were exchanged"),
+    (_TURN @ _EXCHANGE_UP, 2, "u and v were v and -u (y up)"),
+    (-_TURN @ _EXCHANGE_UP, 2, "u and v were -v and u (y up)"),
+)
+"""What u and v may have been, in the physical frame: matrix, how many mistakes, in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One way to take a field's numbers, relative to how they were declared.
+
+    Parameters
+    ----------
+    turn, shift
+        (2, 2), (2,) [mm]: positions are ``turn @ (x, y) + shift``.
+    origin
+        (2,) moves positions further [mm].
+    components
+        (2, 2), displacements are ``components @ (u, v)``.
+    scale
+        Factor of displacements: that of a wrong unit [-].
+    deformed
+        Whether the positions are those of the deformed image.
+    mistakes
+        How many were made.
+    words
+        What they were; empty for the field as declared.
+    """
+
+    turn: FloatArray
+    shift: FloatArray
+    origin: FloatArray
+    components: FloatArray
+    scale: float = 1.0
+    deformed: bool = False
+    mistakes: int = 0
+    words: tuple[str, ...] = ()
+
+    def but(self, mistakes: int = 1, words: str = "", **changes: object) -> Reading:
+        """The same with another mistake."""
+        told = (*self.words, words) if words else self.words
+        changed: Reading = replace(self, **changes)  # type: ignore[arg-type]
+        return replace(changed, mistakes=self.mistakes + mistakes, words=told)
+
+    def differs_in_origin(self, other: Reading) -> bool:
+        """Whether another reading has nothing but another origin."""
+        return (
+            self.scale == other.scale
+            and self.deformed == other.deformed
+            and all(
+                np.array_equal(getattr(self, name), getattr(other, name))
+                for name in ("turn", "shift", "components")
+            )
+        )
+
+    def taken(
+        self, x: FloatArray, y: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Positions (n,), (n,) and displacements (n, 2) as they are with this reading [mm]."""
+        u = self.scale * u @ self.components.T
+        x, y = self.turn @ np.stack([x, y]) + (self.shift + self.origin)[:, None]
+        return (x - u[:, 0], y - u[:, 1], u) if self.deformed else (x, y, u)
+
+
+def as_declared() -> Reading:
+    """The reading that changes nothing."""
+    return Reading(_KEEP, np.zeros(2), np.zeros(2), _KEEP)
+
+
+def check_conventions(
+    field: LocalField, truth: Truth, grid: PixelGrid
+) -> tuple[Reading, tuple[str, ...]]:
+    """What a field means: as declared, or with the fewest mistakes that explain its errors.
+
+    Parameters
+    ----------
+    field
+        As declared.
+    truth
+        The true displacement anywhere.
+    grid
+        The reference image's pixels.
+
+    Returns
+    -------
+    The reading, and a sentence about it; none if it is the declared one, or if there are too few
+    points to tell.
+
+    Raises
+    ------
+    InputError
+        If the displacements are in pixels and were declared as millimetres, or the reverse.
+    """
+    sample = _Sample.of(field, truth, grid)
+    declared = as_declared()
+    if len(sample.x) < 4 * _FEWEST_BLOCKS or not np.isfinite(sample.cap):
+        return declared, ()
+    candidates = [declared, *_promising(sample, grid)]
+    best = min(candidates, key=sample.cost)
+    simplest = sorted(candidates, key=lambda reading: (reading.mistakes, sample.cost(reading)))
+    meant = next(r for r in simplest if r is best or not sample.is_beaten(r, best))
+    if meant is declared or not sample.is_beaten(declared, meant):
+        return declared, ()
+    before, after = (sample.median_px(reading) for reading in (declared, meant))
+    words = " and ".join(meant.words)
+    explained = f"the median error of {before:.3g} px would be {after:.3g} px if {words}"
+    if meant.scale != 1.0:
+        raise InputError(
+            f"{field.source}: expected displacements in the declared unit, got "
+            f"{1 / meant.scale:.4g} times the true ones; {explained} (a pixel is "
+            f"{grid.pixel_size} mm); declare what the file holds"
+        )
+    return meant, (f"{field.source}: {explained}; check what the file holds",)
+
+
+def _orientations(grid: PixelGrid) -> Iterator[Reading]:
+    """All ways to turn positions and displacements: those with fewer mistakes first."""
+    found: dict[tuple[float, ...], Reading] = {}
+    turned = [as_declared(), *_turned_positions(grid)]
+    for reading, (matrix, mistakes, words) in itertools.product(turned, _COMPONENTS):
+        both = reading.but(mistakes, words, components=matrix @ reading.components)
+        key = tuple(np.round([*both.turn.ravel(), *both.shift, *both.components.ravel()], 9))
+        if key not in found or both.mistakes < found[key].mistakes:
+            found[key] = both
+    yield from found.values()
+
+
+def _turned_positions(grid: PixelGrid) -> Iterator[Reading]:
+    """The y axis the other way, rows and columns exchanged; counted in px or mm, y up or down."""
+    declared = as_declared()
+    first, height = np.array([grid.x0, grid.y0]), (grid.rows - 1) * grid.pixel_size
+    low = first - [0.0, height]
+    for matrix, centres, words in (
+        (_TURN, (0.5 * (first + low), np.zeros(2)), "the y axis pointed the other way"),
+        (_EXCHANGE_DOWN, (first, np.zeros(2)), "rows and columns were exchanged"),
+        (_EXCHANGE_UP, (low, np.zeros(2)), "x and y (up) were exchanged"),
+    ):
+        for centre in centres:
+            shift = centre - matrix @ centre
+            yield declared.but(1, words, turn=matrix, shift=shift, components=matrix)
+            yield declared.but(1, f"{words}, of positions only", turn=matrix, shift=shift)
+    for matrix in (_TURN @ _EXCHANGE_UP, -_TURN @ _EXCHANGE_UP):
+        for before, after in ((first, low), (low, first), (np.zeros(2), np.zeros(2))):
+            shift = after - matrix @ before
+            words = "rows and columns were exchanged and the y axis pointed the other way"
+            yield declared.but(2, words, turn=matrix, shift=shift, components=matrix)
+            yield declared.but(2, f"{words}, of positions only", turn=matrix, shift=shift)
+
+
+def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
+    """Where else positions may have been counted from: (2,) [mm], in words."""
+    first, last = (np.array(grid.to_mm(*at)) for at in ((0, 0), (grid.rows - 1, grid.cols - 1)))
+    yield first, "positions were counted from the upper left pixel"
+    yield np.array([first[0], last[1]]), "positions were counted from the lower left pixel"
+    half = 0.5 * (last - first)
+    for shift in (half, half * [1, -1]):
+        yield shift, "positions were counted from the image's centre"
+
+
+def _near_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
+    """What else the first pixel's centre may have been called: (2,) [mm], in words."""
+    for number, y_down in itertools.product((0.5, 1.0, -0.5, -1.0), (1.0, -1.0)):
+        shift = -number * grid.pixel_size * np.array([1.0, -y_down])
+        called = f"({number:g}, {number:g})" + (" (y up)" if y_down < 0 else "")
+        yield shift, f"the first pixel's centre were {called} in the file's count from the declared"
+
+
+def _promising(sample: _Sample, grid: PixelGrid) -> list[Reading]:
+    """The readings with the smallest errors, and those that differ from them by little.
+
+    First all that change displacements by as much as they are, at a few points; to the best of
+    them is added what changes less: deformed positions, then the first pixel.
+    """
+    few = sample.every(4)
+    turned = list(_orientations(grid))
+    turned += [
+        reading.but(1, words, origin=shift)
+        for reading, (shift, words) in itertools.product(turned, _far_origins(grid))
+    ]
+    best = few.best(turned)
+    for factor, words in (
+        (1.0 / grid.pixel_size, "mm had been declared as pixels"),
+        (grid.pixel_size, "pixels had been declared as mm"),
+    ):
+        if abs(np.log(factor)) > 0.1:
+            best += few.best([reading.but(1, words, scale=factor) for reading in turned])
+    best += [_in_deformed_positions(reading) for reading in (as_declared(), *best)]
+    return best + [
+        reading.but(1, words, origin=reading.origin + shift)
+        for reading in (as_declared(), *sample.best(best))
+        for shift, words in _near_origins(grid)
+    ]
+
+
+def _in_deformed_positions(reading: Reading) -> Reading:
+    """The same at positions in the deformed image; there, the other sign leads back."""
+    back = "u led from the deformed image back to the reference"
+    sign = next(words for matrix, _, words in _COMPONENTS if (matrix == -_KEEP).all())
+    if sign in reading.words:
+        rest = tuple(words for words in reading.words if words != sign)
+        return replace(reading, deformed=True, words=(*rest, back))
+    return reading.but(1, "the positions were those of the deformed image", deformed=True)
+
+
+class _Sample:
+    """Some of a field's points, with the errors of readings of them.
+
+    Parameters
+    ----------
+    x, y, u
+        (n,), (n,), (n, 2) as declared [mm].
+    truth
+        The true displacement anywhere.
+    unit
+        A pixel [mm].
+    """
+
+    def __init__(
+        self, x: FloatArray, y: FloatArray, u: FloatArray, truth: Truth, unit: float
+    ) -> None:
+        self.x, self.y, self.u, self.truth, self.unit = x, y, u, truth, unit
+        self.block = _blocks(x, y)
+        self._known: dict[tuple[object, ...], FloatArray] = {}
+        length = _length(self.errors(as_declared()))
+        self.cap = 3.0 * float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
+
+    @classmethod
+    def of(cls, field: LocalField, truth: Truth, grid: PixelGrid) -> _Sample:
+        """Some of a field's valid points."""
+        x, y, u = field.valid_points()
+        some = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int)
+        return cls(x[some], y[some], u[some], truth, grid.pixel_size)
+
+    def every(self, step: int) -> _Sample:
+        """One of so many points."""
+        some = slice(None, None, step if len(self.x) > _POINTS // step else 1)
+        return _Sample(self.x[some], self.y[some], self.u[some], self.truth, self.unit)
+
+    def look_up(self, readings: Sequence[Reading]) -> None:
+        """Find the truth for many readings at once, which is quicker than for one after another."""
+        new = {
+            _place(reading): reading for reading in readings if _place(reading) not in self._known
+        }
+        if not new:
+            return
+        at = [reading.taken(self.x, self.y, self.u) for reading in new.values()]
+        true = self.truth(
+            np.concatenate([x for x, _, _ in at]), np.concatenate([y for _, y, _ in at])
+        )
+        self._known |= dict(zip(new, np.split(true, len(new)), strict=True))
+
+    def errors(self, reading: Reading) -> FloatArray:
+        """(n, 2) of the numbers in the file, were they to hold the truth by that reading [px].
+
+        All readings have the same noise in their errors, also those that scale displacements. NaN
+        where a point would be off the material.
+        """
+        self.look_up([reading])
+        written = self._known[_place(reading)] @ reading.components / reading.scale
+        return np.asarray((self.u - written) / self.unit)
+
+    def cost(self, reading: Reading) -> float:
+        """Mean length of the errors, each bounded; the bound where a point is off [px]."""
+        return float(_bounded(self.errors(reading), self.cap).mean())
+
+    def best(self, readings: Sequence[Reading]) -> list[Reading]:
+        """Those with the smallest errors."""
+        self.look_up(readings)
+        return sorted(readings, key=self.cost)[:_KEPT]
+
+    def median_px(self, reading: Reading) -> float:
+        """Median length of the displacement's error on the material [px]."""
+        return reading.scale * float(np.nanmedian(_length(self.errors(reading))))
+
+    def is_beaten(self, one: Reading, other: Reading) -> bool:
+        """Whether a reading's errors hold what it differs by from another, beyond chance.
+
+        The errors e of the one are fitted by c d, with d what the readings differ by: c is 0 if
+        the one is right, 1 if the other is. So it must be, too, where affine parts are taken out of
+        e and d: a lens or a tilted camera leaves such errors. A mere difference of origin is told
+        from a bias by how the motion varies from point to point.
+        """
+        mine, others = self.errors(one), self.errors(other)
+        known = np.isfinite(mine - others).all(axis=1)
+        if not np.isfinite(others).any() or not self.cost(one) - self.cost(other) > _SMALL_PX:
+            return False
+        if not known.any():
+            return True  # nowhere on the material but by the other one
+        mine, others, block = mine[known], others[known], self.block[known]
+        if one.differs_in_origin(other):
+            mine, others = (error - np.median(error, axis=0) for error in (mine, others))
+        blocks = len(np.unique(block))
+        if blocks < _FEWEST_BLOCKS:
+            return False
+        weight = _weights(np.minimum(_length(mine), _length(others)))
+        share, sd = _share(mine, mine - others, weight, block)
+        affine = np.column_stack([np.ones(len(block)), self.x[known], self.y[known]])
+        mine, others = (_less(error, affine, weight) for error in (mine, others))
+        varying, its_sd = _share(mine, mine - others, weight, block)
+        return bool(
+            share > sd * stats.t.isf(_CHANCE, blocks - 1)
+            and abs(share - 1.0) < _INEXACT + 3.0 * sd
+            and abs(varying - 1.0) < _INEXACT + 3.0 * its_sd
+        )
+
+
+def _weights(size: FloatArray) -> FloatArray:
+    """(n,) weights of points by the length of their errors: little for outliers."""
+    bound = 3.0 * float(np.median(size)) + 1e-9
+    return bound / np.maximum(size, bound)
+
+
+def _share(
+    error: FloatArray, effect: FloatArray, weight: FloatArray, block: NDArray[np.intp]
+) -> tuple[float, float]:
+    """How much of an effect is in errors (n, 2) [-], and its standard error by that of blocks."""
+    along, square = (
+        np.bincount(block, weight * (either * effect).sum(axis=1)) for either in (error, effect)
+    )
+    if not square.sum() > 0.0:
+        return 0.0, np.inf
+    share = along.sum() / square.sum()
+    return share, float(np.sqrt(((along - share * square) ** 2).sum()) / square.sum())
+
+
+def _less(error: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
+    """(n, 2) what a weighted fit by columns (n, m) leaves of errors."""
+    root = np.sqrt(weight)[:, None]
+    return error - columns @ np.linalg.lstsq(root * columns, root * error, rcond=None)[0]
+
+
+def _place(reading: Reading) -> tuple[object, ...]:
+    """What a reading's positions depend on."""
+    moved = (*reading.turn.ravel(), *(reading.shift + reading.origin))
+    return (*moved, *reading.components.ravel(), reading.scale) if reading.deformed else moved
+
+
+def _blocks(x: FloatArray, y: FloatArray) -> NDArray[np.intp]:
+    """(n,) number of the block that each point lies in; of four points or more on average."""
+    side = max(1, min(_BLOCKS, int(np.sqrt(len(x) / 4))))
+    col, row = (
+        np.minimum((side * (at - at.min()) / max(np.ptp(at), 1e-300)).astype(int), side - 1)
+        for at in (x, y)
+    )
+    return np.asarray(row * side + col)
+
+
+def _length(error: FloatArray) -> FloatArray:
+    return np.hypot(error[:, 0], error[:, 1])
+
+
+def _bounded(error: FloatArray, bound: float) -> FloatArray:
+    """(n,) lengths, no larger than a bound; the bound for what is not known."""
+    return np.minimum(np.nan_to_num(_length(error), nan=np.inf), bound)
