@@ -25,6 +25,7 @@ from known_truth import GRID, PIXEL, STRAIN, Truth
 from numpy.typing import NDArray
 
 from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.pyramid import FULL
 from modeharvest.idic.result import Result
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
@@ -57,7 +58,7 @@ class Noise:
     in_f: float
     in_g: float
     rounded: bool = False
-    gradient: str = "deformed"
+    gradient: str | None = None
     blur_px: float | None = None
 
     def draw(self, f: FloatArray, g: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -68,9 +69,9 @@ class Noise:
         return self.in_f * normal[0], self.in_g * normal[1]
 
     @property
-    def as_told(self) -> tuple[float, int]:
-        """``noise_sd`` and ``noisy_images`` of :meth:`Result.covariance`."""
-        return max(self.in_f, self.in_g), int(self.in_f > 0) + int(self.in_g > 0)
+    def known(self) -> ImageNoise:
+        """As the results are given it."""
+        return ImageNoise(self.in_f, self.in_g)
 
 
 NOISES = (
@@ -82,10 +83,9 @@ NOISES = (
     Noise("1 % in g only", 0.0, 0.01),
     Noise("1 % in f only", 0.01, 0.0),
     Noise("8-bit rounding", ROUNDING, ROUNDING, rounded=True),
-    Noise("least squares, 1 % in both", 0.01, 0.01, blur_px=0.0),
-    Noise("least squares, 2 % in both", 0.02, 0.02, blur_px=0.0),
-    Noise("reference's gradient, 2 % in both", 0.02, 0.02, gradient="reference"),
-    Noise("mean gradient, 2 % in both", 0.02, 0.02, gradient="mean"),
+    Noise("least squares, 1 % in both", 0.01, 0.01, gradient="deformed", blur_px=0.0),
+    Noise("least squares, 2 % in both", 0.02, 0.02, gradient="deformed", blur_px=0.0),
+    Noise("deformed image's gradient, 2 % in both", 0.02, 0.02, gradient="deformed"),
 )
 
 
@@ -175,7 +175,7 @@ def judge(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation
 
     return Pairs(
         of_all(lambda r: quantity.of(r.unknowns) - true),
-        of_all(lambda r: quantity.sd(r.covariance(*noise.as_told))),
+        of_all(lambda r: quantity.sd(r.covariance(noise.known))),
         np.sqrt(np.mean([quantity.sd(one.bound) ** 2 for one in made], axis=0)),
     )
 
@@ -212,8 +212,8 @@ def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
             "told_over_error": unknowns.told_over_error,
             "coverage": vars(unknowns.coverage),
             "chi_square_of_residual": float(
-                np.mean([r.agreement(*noise.as_told).chi_square for r in results])
-            ) if noise.in_f > 0 else None,
+                np.mean([r.agreement(noise.known).chi_square for r in results])
+            ),
             "not_converged": sum(r.outcome.value != "converged" for r in results),
         }  # fmt: skip
     det = np.quantile(np.linalg.det(truth.deformation_gradient), (0.0, 0.5, 1.0))
@@ -242,11 +242,10 @@ def tell(found: dict[str, Any]) -> None:
           "error / bound | told standard error / rms error | share in 95 % intervals | chi "
           "squared of the residual |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for noise, row in found["noises"].items():
-        residual = row["chi_square_of_residual"]
         print(f"| {noise} | {row['blur_px']:.2f} | {Share(**row['chi_square'])} | "
               f"{row['ratios'][0]:.2f} – {row['ratios'][1]:.2f} | {row['told_over_error']:.3f} | "
               f"{Share(**row['coverage'])} | "
-              f"{'–' if residual is None else format(residual, '.3f')} |")  # fmt: skip
+              f"{row['chi_square_of_residual']:.3f} |")  # fmt: skip
         if row["not_converged"]:
             print(f"{noise}: {row['not_converged']} correlations did not converge")
 

@@ -27,11 +27,11 @@ from modeharvest.imaging.imageset import ImageSet, make_images
 STRAIN, PIXEL = 0.128, 0.04
 NOISES = (0.0, 0.01, 0.02, 0.04, 0.08)
 WEIGHTED = {
-    "least squares": {"gradient_blur_px": 0.0},
+    "least squares": {"gradient": "deformed", "gradient_blur_px": 0.0},
     "as by default": {},
-    "deformed, blurred by 1 px": {"gradient_blur_px": 1.0},
+    "deformed, blurred by 1 px": {"gradient": "deformed", "gradient_blur_px": 1.0},
     "reference": {"gradient": "reference"},
-    "mean": {"gradient": "mean"},
+    "reference, blurred by 1 px": {"gradient": "reference", "gradient_blur_px": 1.0},
 }
 
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.residual_sums import block_moments, lagged_products
-from modeharvest.imaging.interpolation import SplineImage
 
 _SPARED_PX = 3
 """The deformed image's spline correlates its noise over fewer pixels than that by more than 2 %."""
@@ -31,8 +30,7 @@ TRAPPED = 0.1
 _WHITE = 0.02
 """Rms autocorrelation up to which a residual counts as noise, besides its own scatter."""
 _SIGMAS, _MODEL = 4.0, 0.03
-"""Chi squared may be off by 4 standard deviations and by 3 %: the noise that the spline passes
-is known as a mean over all positions between pixels."""
+"""Chi squared may be off by 4 standard deviations and by 3 %: noise is seldom known better."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,6 @@ class Agreement:
         pixels: int,
         unknowns: int,
         noise_sd: float | None = None,
-        noisy_images: int = 2,
-        order: int = 5,
         lags_px: tuple[int, ...] = LAGS_PX,
     ) -> Agreement:
         """Judge a residual.
@@ -78,11 +74,8 @@ class Agreement:
         unknowns
             Number of fitted unknowns.
         noise_sd
-            Standard deviation of the white noise in an image [grey levels], if known.
-        noisy_images
-            2 if both images are noisy, 1 if only the reference is.
-        order
-            Of the spline, which smooths the deformed image's noise.
+            Standard deviation of the residual that the images' noise predicts [grey levels], if
+            known; see :meth:`modeharvest.idic.result.Result.residual_noise`.
         lags_px
             Where the autocorrelation was taken.
 
@@ -93,14 +86,10 @@ class Agreement:
         """
         if noise_sd is None:
             return cls(correlation, pixels, lags_px=lags_px)
-        if not noise_sd > 0 or noisy_images not in (1, 2):
-            raise InputError(
-                "expected a noise of more than 0 grey levels in 1 or 2 images, got "
-                f"{noise_sd} in {noisy_images}"
-            )
-        passed = spline_noise(order) if noisy_images == 2 else 0.0
+        if not noise_sd > 0:
+            raise InputError(f"expected a noise of more than 0 grey levels, got {noise_sd}")
         freedom = max(1, pixels - unknowns)
-        chi_square = residual_rms**2 * pixels / freedom / noise_sd**2 / (1.0 + passed)
+        chi_square = residual_rms**2 * pixels / freedom / noise_sd**2
         return cls(correlation, pixels, chi_square, lags_px)
 
     @property
@@ -130,16 +119,6 @@ class Agreement:
             f"to {self.lags_px[-1]} px is {self.correlation:.2f}. The displacement has parts that "
             "the ansatz can't describe; the standard errors don't include them."
         )
-
-
-def spline_noise(order: int) -> float:
-    """Variance of interpolated white noise of variance 1, over all positions between pixels."""
-    impulse = np.zeros((41, 41))
-    impulse[20, 20] = 1.0
-    fine = 16
-    along = np.arange(fine * 32 + 1)[:-1] / fine + 4.0
-    weights, _, _ = SplineImage.of(impulse, order, np.float64).sample(20.0, along)
-    return float(((weights**2).sum() / fine) ** 2)
 
 
 def lags_for(width_px: float) -> tuple[int, ...]:

@@ -48,7 +48,6 @@ class Compared:
         images: tuple[NDArray[Any], NDArray[Any]],
         masks: tuple[BoolArray | None, BoolArray | None],
         edge_px: int,
-        order: int,
     ) -> Compared:
         """Prepare the images once more as the last level of a correlation did.
 
@@ -58,15 +57,15 @@ class Compared:
             Of the correlation.
         images, masks
             (rows, cols) f and g, and where they show material; None if not known.
-        edge_px, order
+        edge_px
             Of :class:`~modeharvest.idic.correlate.CorrelationOptions`.
         """
-        grid = result.grid
+        grid, order = result.grid, result.order
         pair = prepare(*images, grid, *masks, FULL, edge_px, order)
         used = pair.mask
         if pair.allowed is not None:
             every = Assembly(result.ansatz, grid, pair.mask)
-            used = landed(every, result.unknowns, pair.reference, pair.deformed, pair.allowed)
+            used, _ = landed(every, result.unknowns, pair.reference, pair.deformed, pair.allowed)
         row, col = np.indices(grid.shape, dtype=np.float64)
         deformed = pair.deformed.sample(row, col)[0].astype(np.float32)
         return cls(pair.reference, deformed, used, order)

@@ -29,11 +29,14 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.speckle_width import speckle_width
 from modeharvest.idic.weighting import Gradient
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.interpolation import ORDERS
 from modeharvest.progress import Progress, silent
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+_FINE_PX = 6.5
+"""Speckles narrower than this want a spline of order 11."""
 _LEAST = 1e-3
 """On coarse levels, directions with an eigenvalue below this share of the largest one wait for
 the finest level: what a blur does to the images would send them into other valleys."""
@@ -52,38 +55,39 @@ class CorrelationOptions:
         Pixels of the reference closer than this to the edge of a hole are left out on the
         finest level [px].
     order
-        Of the spline that samples the deformed image: 5 or 3.
+        Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where
+        speckles are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px.
     gauss_newton
         Tolerances and limits.
     gradient
         What weighs the residual in the end, see :mod:`modeharvest.idic.weighting`: the gradient
-        of the "deformed" image at x + u (the least-squares minimum), that of the "reference" at
-        x, or their "mean".
+        of the "deformed" image at x + u (the least-squares minimum), or that of the "reference"
+        at x. By default the reference's where the residual is noise, else the deformed image's.
     gradient_blur_px
-        Blur of the images that this gradient is taken of, on the finest level [px]. By default
-        none, unless the residual is noise that would spoil the gradient: then the blur that
-        makes the unknowns' variance smallest.
+        Blur of the image that this gradient is taken of, on the finest level [px]. By default
+        none, unless the residual is noise: then the blur that makes the unknowns' variance
+        smallest.
     """
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
     edge_px: int = 2
-    order: int = 5
+    order: int | None = None
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
-    gradient: str = "deformed"
+    gradient: str | None = None
     gradient_blur_px: float | None = None
 
     def __post_init__(self) -> None:
         known = [gradient.value for gradient in Gradient]
-        if self.gradient not in known or not (self.gradient_blur_px or 0.0) >= 0.0:
+        if self.gradient not in (None, *known) or not (self.gradient_blur_px or 0.0) >= 0.0:
             raise InputError(
                 f"expected a gradient among {known} and a blur of it of at least 0 px, got "
                 f"{self.gradient!r} and {self.gradient_blur_px}"
             )
         if not self.levels:
             raise InputError("expected at least one level from coarse to fine, got none")
-        if self.edge_px < 0 or self.order not in (3, 5):
+        if self.edge_px < 0 or self.order not in (None, *ORDERS):
             raise InputError(
-                f"expected edge_px >= 0 and order 3 or 5, got {self.edge_px} and {self.order}"
+                f"expected edge_px >= 0 and order 3, 5 or 11, got {self.edge_px} and {self.order}"
             )
 
 
@@ -129,13 +133,15 @@ def correlate(
     options = options or CorrelationOptions()
     clock = _Clock()
     images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
+    width_px = speckle_width(images.f, images.f_mask)
+    order = options.order or (5 if width_px >= _FINE_PX else 11)
     a = before = _lit_alike(ansatz, ansatz.checked(start), *images.grey)
     clock.lap("check")
     levels = _useful(options.levels, ansatz, grid)
     history: tuple[Iteration, ...] = ()
     for k, level in enumerate(levels):
         report = _reporter(progress, k, len(levels), options.gauss_newton)
-        search = _level_search(images, ansatz, level, level is levels[-1], options, report)
+        search = _level_search(images, ansatz, level, level is levels[-1], order, options, report)
         clock.lap(f"prepare level {level.factor}")
         n = search.ansatz.size
         before = np.append(search.better(a[:n], before[:n]), a[n:])
@@ -145,16 +151,17 @@ def correlate(
         a = np.append(found.unknowns, a[n:])
         if found.outcome in WITHOUT_RESULT:
             break
-    width_px = speckle_width(search.pair.reference, search.pair.mask)
     result = judged(search.ansatz, search.pair, found, assembly, width_px)
     clock.lap("judge the residual")
-    gradient = Gradient(options.gradient)
+    gradient = None if options.gradient is None else Gradient(options.gradient)
     weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
-    if level == FULL and result.outcome is Outcome.CONVERGED and not weighting.is_least_squares:
+    without = (*WITHOUT_RESULT, Outcome.TRAPPED)
+    if level == FULL and result.outcome not in without and not weighting.is_least_squares:
         weights = instrument(weighting, images, search.pair, assembly, found.unknowns)
-        found = search.reweighed(found, assembly, weights)
+        found, how = search.reweighed(found, assembly, weights)
         history += found.history
-        result = judged(search.ansatz, search.pair, found, assembly, width_px, weighting)
+        weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
+        result = judged(search.ansatz, search.pair, found, assembly, width_px, *weighted)
         clock.lap("weigh anew")
     progress(len(levels), len(levels), "correlate")
     return replace(result, history=history, timings_s=clock.laps)
@@ -230,6 +237,7 @@ def _level_search(
     ansatz: Ansatz,
     level: Level,
     finest: bool,
+    order: int,
     options: CorrelationOptions,
     report: Callable[[int], None],
 ) -> LevelSearch:
@@ -241,7 +249,7 @@ def _level_search(
     levelled = ansatz.brightness.size > 0 and not finest
     pair = prepare(
         images.f, images.g, images.grid, images.f_mask, images.g_mask, level, options.edge_px,
-        options.order, levelled,
+        order if level == FULL else min(order, 5), levelled,
     )  # fmt: skip
     coarse_px = options.gauss_newton.coarse_tolerance_px * level.factor
     return LevelSearch(

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.errors import InputError
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.result import Result
 from modeharvest.imaging.interpolation import SplineImage
@@ -172,27 +173,28 @@ def noise_covariance(
     return _sandwich(soft, np.vstack(examples)) / len(examples)
 
 
-def softened(result: Result, noise_sd: float, soft: FloatArray) -> FloatArray:
+def softened(result: Result, noise: ImageNoise | float, soft: FloatArray) -> FloatArray:
     """(n, n) covariance by white noise in both images against the cost's own curvature.
 
-    H⁻¹ V H⁻¹, where V are the pushes that make ``result.covariance(noise_sd)``, C = 2σ²(1 + e)M⁻¹
-    with the excess e of a noisy gradient, with Gauss and Newton's curvature M without noise:
-    V = M C M = (2σ²(1 + e))² C⁻¹.
+    H⁻¹ V H⁻¹, where V = M C M are the pushes that make C = ``result.covariance(noise)`` with
+    Gauss and Newton's curvature M. Where the residual is noise there is no such difference, and
+    C itself is given.
 
     Parameters
     ----------
     result
         Of a correlation.
-    noise_sd
-        Of each image [grey levels].
+    noise
+        Of the images, or the standard deviation of both [grey levels].
     soft
         (n, n) of :func:`softness`.
     """
+    found = result.covariance(noise)
+    if result.agreement().is_white:
+        return found
     kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
-    found = result.covariance(noise_sd)
-    excess = result.weighting.excess(result.noise_in_gradient(noise_sd**2))
-    pushes = (2.0 * noise_sd**2 * (1.0 + excess)) ** 2 * np.linalg.inv(found[kept])
-    found[kept] = soft[kept] @ pushes @ soft[kept].T
+    M = (1.0 - result.noise_in_slope(ImageNoise.of(noise))) * np.linalg.inv(result.inverse[kept])
+    found[kept] = soft[kept] @ M @ found[kept] @ M @ soft[kept].T
     return found
 
 

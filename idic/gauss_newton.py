@@ -36,6 +36,7 @@ class Outcome(Enum):
     SINGULAR = "singular"
     LEFT_IMAGE = "left_image"
     TRAPPED = "trapped"
+    UNWEIGHTED = "unweighted"
 
     @property
     def explanation(self) -> str:
@@ -64,6 +65,11 @@ _EXPLANATIONS = {
         "The iteration ended where parts of the images don't match at all: a local minimum; "
         "start closer, or with other mode parameters."
     ),
+    Outcome.UNWEIGHTED: (
+        "The least-squares minimum was found, but from there no way to where the gradient that "
+        "was to weigh the residual does so: this is the least-squares minimum, which noise biases "
+        "by more than its standard errors say; try gradient_blur_px, or gradient = 'deformed'."
+    ),
 }
 
 
@@ -79,6 +85,11 @@ class GaussNewtonOptions:
         floor of DIC.
     coarse_tolerance_px
         The same in *binned* px on the coarse levels, which only have to lead to the next.
+    tolerance_errors
+        Converged, too, where no step lowers the cost any more and the last one was that short,
+        rms over the unknowns in standard errors, the residual being taken for noise: the
+        relative offset of Bates & Watts, Technometrics 23 (1981), doi
+        10.1080/00401706.1981.10486254.
     max_iterations
         On each level.
     max_left
@@ -87,6 +98,7 @@ class GaussNewtonOptions:
 
     tolerance_px: float = 1e-4
     coarse_tolerance_px: float = 1e-2
+    tolerance_errors: float = 0.01
     max_iterations: int = 50
     max_left: float = 0.2
 
@@ -257,6 +269,7 @@ class _Step:
 
     to: _Point
     length_px: float
+    errors: float
     damping: float
     accepted: bool
 
@@ -281,16 +294,20 @@ def _descend(at: _Point, evaluate: Evaluate, step_length: StepLength, limits: _L
         change = found.gradient - at.equations.gradient
         curvature = corrected(at.curvature, a - at.a, change)
     has_fallen = found.mean_square < _FALLING * at.equations.mean_square
-    return _Step(_Point(a, found, is_assembled, curvature, has_fallen), length, damping, accepted)
+    errors = standard_errors(a - at.a, at.curvature, at.equations)
+    to = _Point(a, found, is_assembled, curvature, has_fallen)
+    return _Step(to, length, errors, damping, accepted)
 
 
 def _ending(step: _Step, number: int, limits: _Limits) -> Outcome | None:
     """Why to stop after this step, if there is a reason."""
     if step.length_px <= limits.tolerance_px and step.damping <= _FIRST_DAMPING:
         return Outcome.CONVERGED
-    if not step.accepted:
-        return Outcome.STAGNATED
-    return Outcome.MAX_ITERATIONS if number >= limits.options.max_iterations else None
+    if step.accepted and number < limits.options.max_iterations:
+        return None
+    if step.damping <= _FIRST_DAMPING and step.errors <= limits.options.tolerance_errors:
+        return Outcome.CONVERGED
+    return Outcome.MAX_ITERATIONS if step.accepted else Outcome.STAGNATED
 
 
 def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
@@ -304,6 +321,14 @@ def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> Float
         return matrix
     lost, gained = np.outer(pushed, pushed) / curvature, np.outer(change, change) / seen
     return np.asarray(matrix - lost + gained)
+
+
+def standard_errors(step: FloatArray, curvature: FloatArray, at: NormalEquations) -> float:
+    """How long a step is, rms over the unknowns, in their standard errors by the residual."""
+    squares = max(0.0, float(step @ curvature @ step))
+    if not at.mean_square > 0.0:
+        return np.inf
+    return float(np.sqrt(squares / (at.mean_square * step.size)))
 
 
 def _left(equations: NormalEquations) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.estimating_equation import root
+from modeharvest.idic.estimating_equation import Propagation, root
 from modeharvest.idic.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -112,7 +112,9 @@ class LevelSearch:
                 break
         return replace(found, history=history), used
 
-    def reweighed(self, found: Minimum, used: Assembly, instrument: NDArray[Any]) -> Minimum:
+    def reweighed(
+        self, found: Minimum, used: Assembly, instrument: NDArray[Any]
+    ) -> tuple[Minimum, Propagation]:
         """Move on from the minimum to where an instrument weighs the residual to zero.
 
         Parameters
@@ -122,21 +124,26 @@ class LevelSearch:
         instrument
             (3, rows, cols) as for :meth:`Assembly.images`.
         """
-        pair = self.pair
+        images = self.pair.reference, self.pair.deformed
 
-        def evaluate(a: FloatArray, with_matrix: bool) -> NormalEquations:
-            return used.images(a, pair.reference, pair.deformed, with_matrix, instrument)
+        def matrix(share: float) -> FloatArray:
+            return used.images(found.unknowns, *images, True, instrument, share).matrix
 
+        def evaluate(a: FloatArray) -> NormalEquations:
+            return used.images(a, *images, False, instrument)
+
+        how = Propagation.of(matrix, found.equations.matrix)
         length = step_length(self.ansatz, used.grid, used.mask, self.factor)
-        return root(evaluate, length, found, self.options, self.on_iteration)
+        there = root(evaluate, how.slope, length, found, self.options, self.on_iteration)
+        return there, how
 
     def _landed(self, a: FloatArray) -> Assembly:
-        """All pixels, less those that these unknowns map onto no material."""
+        """All pixels, less those that these unknowns map onto no material, or off the image."""
         pair = self.pair
         if pair.allowed is None:
             return self._everything
-        kept = landed(self._everything, a, pair.reference, pair.deformed, pair.allowed)
-        return replace(self._everything, mask=kept)
+        kept, outside = landed(self._everything, a, pair.reference, pair.deformed, pair.allowed)
+        return replace(self._everything, mask=kept, outside=outside)
 
     @property
     def _only_leads(self) -> bool:
@@ -158,7 +165,7 @@ class LevelSearch:
             return assembly
         rows = np.zeros_like(assembly.mask)
         rows[_STRIDE // 2 :: _STRIDE] = assembly.mask[_STRIDE // 2 :: _STRIDE]
-        return replace(assembly, mask=rows)
+        return replace(assembly, mask=rows, outside=assembly.outside // _STRIDE)
 
     def _minimise(
         self, assembly: Assembly, start: FloatArray, tolerance: float, curvature: FloatArray | None
@@ -180,8 +187,8 @@ class LevelSearch:
 
         Those left out at g's border and at its holes are not to weigh as if they had left.
         """
-        rows = np.diff(assembly.runs.row_start) > 0
-        kept = assembly.pixels / max(1, self._material[rows].sum())
+        rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
+        kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
         most = min(1.0, self.options.max_left / kept) if kept > 0 else self.options.max_left
         return replace(self.options, max_left=most)
 

@@ -85,11 +85,15 @@ class Assembly:
         Where the pixels are.
     mask
         (rows, cols) True where there is material.
+    outside
+        Number of further pixels that were mapped outside the deformed image when the pixels were
+        chosen: they take no part, but count as having left.
     """
 
     ansatz: Ansatz
     grid: PixelGrid
     mask: BoolArray
+    outside: int = 0
 
     def __post_init__(self) -> None:
         if self.mask.shape != self.grid.shape:
@@ -160,6 +164,7 @@ class Assembly:
         deformed: SplineImage,
         with_matrix: bool = True,
         instrument: NDArray[Any] | None = None,
+        share: float = 1.0,
     ) -> NormalEquations:
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
@@ -179,8 +184,10 @@ class Assembly:
             (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and
             y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
             being its products with the derivatives of the displacement and of the gain.
+        share
+            How much of h is the instrument; the rest is g's own [-].
         """
-        target = Target.images(reference, deformed, self.grid, instrument)
+        target = Target.images(reference, deformed, self.grid, instrument, share)
         return self._assemble(a, target, with_matrix)
 
     def displacement(
@@ -223,8 +230,9 @@ class Assembly:
             matrix[parts[e], parts[k]] = _products(moment, degrees[e], degrees[k])
             matrix[parts[k], parts[e]] = matrix[parts[e], parts[k]].T
         to = self._to_unknowns
+        left = self.outside + off
         return NormalEquations(
-            to.T @ matrix[:-1, :-1] @ to, -to.T @ matrix[:-1, -1], 0.5 * matrix[-1, -1], used, off
+            to.T @ matrix[:-1, :-1] @ to, -to.T @ matrix[:-1, -1], 0.5 * matrix[-1, -1], used, left
         )
 
 

@@ -44,6 +44,8 @@ class Target(NamedTuple):
     instrument
         (3, rows, cols) what weighs the residual in place of (1 + b) times the gradient of g at
         x + u, along x and y [grey levels/mm], and of g there; (3, 0, 0) for these themselves.
+    share
+        How much of what weighs is the instrument; the rest is g's own [-].
     pixel_size
         [mm/px].
     """
@@ -54,6 +56,7 @@ class Target(NamedTuple):
     order: int
     displacement: NDArray[Any]
     instrument: NDArray[Any]
+    share: float
     pixel_size: float
 
     @classmethod
@@ -63,12 +66,13 @@ class Target(NamedTuple):
         deformed: SplineImage,
         grid: PixelGrid,
         instrument: NDArray[Any] | None = None,
+        share: float = 1.0,
     ) -> Target:
         """A pair of images."""
         f, nothing = readable(reference), readable(np.zeros((0, 0)))
         given = readable(NO_INSTRUMENT if instrument is None else instrument)
         spline = deformed.coefficients, deformed.order
-        return cls(IMAGES, f, *spline, nothing, given, grid.pixel_size)
+        return cls(IMAGES, f, *spline, nothing, given, share, grid.pixel_size)
 
     @classmethod
     def along(cls, component: int, displacement: NDArray[Any], grid: PixelGrid) -> Target:
@@ -76,7 +80,7 @@ class Target(NamedTuple):
         nothing = np.zeros((0, 0), dtype=np.float32)
         u = readable(displacement)
         none = readable(NO_INSTRUMENT)
-        return cls(component, readable(nothing), nothing, 5, u, none, grid.pixel_size)
+        return cls(component, readable(nothing), nothing, 5, u, none, 1.0, grid.pixel_size)
 
 
 IMAGES = -1
@@ -326,8 +330,9 @@ def sample_block(target: Any, row: int, n: int, block: Any) -> int:
     for m in range(n):
         residual[m] = (known[m] - c[m]) * weight[m] - (1.0 + b[m]) * g[m]
     if target.instrument.shape[1]:
+        share = target.share
         for k in range(3):
             given, to = own[INSTRUMENT + k], (E[k] if k < 2 else g)
             for m in range(n):
-                to[m] = weight[m] * given[m]
+                to[m] = weight[m] * (share * given[m] + (1.0 - share) * to[m])
     return off

@@ -15,15 +15,20 @@ from modeharvest.files import read_record, write_json
 from modeharvest.idic.agreement import LAGS_PX, Agreement
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.gauss_newton import Iteration, Outcome
+from modeharvest.idic.noise_transfer import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.idic.serialise import result_fields, result_to_dict
-from modeharvest.idic.weighting import SLOPE_NOISE, Weighting
+from modeharvest.idic.weighting import Gradient, Weighting
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.interpolation import SplineImage
 from modeharvest.reading import reading
 
 FloatArray = NDArray[np.float64]
 
-FORMAT = "modeharvest-result-3"
+FORMAT = "modeharvest-result-4"
+
+_MOST_NOISE = 0.8
+"""Of a mean square slope no more is taken for noise: where noise is all there is, the estimate of
+what is not would be nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +44,9 @@ class Result:
     unknowns
         (n,): a, in the order of ``ansatz.names``.
     inverse
-        (n, n): M^-1, the inverse of the Gauss-Newton matrix; times a variance of the residual
-        it is the covariance. Infinite on the diagonal where nothing could be determined.
+        (n, n) covariance of the unknowns for a residual of white noise of variance 1: with least
+        squares M^-1, M = J'J being the Gauss-Newton matrix; with other weights h in place of J
+        (h'J)^-1 h'h (J'h)^-1. Infinite on the diagonal where nothing could be determined.
     residual_rms
         Root mean square of the residual over the pixels used: grey levels, or mm per component
         for a fit to a displacement.
@@ -65,6 +71,13 @@ class Result:
         0.1 the outcome is TRAPPED. NaN for a fit to a displacement.
     weighting
         Which gradient weighed the residual.
+    slope_square, weight_square
+        Mean squares along an axis of the deformed image's gradient and of the one that weighed
+        the residual, noise included [grey levels^2/px^2].
+    noise_transfer
+        What of the deformed image's noise reaches the residual.
+    order
+        Of the spline.
     """
 
     ansatz: Ansatz
@@ -82,6 +95,10 @@ class Result:
     unmatched: float = float("nan")
     residual_lags_px: tuple[int, ...] = LAGS_PX
     weighting: Weighting = field(default_factory=Weighting)
+    slope_square: float = 0.0
+    weight_square: float = 0.0
+    noise_transfer: NoiseTransfer = field(default_factory=NoiseTransfer)
+    order: int = 5
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -111,96 +128,98 @@ class Result:
 
     @property
     def noise_sd(self) -> float:
-        """Grey-level noise of each image if the residual were nothing but noise in both.
+        """Grey-level noise of each image if the residual were nothing but noise, alike in both.
 
-        An upper bound: what the ansatz can't describe is in the residual too.
+        An upper bound: what the ansatz can't describe is in the residual too. What the spline
+        smooths away of the noise of g is not in it, and is put back.
         """
         freedom = max(1, self.pixels - self.ansatz.size)
-        return float(self.residual_rms * np.sqrt(max(1, self.pixels) / freedom / 2.0))
+        both = 1.0 + self.noise_transfer.value
+        return float(self.residual_rms * np.sqrt(max(1, self.pixels) / freedom / both))
 
-    def covariance(self, noise_sd: float | None = None, noisy_images: int = 2) -> FloatArray:
+    @property
+    def noise_to_slope(self) -> float:
+        """Variance of :attr:`noise_sd` over the mean square of the speckle's own slope [px^2]."""
+        if self.slope_square <= 0.0:
+            return 0.0
+        variance = self.noise_sd**2
+        share = min(variance * self.noise_transfer.slope / self.slope_square, _MOST_NOISE)
+        return variance / (self.slope_square * (1.0 - share))
+
+    def covariance(self, noise: ImageNoise | float | None = None) -> FloatArray:
         """(n, n) covariance of the unknowns under white noise: for weak noise the Cramer-Rao bound.
 
         Parameters
         ----------
-        noise_sd
-            Standard deviation of the noise in an image [grey levels]; by default the one that
-            makes the residual nothing but noise.
-        noisy_images
-            2 if both images are noisy, 2 s^2 M^-1; 1 if only the reference is, s^2 M^-1.
+        noise
+            Of the images, or the standard deviation of both [grey levels]; by default
+            :attr:`noise_sd` in both, which makes the residual nothing but noise.
 
         Notes
         -----
-        Two things that noise s in the deformed image does beyond that, in both of which the
-        variance q s^2 of its own gradient counts against the speckle's G^2: it makes M larger,
-        by 1 + q s^2/G^2, which is taken back; and it spoils the gradient that the residual is
-        weighed with, which adds what :meth:`Weighting.excess` says. Where the noise isn't given,
-        that is done if the residual is noise.
-
-        The noise of the deformed image weighs 1/det F more: where the material has shrunk,
-        neighbouring pixels of the reference share noise. That is not taken into account.
+        s_f^2 + s_g^2/det F, the mean of 1/det F over the pixels, times :attr:`inverse`. Of higher
+        order are two things that noise in the gradient does. The noise of an image is
+        uncorrelated with its own slope at the same pixel and anticorrelated elsewhere, which
+        takes back what that slope seems to scatter. And J'J holds the slope of g's noise: where
+        it is the matrix (least squares), that is taken out. Where the noise isn't given, these
+        are counted if the residual is noise.
         """
-        if noisy_images not in (1, 2):
-            raise InputError(f"expected 1 or 2 noisy images, got {noisy_images}")
-        # The residual holds the noise of however many images are noisy.
-        variance = noisy_images * noise_sd**2 if noise_sd is not None else 2.0 * self.noise_sd**2
-        is_noise = noise_sd is not None or self.agreement().is_white
-        if noisy_images == 2 and is_noise and np.isfinite(self.residual_correlation):
-            share = self.noise_in_gradient(0.5 * variance)
-            variance *= (1.0 + share) * (1.0 + self.weighting.excess(share))
+        known = ImageNoise.of(self.noise_sd if noise is None else noise)
+        in_f = known.reference**2
+        in_g = known.deformed**2 * self.noise_transfer.density
+        variance = in_f + in_g
+        is_noise = noise is not None or self.agreement().is_white
+        if variance > 0.0 and is_noise and np.isfinite(self.residual_correlation):
+            share = self.noise_in_slope(known)
+            own = in_f if self.weighting.gradient is Gradient.REFERENCE else in_g
+            variance -= share * own
+            if self.weighting.is_least_squares:
+                variance /= (1.0 - share) ** 2
         return np.asarray(variance * self.inverse)
 
-    def noise_in_gradient(self, variance: float) -> float:
-        """q s^2/G^2 [-]: what noise adds to the deformed image's squared gradient.
-
-        The columns of a constant v0 are the gradient; as large as 4 where noise is all there is.
-
-        Parameters
-        ----------
-        variance
-            s^2 of the noise in the deformed image [grey levels squared].
-        """
-        kept = np.flatnonzero(np.isfinite(np.diag(self.inverse)))
-        matrix = np.linalg.inv(self.inverse[np.ix_(kept, kept)])
-        constants = np.isin(kept, [self.ansatz.v0_slice(c).start for c in (0, 1)])
-        if not constants.any():
+    def noise_in_slope(self, noise: ImageNoise) -> float:
+        """Share of :attr:`weight_square` that is the noise's [-]."""
+        if self.weight_square <= 0.0:
             return 0.0
-        seen = float(np.diag(matrix)[constants].mean()) / max(1, self.pixels)
-        noise = SLOPE_NOISE * variance / self.grid.pixel_size**2
-        return noise / max(seen - noise, 0.25 * noise)
+        weighting = self.weighting
+        if weighting.gradient is Gradient.REFERENCE:
+            made = noise.reference**2 * slope_noise(self.order, weighting.blur_px)
+        elif weighting.blur_px > 0.0:
+            made = noise.deformed**2 * slope_noise(self.order, weighting.blur_px)
+        else:
+            made = noise.deformed**2 * self.noise_transfer.slope
+        return min(made / self.weight_square, _MOST_NOISE)
 
-    def agreement(
-        self, noise_sd: float | None = None, noisy_images: int = 2, order: int = 5
-    ) -> Agreement:
+    def residual_noise(self, noise: ImageNoise | float) -> float:
+        """Standard deviation of the residual that noise in the images makes [grey levels]."""
+        known = ImageNoise.of(noise)
+        in_g = self.noise_transfer.value * known.deformed**2
+        return float(np.sqrt(known.reference**2 + in_g))
+
+    def agreement(self, noise: ImageNoise | float | None = None) -> Agreement:
         """Whether the residual is noise: what the standard errors rest on.
 
         Parameters
         ----------
-        noise_sd
-            Standard deviation of the noise in an image [grey levels], if known; then chi
-            squared is told, too.
-        noisy_images
-            2 if both images are noisy, 1 if only the reference is.
-        order
-            Of the spline that was used.
+        noise
+            Of the images, or the standard deviation of both [grey levels], if known; then chi
+            squared is given, too.
         """
         return Agreement.of(
             self.residual_rms,
             self.residual_correlation,
             self.pixels,
             self.ansatz.size,
-            noise_sd,
-            noisy_images,
-            order,
+            None if noise is None else self.residual_noise(noise),
             self.residual_lags_px,
         )
 
-    def standard_errors(self, noise_sd: float | None = None) -> FloatArray:
+    def standard_errors(self, noise: ImageNoise | float | None = None) -> FloatArray:
         """(n,): square roots of the diagonal of :meth:`covariance`."""
-        return np.sqrt(np.diag(self.covariance(noise_sd)))
+        return np.sqrt(np.diag(self.covariance(noise)))
 
     def displacement_sd(
-        self, x: ArrayLike, y: ArrayLike, noise_sd: float | None = None
+        self, x: ArrayLike, y: ArrayLike, noise: ImageNoise | float | None = None
     ) -> FloatArray:
         """(..., 2): predicted standard deviation of u_x and u_y [mm] at positions [mm].
 
@@ -211,11 +230,11 @@ class Result:
         x, y
             Positions that broadcast together, or two axes; for maps take every tenth pixel or
             so: it is as smooth as the ansatz.
-        noise_sd
+        noise
             As for :meth:`covariance`.
         """
         S = self.ansatz.sensitivities(self.unknowns, x, y)
-        covariance = self.covariance(noise_sd)
+        covariance = self.covariance(noise)
         lost = np.isinf(np.diag(covariance))
         covariance[np.ix_(lost, lost)] = 0.0
         variance = np.einsum("...n,nm,...m->...", S, covariance, S, optimize=True)

@@ -13,6 +13,7 @@ from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.fourier import FourierMode, ModeFamily
 from modeharvest.idic.gauss_newton import Iteration, Outcome
+from modeharvest.idic.noise_transfer import NoiseTransfer
 from modeharvest.idic.support import Taper
 from modeharvest.idic.weighting import Gradient, Weighting
 from modeharvest.imaging.grid import PixelGrid
@@ -66,6 +67,10 @@ def result_to_dict(result: Result) -> dict[str, Any]:
             "width_px": _finite(weighting.width_px),
             "explanation": weighting.sentence,
         },
+        "slope_square": _finite(result.slope_square),
+        "weight_square": _finite(result.weight_square),
+        "noise_transfer": vars(result.noise_transfer),
+        "order": result.order,
         "grid": vars(result.grid),
         "ansatz": ansatz_to_dict(result.ansatz),
         "inverse": [[_finite(float(v)) for v in row] for row in result.inverse],
@@ -75,7 +80,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
     weighting = content["weighting"]
-    plain = ("pixels", "left_image", "timings_s")
+    plain = ("pixels", "left_image", "timings_s", "order")
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
     return {
         **{name: content[name] for name in plain},
@@ -90,6 +95,9 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
         "residual_correlation": _or(np.nan, content["residual_correlation"]),
         "residual_lags_px": tuple(content["residual_lags_px"]),
         "unmatched": _or(np.nan, content["unmatched"]),
+        "slope_square": _or(np.inf, content["slope_square"]),
+        "weight_square": _or(np.inf, content["weight_square"]),
+        "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
         "weighting": Weighting(
             Gradient(weighting["gradient"]),
             weighting["blur_px"],

@@ -34,7 +34,7 @@ class Identification:
     edge_px
         Pixels of the reference closer than this to the edge of a hole are left out [px].
     order
-        Of the spline that samples the deformed image: 5 or 3.
+        Of the spline that samples the deformed image: 3, 5 or 11; None for as the speckle asks for.
     camera
         Correlate the quantised images instead of the float ones.
     hold_mode
@@ -42,21 +42,21 @@ class Identification:
     gain_degree, offset_degree
         Total degrees of a gain and of an offset between the images' grey levels; None for none.
     gradient, gradient_blur_px
-        What weighs the residual: the gradient of the "deformed" image, of the "reference", or
-        their "mean"; and the blur of what it is taken of [px], None for as the noise asks for.
-        See :class:`CorrelationOptions`.
+        What weighs the residual: the gradient of the "deformed" image or of the "reference"; and
+        the blur of what it is taken of [px]; None for as the noise asks for. See
+        :class:`CorrelationOptions`.
     """
 
     v0_degree: int = 5
     v_degree: int = 6
     start_amplitude: float = 1.0
     edge_px: int = 2
-    order: int = 5
+    order: int | None = None
     camera: bool = False
     hold_mode: bool = False
     gain_degree: int | None = None
     offset_degree: int | None = None
-    gradient: str = "deformed"
+    gradient: str | None = None
     gradient_blur_px: float | None = None
 
     def __post_init__(self) -> None:

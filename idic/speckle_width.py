@@ -21,7 +21,7 @@ _LINES = 256
 """Rows, and columns, that are enough: neighbouring ones say nearly the same."""
 
 
-def speckle_width(image: NDArray[Any], mask: BoolArray) -> float:
+def speckle_width(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     """Full width at half maximum of the autocorrelation of an image's material [px].
 
     Parameters
@@ -29,13 +29,14 @@ def speckle_width(image: NDArray[Any], mask: BoolArray) -> float:
     image
         (rows, cols) grey levels.
     mask
-        (rows, cols) True on material.
+        (rows, cols) True on material; None for everywhere.
 
     Returns
     -------
     float
         At most twice the largest lag looked at, 128 px; that for an image without contrast, too.
     """
+    mask = np.ones(image.shape, dtype=np.bool_) if mask is None else mask
     inner = eroded(mask, _EDGE_PX)
     inner = inner if inner.any() else mask
     curve = 0.5 * (_autocorrelation(image, inner) + _autocorrelation(image.T, inner.T))

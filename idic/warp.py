@@ -12,6 +12,7 @@ from modeharvest.idic.pixel_blocks import (
     AT_COL,
     AT_ROW,
     COLUMN,
+    U_X,
     WEIGHT,
     Target,
     displace_block,
@@ -35,7 +36,7 @@ def landed(
     reference: NDArray[Any],
     deformed: SplineImage,
     allowed: BoolArray,
-) -> BoolArray:
+) -> tuple[BoolArray, int]:
     """Keep the pixels that the unknowns map onto material of the deformed image.
 
     Parameters
@@ -51,12 +52,15 @@ def landed(
 
     Returns
     -------
-    (rows, cols)
-        A pixel off the image stays in: the iteration counts those and says so.
+    kept
+        (rows, cols).
+    outside
+        Number of the others that are mapped outside the deformed image.
     """
     kept = assembly.mask.copy()
-    _run(assembly, a, reference, deformed, allowed, kept, np.zeros((0, 0, 0), dtype=np.float32))
-    return kept
+    nothing = np.zeros((0, 0, 0), dtype=np.float32)
+    outside = _run(assembly, a, reference, deformed, allowed, kept, nothing)
+    return kept, outside
 
 
 def residual(
@@ -81,6 +85,47 @@ def brought_back(
     return found
 
 
+def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32]) -> None:
+    """Turn slopes at X into those at x = X + u of what moves along: F^-T times them, in place.
+
+    F by central differences of u between neighbouring pixels.
+
+    Parameters
+    ----------
+    assembly
+        Ansatz and grid; pixels beyond those that count are turned, too.
+    a
+        (size,) unknowns.
+    slopes
+        (2 or more, rows, cols) along x and y.
+    """
+    everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
+    u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
+    nothing = np.zeros((0, 0), dtype=np.bool_)
+    _run(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), nothing, nothing, u)
+    side_by_side(_turn, u, slopes, assembly.grid.pixel_size)
+
+
+@compiled(relaxed=True)
+def _turn(u: Any, slopes: Any, pixel_size: float, first: int, every: int) -> None:
+    rows, cols = u.shape[1:]
+    for i in range(first, rows, every):
+        up, down = max(0, i - 1), min(rows - 1, i + 1)
+        per_y = 1.0 / (pixel_size * max(1, down - up))
+        for j in range(cols):
+            left, right = max(0, j - 1), min(cols - 1, j + 1)
+            per_x = 1.0 / (pixel_size * max(1, right - left))
+            xx = 1.0 + (u[0, i, right] - u[0, i, left]) * per_x
+            yx = (u[1, i, right] - u[1, i, left]) * per_x
+            xy = (u[0, up, j] - u[0, down, j]) * per_y
+            yy = 1.0 + (u[1, up, j] - u[1, down, j]) * per_y
+            det = xx * yy - xy * yx
+            if det > 0.0:
+                s_x, s_y = slopes[0, i, j], slopes[1, i, j]
+                slopes[0, i, j] = (yy * s_x - yx * s_y) / det
+                slopes[1, i, j] = (xx * s_y - xy * s_x) / det
+
+
 def _fill(
     left: NDArray[np.float32],
     assembly: Assembly,
@@ -101,21 +146,27 @@ def _run(
     allowed: BoolArray,
     kept: BoolArray,
     left: NDArray[np.float32],
-) -> None:
-    ansatz = assembly.ansatz
+) -> int:
+    ansatz, outside = assembly.ansatz, np.zeros(BANDS, dtype=np.int64)
     tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    side_by_side(_pass, target, assembly.runs, tables, degree, BANDS, readable(allowed), kept, left)
+    side_by_side(
+        _pass, target, assembly.runs, tables, degree, readable(allowed), kept, left, outside
+    )
+    return int(outside.sum())
 
 
 @compiled(relaxed=True)
 def _pass(
-    target: Any, runs: Any, tables: Any, degree: int, bands: int, allowed: Any, kept: Any,
-    left: Any, first: int, every: int,
+    target: Any, runs: Any, tables: Any, degree: int, allowed: Any, kept: Any, left: Any,
+    outside: Any, first: int, every: int,
 ) -> None:  # fmt: skip
-    """Fill ``kept`` from ``allowed``, or else ``left``: one pass, so that it is compiled once."""
-    rows, per_px = runs.row_start.size - 1, 1.0 / target.pixel_size
+    """Fill ``kept`` from ``allowed``, or else ``left``: one pass, so that it is compiled once.
+
+    ``left`` takes the residual alone, the displacement of whole rows, or slopes and residual.
+    """
+    rows, per_px, bands = runs.row_start.size - 1, 1.0 / target.pixel_size, outside.size
     for band in range(first, bands, every):
         block = new_block(tables, degree, 3)
         own, E = block.own, block.E
@@ -126,7 +177,10 @@ def _pass(
                 displace_block(row, n, tables, block)
                 if kept.size:
                     map_block(row, n, per_px, own)
-                    _land(n, own, allowed, kept[row])
+                    outside[band] += _land(n, own, allowed, kept[row])
+                elif left.shape[0] == 2:
+                    for k in range(2):
+                        _place(n, own, own[U_X + k], left[k, row])
                 else:
                     sample_block(target, row, n, block)
                     for k in range(left.shape[0]):
@@ -141,9 +195,17 @@ def _put(n: int, own: Any, values: Any, to: Any) -> None:
 
 
 @compiled(relaxed=True)
-def _land(n: int, own: Any, allowed: Any, kept: Any) -> None:
-    last_row, last_col = allowed.shape[0] - 1, allowed.shape[1] - 1
+def _place(n: int, own: Any, values: Any, to: Any) -> None:
+    for m in range(n):
+        to[int(own[COLUMN, m])] = values[m]
+
+
+@compiled(relaxed=True)
+def _land(n: int, own: Any, allowed: Any, kept: Any) -> int:
+    last_row, last_col, outside = allowed.shape[0] - 1, allowed.shape[1] - 1, 0
     for m in range(n):
         row, col = own[AT_ROW, m], own[AT_COL, m]
-        if 0 <= row <= last_row and 0 <= col <= last_col:
-            kept[int(own[COLUMN, m])] = allowed[int(np.rint(row)), int(np.rint(col))]
+        inside = 0 <= row <= last_row and 0 <= col <= last_col
+        outside += not inside
+        kept[int(own[COLUMN, m])] = inside and allowed[int(np.rint(row)), int(np.rint(col))]
+    return outside

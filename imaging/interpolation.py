@@ -1,8 +1,8 @@
-"""Value and gradient of an image between its pixels, by cubic or quintic B-splines.
+"""Value and gradient of an image between its pixels, by B-splines of order 3, 5 or 11.
 
 The image is prefiltered once, so that the spline passes through every pixel; afterwards a
-sample costs 16 (cubic) or 36 (quintic) coefficients. On a speckle blurred by 3 px the cubic is
-off by 6e-5 of full scale and the quintic by 8e-7, hence the quintic is the default.
+sample costs 16, 36 or 144 coefficients. On a speckle blurred by 3 px the cubic is off by 6e-5 of
+full scale and the quintic by 8e-7. Speckles finer than 6 px want order 11: docs/metrology.md.
 
 Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220.
 """
@@ -18,11 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.errors import InputError
 from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.prefilter import spline_coefficients
-from modeharvest.imaging.taps import quintic_at
+from modeharvest.imaging.taps import eleventh_at, quintic_at
 
 FloatArray = NDArray[np.float64]
 
-PAD = 3
+ORDERS = (3, 5, 11)
+"""Of splines."""
+PAD = 6
 """Rows and columns of mirrored coefficients around the image, so that no tap needs a test."""
 
 
@@ -35,15 +37,15 @@ class SplineImage:
     coefficients
         (rows + 2 PAD, cols + 2 PAD) B-spline coefficients, float32 or float64.
     order
-        3 or 5.
+        3, 5 or 11.
     """
 
     coefficients: NDArray[Any]
     order: int
 
     def __post_init__(self) -> None:
-        if self.order not in (3, 5):
-            raise InputError(f"expected a spline of order 3 or 5, got {self.order}")
+        if self.order not in ORDERS:
+            raise InputError(f"expected a spline of order 3, 5 or 11, got {self.order}")
         if self.coefficients.ndim != 2 or min(self.coefficients.shape) < 2 * PAD + 2:
             raise InputError(
                 f"expected padded coefficients of at least {2 * PAD + 2} x {2 * PAD + 2}, "
@@ -59,7 +61,7 @@ class SplineImage:
         image
             (rows, cols) grey levels.
         order
-            3 or 5.
+            3, 5 or 11.
         dtype
             How the coefficients are stored: float32 costs 1e-7 of full scale. The recursive
             filter itself runs in float64, line by line.
@@ -68,13 +70,13 @@ class SplineImage:
         ------
         InputError
             If the image isn't two-dimensional or smaller than 2 x 2 px, or the order is
-            neither 3 nor 5.
+            not among the three.
         """
         pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
             raise InputError(f"expected an image of at least 2 x 2 px, got shape {pixels.shape}")
-        if order not in (3, 5):
-            raise InputError(f"expected a spline of order 3 or 5, got {order}")
+        if order not in ORDERS:
+            raise InputError(f"expected a spline of order 3, 5 or 11, got {order}")
         return cls(spline_coefficients(pixels, order, PAD), order)
 
     @property
@@ -150,6 +152,14 @@ def sample_quintic(c: Any, row: float, col: float) -> tuple[float, float, float]
     return found
 
 
+@compiled(inline=True, relaxed=True)
+def sample_eleventh(c: Any, row: float, col: float) -> tuple[float, float, float]:
+    """(value, d_row, d_col) at a position inside the image [px]."""
+    i, j = min(int(row), c.shape[0] - 2 * PAD - 2), min(int(col), c.shape[1] - 2 * PAD - 2)
+    found: tuple[float, float, float] = eleventh_at(c, i + PAD - 5, j + PAD - 5, row - i, col - j)
+    return found
+
+
 @compiled(relaxed=True)
 def sample_points(
     c: Any, order: int, row: Any, col: Any, n: int, value: Any, d_row: Any, d_col: Any
@@ -162,5 +172,7 @@ def sample_points(
             value[k] = d_row[k] = d_col[k] = np.nan
         elif order == 5:
             value[k], d_row[k], d_col[k] = sample_quintic(c, r, q)
+        elif order == 11:
+            value[k], d_row[k], d_col[k] = sample_eleventh(c, r, q)
         else:
             value[k], d_row[k], d_col[k] = sample_cubic(c, r, q)

@@ -9,21 +9,38 @@ Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220 (poles, initial values
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from modeharvest.imaging.compiled import compiled, readable
 
 FloatArray = NDArray[np.float64]
 
-_POLES = {
-    3: (-0.267949192431122706472553658494128,),
-    5: (-0.430575347099973791851434783493520, -0.0430962882032646537653098206270146),
-}
-"""Roots of the samples' z-transform inside the unit circle."""
+
+@cache
+def poles(order: int) -> FloatArray:
+    """Roots of the z-transform of a B-spline's samples inside the unit circle, the largest first.
+
+    Parameters
+    ----------
+    order
+        Odd.
+    """
+    knots = np.arange(order + 2.0)
+    samples = BSpline.basis_element(knots)(knots[1:-1])
+    polynomial = np.polynomial.Polynomial(samples)
+    roots = polynomial.roots().real
+    found: FloatArray = roots[abs(roots) < 1.0]
+    for _ in range(3):  # Newton, because the roots of an eigenvalue problem have lost digits
+        found = found - polynomial(found) / polynomial.deriv()(found)
+    return np.asarray(np.sort(found))
+
+
 _LINES = 16
 """Lines filtered side by side: two vectors of float64."""
 _NEGLIGIBLE = 1e-18
@@ -33,20 +50,20 @@ def border_reach(order: int, share: float) -> int:
     """How far from an image's border what lies beyond it is felt by more than a share [px].
 
     A spline passes through every pixel whatever continues the image, but between the pixels the
-    continuation is felt: by a factor of the largest pole, 0.43 or 0.27, less with every pixel.
+    continuation is felt: less with every pixel by the largest pole, 0.27, 0.43 or 0.66.
 
     Parameters
     ----------
     order
-        3 or 5.
+        3, 5 or 11.
     share
         Of what is felt at the border itself [-].
     """
-    return int(np.ceil(np.log(share) / np.log(max(abs(pole) for pole in _POLES[order]))))
+    return int(np.ceil(np.log(share) / np.log(abs(poles(order)).max())))
 
 
 def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[Any]:
-    """Coefficients of the spline of order 3 or 5 that passes through every pixel.
+    """Coefficients of the spline of order 3, 5 or 11 that passes through every pixel.
 
     Parameters
     ----------
@@ -54,7 +71,7 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
         (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about
         its outermost pixels.
     order
-        3 or 5.
+        3, 5 or 11.
     pad
         Rows and columns of mirrored coefficients to put around it [px].
 
@@ -66,10 +83,10 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     rows, cols = image.shape
     padded = np.empty((rows + 2 * pad, cols + 2 * pad), dtype=image.dtype)
     inner = padded[pad : pad + rows, pad : pad + cols]
-    poles = np.array(_POLES[order])
-    gain = float(np.prod((1.0 - poles) * (1.0 - 1.0 / poles)))
-    _filter_columns(readable(image), poles, _mirrored(poles, rows), gain, inner)
-    _filter_rows(poles, _mirrored(poles, cols), gain, inner)
+    z = poles(order)
+    gain = float(np.prod((1.0 - z) * (1.0 - 1.0 / z)))
+    _filter_columns(readable(image), z, _mirrored(z, rows), gain, inner)
+    _filter_rows(z, _mirrored(z, cols), gain, inner)
     _pad_mirrored(padded, pad)
     return padded
 

@@ -18,7 +18,6 @@ from modeharvest.idic.agreement import (
     Agreement,
     autocorrelation,
     lags_for,
-    spline_noise,
     unmatched,
 )
 from modeharvest.idic.ansatz import Ansatz
@@ -63,17 +62,6 @@ def test_a_displacement_that_the_ansatz_lacks_is_recognised_without_knowing_the_
     assert not judged.is_white
     assert "not noise" in judged.sentence
     assert np.isnan(judged.chi_square)
-
-
-@pytest.mark.parametrize("order", [3, 5])
-def test_noise_that_a_spline_passes_against_sampling_noise(order: int) -> None:
-    rng = np.random.default_rng(1)
-    image = rng.normal(size=(400, 400))
-    at = rng.uniform(5, 394, size=(2, 200_000))
-    sampled, _, _ = SplineImage.of(image, order, np.float64).sample(*at)
-    # 160 000 independent pixels: the variance scatters by sqrt(2/160 000) = 0.35 %.
-    assert spline_noise(order) == pytest.approx(sampled.var(), rel=0.015)
-    assert spline_noise(3) < spline_noise(5) < 1.0
 
 
 def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:

@@ -79,7 +79,7 @@ def test_plain_values_make_the_same_case_again() -> None:
         ("[experiment]\nstrains = [0.1, 0.05]", "ascending"),
         ("[experiment]\nstrains = [12.8]", "below 0.5"),
         ('[experiment]\nedges = "glued"', "'glued'"),
-        ("[correlation]\norder = 4", "order 3 or 5"),
+        ("[correlation]\norder = 4", "order 3, 5 or 11"),
         ("[imaging]\npixel_size = 0", "pixel size above 0"),
         ("[experiment", "not valid TOML"),
     ],

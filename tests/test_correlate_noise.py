@@ -16,6 +16,7 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions, correlate
 from modeharvest.idic.fourier import FourierMode, square_family
 from modeharvest.idic.gauss_newton import GaussNewtonOptions, Outcome
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.pyramid import Level
 from modeharvest.idic.result import Result
 from modeharvest.idic.support import Taper
@@ -51,7 +52,7 @@ def test_8_bit_images_are_as_good_as_quantisation_allows() -> None:
     # tr(K) and variance 2 tr(K^2); 4 standard deviations leave 1 in 10^4.
     S = ansatz.sensitivities(truth, GRID.x[None, ::8], GRID.y[::8, None])[MASK[::8, ::8]]
     A = np.einsum("pcn,pcm->nm", S, S) / len(S) / PIXEL**2
-    K = result.covariance(noise_sd=1 / np.sqrt(12)) @ A
+    K = result.covariance(1 / np.sqrt(12)) @ A
     mean, sd = np.trace(K), np.sqrt(2 * np.trace(K @ K))
     assert abs(error_px(result, truth) ** 2 - mean) < 4 * sd
     # The plateaus of the speckle (51 and 255) are whole grey levels, with no rounding at all.
@@ -71,7 +72,7 @@ def test_covariance_against_monte_carlo(in_f: int, in_g: int) -> None:
     options = CorrelationOptions(levels=(Level(1, 0.0),))
     mask = np.pad(np.ones((110, 100), dtype=np.bool_), 20)
     clean = correlate(f, g, SMALL, ansatz, truth, mask, options=options)
-    covariance = clean.covariance(NOISE, noisy_images=in_f + in_g)
+    covariance = clean.covariance(ImageNoise(in_f * NOISE, in_g * NOISE))
     rng = np.random.default_rng(7)
     found, sds = [], []
     for _ in range(SEEDS):
@@ -83,7 +84,7 @@ def test_covariance_against_monte_carlo(in_f: int, in_g: int) -> None:
         sds.append(result.noise_sd)
     deviation, n = np.array(found), ansatz.size
     # Per area, the noise of g has det F times fewer pixels than the reference's pixels that
-    # sample it, so its share of the variance is larger by 1/det F, 5 % here.
+    # sample it, so its share of the variance is larger by 1/det F, 5 % here: the result knows.
     h = 1e-5
     Fx = (
         ansatz.displacement(truth, SMALL.x + h, SMALL.y)
@@ -94,19 +95,20 @@ def test_covariance_against_monte_carlo(in_f: int, in_g: int) -> None:
         - ansatz.displacement(truth, SMALL.x, SMALL.y - h)
     ) / (2 * h)
     det = (1 + Fx[..., 0]) * (1 + Fy[..., 1]) - Fx[..., 1] * Fy[..., 0]
-    predicted = (in_f + in_g * (1 / det[mask]).mean()) / (in_f + in_g)
+    assert clean.noise_transfer.density == pytest.approx((1 / det[mask]).mean(), abs=2e-3)
     # The sum of all squared Mahalanobis distances is chi squared with 60 n degrees of freedom;
     # its relative standard deviation is sqrt(2/60n) = 4 %: 4 of them leave 1 in 10^4.
     distances = np.einsum("sn,nm,sm->s", deviation, np.linalg.inv(covariance), deviation)
-    assert distances.sum() / (SEEDS * n) == pytest.approx(predicted, abs=0.16)
+    assert distances.sum() / (SEEDS * n) == pytest.approx(1.0, abs=0.16)
     # And each unknown on its own: chi squared with 60 degrees of freedom, 0.1 % over all.
     ratio = (deviation**2).mean(axis=0) / np.diag(covariance)
     assert ratio.min() > 0.35
     assert ratio.max() < 2.0
-    # noise_sd divides the residual between both images. What a spline hands on of the noise
-    # in g is between 1 (at pixels) and 0.6 of its variance (midway in both directions).
-    expected = NOISE * np.sqrt(0.5 * (in_f + np.array([0.6, 1.0]) * in_g))
-    assert 0.98 * expected[0] < np.mean(sds) < 1.02 * expected[1]
+    # noise_sd divides the residual between both images, knowing what the spline takes of g's.
+    passed = clean.noise_transfer.value
+    expected = NOISE * np.sqrt((in_f + passed * in_g) / (1.0 + passed))
+    # 60 times 11 000 px: 0.1 %, but the spline's noise is correlated between pixels.
+    assert np.mean(sds) == pytest.approx(expected, rel=0.01)
 
 
 @cache

@@ -130,9 +130,11 @@ def test_landing_and_residual_by_their_definitions() -> None:
     to_row, to_col = row - u[:, 1], col + u[:, 0]
     i, j = np.rint(to_row).astype(int), np.rint(to_col).astype(int)
     inside = (i >= 0) & (i < GRID.rows) & (j >= 0) & (j < GRID.cols)
-    kept = landed(assembly, a, f, spline, allowed)
-    expected = np.ones(row.size, dtype=bool)  # a pixel off the image stays in
+    kept, outside = landed(assembly, a, f, spline, allowed)
+    expected = np.zeros(row.size, dtype=bool)
     expected[inside] = allowed[i[inside], j[inside]]
+    off = (to_row < 0) | (to_row > GRID.rows - 1) | (to_col < 0) | (to_col > GRID.cols - 1)
+    assert outside == off.sum()
     np.testing.assert_array_equal(kept[MASK], expected)
     assert not kept[~MASK].any()
     left = residual(assembly, a, f, spline)

@@ -11,7 +11,6 @@ import synthetic_report as made_up
 
 from modeharvest.case import read_case, shipped_solution
 from modeharvest.files import read_json
-from modeharvest.idic.agreement import spline_noise
 from modeharvest.pipeline import Run
 from modeharvest.validation import words
 
@@ -51,10 +50,12 @@ def test_chi_squared_is_noise_and_what_noise_free_images_leave(
     """Independent of each other, their squares add up; the images' own predictions go in."""
     (snapshot,) = read_json(exposed.folder / "summary.json")["snapshots"]
     (clean,) = finished(tmp_path, "camera = false").correlate().values()
+    (noisy,) = exposed.correlate().values()
     info = exposed.image().info
     variance = np.mean([info["reference"]["noise_sd"] ** 2, info["snapshots"][0]["noise_sd"] ** 2])
     assert snapshot["noise_sd"] == pytest.approx(np.sqrt(variance), rel=1e-6)
-    noise = variance * (1 + spline_noise(5))
+    in_f, in_g = info["reference"]["noise_sd"], info["snapshots"][0]["noise_sd"]
+    noise = in_f**2 + noisy.noise_transfer.value * in_g**2
     # 5e4 px: the noise's square scatters by 1 %, and w is not quite the same without noise.
     assert snapshot["chi_square"] == pytest.approx(1 + clean.residual_rms**2 / noise, rel=0.04)
     assert snapshot["chi_square"] > 1.1  # w is seen

@@ -15,6 +15,7 @@ from manufactured import GRID
 
 from modeharvest.errors import InputError
 from modeharvest.idic.gauss_newton import Iteration, Outcome
+from modeharvest.idic.noise_transfer import ImageNoise, NoiseTransfer
 from modeharvest.idic.result import Result
 from modeharvest.imaging.grid import PixelGrid
 
@@ -98,7 +99,7 @@ def test_a_truncated_file_is_refused(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": "modeharvest-result-0"}, "modeharvest-result-3"),
+        ({"format": "modeharvest-result-0"}, "modeharvest-result-4"),
         ({"outcome": "splendid"}, "complete"),
         ({"inverse": [[1.0, 2.0], [3.0]]}, "complete"),
         ({"inverse": [[1.0]]}, "inverse of shape"),
@@ -133,23 +134,25 @@ def test_parts_add_up_to_the_displacement() -> None:
 def test_covariance_of_noise_in_one_or_both_images() -> None:
     result = some_result()
     np.testing.assert_allclose(result.covariance(0.1), 2 * 0.1**2 * result.inverse)
-    np.testing.assert_allclose(result.covariance(0.1, noisy_images=1), 0.1**2 * result.inverse)
+    for one in (ImageNoise(0.1, 0.0), ImageNoise(0.0, 0.1)):
+        np.testing.assert_allclose(result.covariance(one), 0.1**2 * result.inverse)
+    shrunk = replace(result, noise_transfer=NoiseTransfer(density=1.2))
+    np.testing.assert_allclose(shrunk.covariance(0.1), 2.2 * 0.1**2 * result.inverse)
     np.testing.assert_allclose(
         result.standard_errors(0.1), 0.1 * np.sqrt(2 * np.diag(result.inverse))
     )
-    with pytest.raises(InputError, match="1 or 2 noisy images, got 3"):
-        result.covariance(0.1, noisy_images=3)
+    for bad in (-0.1, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="noise of 0 grey levels or more"):
+            result.covariance(bad)
 
 
-def test_the_residual_is_counted_once_whoever_made_the_noise() -> None:
-    """An unbiased variance of the residual, in whichever image the noise was."""
-    result = some_result()
+def test_the_residual_says_how_much_noise_there_is() -> None:
+    """An unbiased variance of it, and what the spline took of g's put back."""
+    result = replace(some_result(), noise_transfer=NoiseTransfer(value=0.7))
     variance = 0.1**2 / 9 * 12345 / (12345 - result.ansatz.size)
-    assert 2 * result.noise_sd**2 == pytest.approx(variance)
-    for images in (1, 2):
-        np.testing.assert_allclose(
-            result.covariance(noisy_images=images), variance * result.inverse
-        )
+    assert 1.7 * result.noise_sd**2 == pytest.approx(variance)
+    np.testing.assert_allclose(result.covariance(), 2 * result.noise_sd**2 * result.inverse)
+    assert result.residual_noise(ImageNoise(0.3, 0.4)) == pytest.approx(np.sqrt(0.09 + 0.7 * 0.16))
 
 
 def test_bad_shapes() -> None:

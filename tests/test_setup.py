@@ -79,7 +79,7 @@ def test_options_are_handed_on() -> None:
         ({"v_degree": -1}, "v_degree >= 0"),
         ({"start_amplitude": 0.0}, "start_amplitude that is not 0 mm"),
         ({"edge_px": -1}, "edge_px >= 0"),
-        ({"order": 4}, "order 3 or 5"),
+        ({"order": 4}, "order 3, 5 or 11"),
     ],
 )
 def test_bad_values_are_named(values: dict[str, float], words: str) -> None:

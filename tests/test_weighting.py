@@ -22,6 +22,7 @@ from modeharvest.idic.estimating_equation import instrument, root
 from modeharvest.idic.gauss_newton import GaussNewtonOptions, Minimum, Outcome
 from modeharvest.idic.inputs import CheckedImages
 from modeharvest.idic.level_search import step_length
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.pyramid import FULL, prepare
 from modeharvest.idic.result import Result
@@ -36,7 +37,7 @@ GRID = PixelGrid.centred(150, 140, PIXEL)
 ANSATZ = Ansatz(Box.centred(1.4, 1.5), v0_degree=2)
 MASK: NDArray[np.bool_] = np.pad(np.ones((110, 100), dtype=np.bool_), 20)
 FINEST = CorrelationOptions(levels=(FULL,))
-LEAST_SQUARES = replace(FINEST, gradient_blur_px=0.0)
+LEAST_SQUARES = replace(FINEST, gradient="deformed", gradient_blur_px=0.0)
 NOISE, PAIRS = 0.02, 40
 
 
@@ -76,7 +77,8 @@ def steps_to_the_truth(weighting: Weighting) -> int:
     here = used.images(a, level.reference, level.deformed)
     given = instrument(weighting, images, level, used, a)
     found = root(
-        lambda a, with_matrix: used.images(a, level.reference, level.deformed, with_matrix, given),
+        lambda a: used.images(a, level.reference, level.deformed, False, given),
+        here.matrix,
         length,
         Minimum(a, here, Outcome.CONVERGED, (), here.matrix),
         GaussNewtonOptions(tolerance_px=1e-6),
@@ -93,11 +95,17 @@ def test_exact_images_have_their_root_at_the_truth(gradient: Gradient, blur_px: 
     assert steps_to_the_truth(Weighting(gradient, blur_px)) < 15
 
 
-def test_the_reference_s_gradient_is_off_where_the_material_turns() -> None:
-    """Its directions are those before the deformation: the steps are worse."""
-    deformed, reference = (steps_to_the_truth(Weighting(gradient)) for gradient in
-                           (Gradient.DEFORMED, Gradient.REFERENCE))  # fmt: skip
-    assert deformed < reference
+def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> None:
+    f, g = pair()
+    images = CheckedImages.checked(f, g, GRID, MASK, None)
+    level = prepare(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    used = Assembly(ANSATZ, GRID, level.mask)
+    of_f, of_g = (instrument(Weighting(gradient), images, level, used, truth())[:2, level.mask]
+                  for gradient in (Gradient.REFERENCE, Gradient.DEFORMED))  # fmt: skip
+    # Slopes of float32 splines of a speckle blurred by 3 px.
+    assert abs(of_f - of_g).max() < 1e-4 * abs(of_g).max()
+    plain = instrument(Weighting(Gradient.REFERENCE), images, level, used, np.zeros(ANSATZ.size))
+    assert abs(plain[:2, level.mask] - of_g).max() > 0.03 * abs(of_g).max()
 
 
 def test_noise_free_images_keep_the_least_squares_minimum() -> None:
@@ -143,6 +151,12 @@ def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, li
     return np.array(errors), np.array(bounds), results
 
 
+def square_slope() -> float:
+    """Mean square of the speckle's slope along an axis [1/px^2]."""
+    slopes = SplineImage.of(pair(0)[0]).sample(*np.nonzero(MASK))[1:]
+    return float(np.mean(np.square(slopes)))
+
+
 def chi_square(errors: FloatArray, bounds: FloatArray) -> float:
     """Mean square of standardised errors; the two of a pair have theirs in common."""
     weighted = np.linalg.solve(bounds[:, None], errors[..., None])[..., 0]
@@ -152,13 +166,14 @@ def chi_square(errors: FloatArray, bounds: FloatArray) -> float:
 def test_at_2_percent_of_noise_the_errors_are_at_the_bound() -> None:
     errors, bounds, results = monte_carlo(FINEST)
     assert {r.outcome for r in results} == {Outcome.CONVERGED}
+    assert all(r.weighting.gradient is Gradient.REFERENCE for r in results)
     assert all(r.weighting.blur_px > 0.6 for r in results)
     # n and -n are one draw: chi squared over n * PAIRS = 480 degrees of freedom has a standard
     # deviation of sqrt(2/480) = 6.5 %; four of them leave 1 in 10^4. Least squares has 1.4.
     assert chi_square(errors, bounds) == pytest.approx(1.0, abs=4 * np.sqrt(2 / bounds[:, 0].size))
     bare = chi_square(*monte_carlo(LEAST_SQUARES)[:2])
     # On the same noise: the difference scatters far less than either.
-    share = results[0].noise_in_gradient(NOISE**2)
+    share = results[0].noise_transfer.slope * NOISE**2 / square_slope()
     assert 0.25 * share < bare - chi_square(errors, bounds) < share
 
 
@@ -174,8 +189,8 @@ def test_results_tell_the_errors_they_have() -> None:
     _, bounds, results = monte_carlo(FINEST)
     told = np.array([r.covariance(NOISE) for r in results])
     share = np.trace(np.linalg.solve(np.repeat(bounds, 2, axis=0), told).mean(axis=0)) / ANSATZ.size
-    # 5 % is what 1/det F and the positions between pixels leave open (test_result_noise.py).
-    assert share == pytest.approx(1.0, abs=0.05)
+    # 2 % is what the blur costs.
+    assert share == pytest.approx(1.01, abs=0.02)
 
 
 def test_noise_does_not_make_a_gain_too_small() -> None:
@@ -197,7 +212,7 @@ def test_noise_does_not_make_a_gain_too_small() -> None:
     assert least_squares < -10.0
 
 
-@pytest.mark.parametrize("gradient", ["deformed", "mean"])
+@pytest.mark.parametrize("gradient", ["deformed", "reference"])
 def test_weighing_anew_takes_little_memory(gradient: str) -> None:
     image = gaussian_speckle(10.0, 2)
     f, g = ((image + 0.05 * noise * image.std()).astype(np.float32)
@@ -232,29 +247,30 @@ def test_the_excess_is_that_of_sums_over_an_image(width_px: float, blur_px: floa
 
     G = np.fft.ifft(2j * np.pi * np.fft.fftfreq(512) * np.fft.fft(clean, axis=1), axis=1).real
     h, spoilt = slope(clean), slope(noise)
-    # Noise in f, of which h is independent, sees all of h; noise in g only its true part.
+    # Noise in g, of which h is independent, sees all of h; noise in f only its true part.
     variance = (h**2).sum() + 0.5 * (spoilt**2).sum()
     expected = variance * (G**2).sum() / (h * G).sum() ** 2 - 1
-    share = 2.46 * s**2 / (G**2).mean()
     # 512 px hold (512/12)^2 speckles: sums are good to 2 %, their ratios to a tenth of that.
-    assert Weighting(Gradient.DEFORMED, blur_px, width_px).excess(share) == pytest.approx(
-        expected, rel=0.1, abs=2e-3
-    )
+    found = Weighting(Gradient.REFERENCE, blur_px, width_px).excess(s**2 / (G**2).mean())
+    assert found == pytest.approx(expected, rel=0.1, abs=2e-3)
 
 
 @pytest.mark.parametrize("width_px", [3.0, 6.0, 12.0])
-@pytest.mark.parametrize("share", [0.05, 0.8, 3.0])
-def test_the_best_blur_is_the_best(width_px: float, share: float) -> None:
-    best = best_blur(share, width_px)
-    excess = Weighting(blur_px=best, width_px=width_px).excess(share)
-    assert excess <= Weighting().excess(share)
+@pytest.mark.parametrize("noise", [0.02, 0.3, 1.2])
+def test_the_best_blur_is_the_best(width_px: float, noise: float) -> None:
+    def excess_of(blur_px: float) -> float:
+        return Weighting(Gradient.REFERENCE, blur_px, width_px).excess(noise)
+
+    best = best_blur(noise, width_px)
+    excess = excess_of(best)
+    assert excess <= excess_of(0.0)
     if best > 0.65:  # else it is the smallest there is
-        around = [Weighting(blur_px=k * best, width_px=width_px).excess(share) for k in (0.9, 1.1)]
+        around = [excess_of(k * best) for k in (0.9, 1.1)]
         assert excess < min(around)
 
 
 def test_little_noise_needs_no_blur() -> None:
-    assert best_blur(0.0, 12.0) == best_blur(0.015, 12.0) == 0.0
+    assert best_blur(0.0, 12.0) == best_blur(0.006, 12.0) == 0.0
     assert best_blur(0.1, 12.0) > 0.0
 
 
@@ -274,3 +290,89 @@ def test_bad_options(change: dict[str, object], words: str) -> None:
 def test_bad_weighting() -> None:
     with pytest.raises(InputError, match="at least 0 px"):
         Weighting(blur_px=-0.1)
+
+
+SMALL = Ansatz(Box.centred(1.4, 1.5), v0_degree=1)
+
+
+def shifted(shift_px: tuple[float, float], seed: int) -> tuple[FloatArray, FloatArray]:
+    """A pair of exact images, the second one moved [px]."""
+    pattern = manufactured.speckle(seed, GRID)
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    return pattern(x, y), pattern(x - shift_px[0] * PIXEL, y - shift_px[1] * PIXEL)
+
+
+def bias_of_a_shift(
+    shift_px: tuple[float, float], in_f: float, in_g: float, options: CorrelationOptions
+) -> FloatArray:
+    """(2,) bias of the mean displacement along x and y, in standard errors."""
+    truth = np.array(shift_px)
+    errors, sds = [], []
+    for seed in range(6):
+        f, g = shifted(shift_px, seed)
+        noise = np.random.default_rng([seed, 9]).normal(size=(2, *GRID.shape))
+        for sign in (1, -1):
+            found = correlate(
+                f + sign * in_f * noise[0], g + sign * in_g * noise[1], GRID, SMALL,
+                np.zeros(SMALL.size), MASK, options=options,
+            )  # fmt: skip
+            at = [SMALL.v0_slice(c).start for c in (0, 1)]
+            errors.append(found.unknowns[at] / PIXEL - truth)
+            sds.append(found.standard_errors(ImageNoise(in_f, in_g))[at] / PIXEL)
+    return np.asarray(np.mean(errors, axis=0) / np.sqrt(np.mean(np.square(sds), axis=0)))
+
+
+@pytest.mark.parametrize(
+    ("shift_px", "in_f", "in_g"),
+    [
+        ((0.25, 0.0), 0.02, 0.02),
+        ((0.1, 0.75), 0.02, 0.02),
+        ((0.25, 0.3), 0.0, 0.02),
+        ((0.25, 0.3), 0.02, 0.0),
+    ],
+)
+def test_small_motions_have_no_bias(
+    shift_px: tuple[float, float], in_f: float, in_g: float
+) -> None:
+    """Interpolated noise has a variance, and so a slope, that depends on where between pixels.
+
+    benchmarks/small_motion.py looks at more of it.
+    """
+    assert abs(bias_of_a_shift(shift_px, in_f, in_g, FINEST)).max() < 0.2
+
+
+def test_least_squares_has_one() -> None:
+    along, across = bias_of_a_shift((0.25, 0.0), 0.0, 0.02, LEAST_SQUARES)
+    assert along > 3.0
+    assert abs(across) < 1.0
+
+
+def test_pixels_at_the_border_do_not_keep_a_correlation_from_settling() -> None:
+    """A row that lands on the image's last one came and went with every step."""
+    f, g = shifted((0.25, 0.0), 0)
+    for seed in range(6):
+        noise = 0.01 * np.random.default_rng(seed).normal(size=(2, *GRID.shape))
+        options = CorrelationOptions(gradient="reference")
+        start = np.zeros(SMALL.size)
+        found = correlate(f + noise[0], g + noise[1], GRID, SMALL, start, options=options)
+        assert found.outcome is Outcome.CONVERGED
+        assert found.weighting.gradient is Gradient.REFERENCE
+
+
+def test_a_root_that_is_not_found_is_told() -> None:
+    """Weights that have nothing to do with the images lead nowhere."""
+    f, g = pair()
+    used = Assembly(ANSATZ, GRID, MASK)
+    level = prepare(f, g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    here = used.images(truth(), level.reference, level.deformed)
+    noise = np.random.default_rng(1).normal(size=(3, *GRID.shape)).astype(np.float32)
+    found = root(
+        lambda a: used.images(a, level.reference, level.deformed, False, noise),
+        1e-3 * here.matrix,
+        step_length(ANSATZ, GRID, level.mask, 1),
+        Minimum(truth() + 0.01, here, Outcome.CONVERGED, (), here.matrix),
+        GaussNewtonOptions(max_iterations=5),
+    )
+    assert found.outcome is Outcome.UNWEIGHTED
+    np.testing.assert_array_equal(found.unknowns, truth() + 0.01)
+    assert "least-squares minimum" in found.outcome.explanation

@@ -14,7 +14,8 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     v1 phi1), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
     [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
     ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
-    ``mode_standard_error``, ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
+    ``mode_standard_error`` (by noise) and ``mode_model_error`` (by what the ansatz can't
+    describe), ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
     the full image), ``iterations_all_levels``, ``outcome``, ``outcome_why``,
     ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
     ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
@@ -39,21 +40,24 @@ import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.files import write_json
+from modeharvest.idic.compared import Compared
 from modeharvest.idic.families.equivalents import mode_deviation, mode_equivalent
 from modeharvest.idic.families.pattern import Pattern, read_pattern
 from modeharvest.idic.families.spectrum import Spectrum, spectral_density
 from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import Identification
 from modeharvest.imaging.imageset import ImageSet
@@ -191,8 +195,8 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
     }
     px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
     seen = identifiability(result, mask)
-    noise_sd = _noise_sd(measured, comparison.strain)
-    agreement = result.agreement(noise_sd, order=measured.how.order)
+    noise = _noise(measured, comparison.strain)
+    agreement = result.agreement(noise)
     return {
         "nominal_strain": comparison.strain,
         "branch": state.branch,
@@ -211,8 +215,8 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "mode_polynomial_overlap": seen.overlap[0],
         "worst_determined": [str(combination) for combination in seen.worst],
         "residual_correlation": result.residual_correlation,
-        "noise_sd": noise_sd,
-        "chi_square": None if noise_sd is None else agreement.chi_square,
+        "noise_sd": None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
+        "chi_square": None if noise is None else agreement.chi_square,
         "identifiability_warnings": list(seen.warnings),
         "residual_verdict": agreement.sentence,
         "weighting": result.weighting.sentence,
@@ -228,17 +232,17 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
     }
 
 
-def _noise_sd(measured: Measured, strain: float) -> float | None:
+def _noise(measured: Measured, strain: float) -> ImageNoise | None:
     """Noise of the exposures [fraction of full scale]; None if noise-free images were measured.
 
-    The root of the mean variance, since chi squared compares sums of squares.
+    The roots of mean variances, since chi squared compares sums of squares.
     """
     if not measured.how.camera:
         return None
     images = measured.images
     in_f = images.noise_sd()[images.mask()]
     in_g = images.noise_sd(strain)[images.deformed_mask(strain)]
-    return float(np.sqrt(0.5 * ((in_f**2).mean() + (in_g**2).mean())))
+    return ImageNoise(*(float(np.sqrt((sd**2).mean())) for sd in (in_f, in_g)))
 
 
 def _brightness(comparison: Comparison) -> dict[str, float]:
@@ -270,9 +274,31 @@ def _mode(comparison: Comparison, measured: Measured) -> dict[str, Any]:
         "mode": mode_equivalent(found, pitch, ideal)[0].tolist(),
         "mode_ideal": ideal.tolist(),
         "mode_standard_error": _plain(result.standard_errors()[phi]),
+        "mode_model_error": _model_errors(comparison, measured)[phi.start : phi.stop],
         "mode_deviation_percent": mode_deviation(found, pitch, ideal).tolist(),
         "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
     }
+
+
+def _model_errors(comparison: Comparison, measured: Measured) -> list[float | None]:
+    """Standard deviations of the unknowns by what the ansatz can't describe; None if not known.
+
+    Each unit cell's share of the residual counts as one draw: where noise says how well the
+    images determine the unknowns, this says how far w moves them.
+    """
+    images, how, result = measured.images, measured.how, comparison.result
+    pair = (
+        images.reference(camera=how.camera),
+        images.deformed(comparison.strain, camera=how.camera),
+    )
+    masks = images.mask(), images.deformed_mask(comparison.strain)
+    try:
+        found = Compared.of(result, pair, masks, how.edge_px).leftover_covariance(
+            result, measured.specimen.pitch
+        )
+    except InputError:  # a specimen of too few cells
+        return [None] * result.ansatz.size
+    return _plain(np.sqrt(np.diag(found)))
 
 
 def _energies(solution: Solution) -> list[dict[str, float]]:

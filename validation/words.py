@@ -71,12 +71,13 @@ def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def mode_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the mode's parameters: for each snapshot value, standard error and best fit."""
+    """Rows of the mode's parameters: for each snapshot value, standard errors and best fit."""
     snapshots = [s for s in summary["snapshots"] if len(s.get("mode", ())) == len(_MODE)]
     ideal = snapshots[0].get("mode_ideal", REFERENCE_MODE) if snapshots else REFERENCE_MODE
     return [
         {"name": name, "unit": unit, "ideal": ideal[k],
          "cells": [{"value": s["mode"][k], "error": _item(s.get("mode_standard_error"), k),
+                    "model": _item(s.get("mode_model_error"), k),
                     "best": _item(s.get("mode_best_fit"), k)} for s in snapshots]}
         for k, (name, unit) in enumerate(_MODE) if snapshots
     ]  # fmt: skip
@@ -143,9 +144,11 @@ def _standard_errors(summary: Mapping[str, Any]) -> str:
     else:
         said = "No noise was added to these images: the residual is"
     return (
-        f"Standard errors take the whole residual for white noise in both images. {said} what "
-        "the ansatz can't say, so a standard error tells how firmly the images hold a parameter, "
-        "not how far it is from the truth. Compare it with the best fit beside it."
+        "Of a parameter's two standard errors the first takes the whole residual for white noise "
+        f"in both images. {said} what the ansatz can't describe, so it says how firmly the images "
+        "hold a parameter, not how far it is from the truth. The second, by model error, takes "
+        "each unit cell's share of the residual for one draw. Compare them with the best fit "
+        "beside."
     )
 
 

@@ -190,7 +190,7 @@ def _predicted_px(pair: ImagePair, result: Result) -> float:
     x, y = pair.grid.x[None, ::8], pair.grid.y[::8, None]
     S = result.ansatz.sensitivities(result.unknowns, x, y)[pair.mask[::8, ::8]][..., n]
     A = np.einsum("pcn,pcm->nm", S, S) / len(S) / pair.grid.pixel_size**2
-    return float(np.sqrt(np.trace(result.covariance(noise_sd=QUANTISATION)[np.ix_(n, n)] @ A)))
+    return float(np.sqrt(np.trace(result.covariance(QUANTISATION)[np.ix_(n, n)] @ A)))
 
 
 def table(found: dict[str, dict[str, Any]]) -> list[str]:

@@ -20,7 +20,7 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
     """Describe mode i (from 0) of a frame; keys as in ``summary.json``."""
     result, seen = frame.result, frame.identifiability
     family, part = result.ansatz.modes[i].family, result.ansatz.phi_slice(i)
-    noise = result.covariance(harvest.noise_sd)[part, part]
+    noise = frame.noise_covariance[part, part]
     left = None if frame.leftover_covariance is None else frame.leftover_covariance[part, part]
     sd_noise, sd_left = _sd(np.eye(family.size), noise), _sd(np.eye(family.size), left)
     return {

@@ -204,7 +204,7 @@ def _residual(atlas: HarvestAtlas, frame: HarvestedFrame) -> FloatArray:
     rows, cols = _pixels(atlas.sheet(FINE))
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
-    spline = SplineImage.of(np.asarray(frame.image), harvest.order)
+    spline = SplineImage.of(np.asarray(frame.image), frame.result.order)
     value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
     gain, offset = ansatz.gain_and_offset(a, x, y)
     picked = np.ix_(rows, cols)

@@ -67,8 +67,9 @@ class HarvestedFrame:
     by_noise, by_leftover
         Error bars on these axes, arrays (q, p, ...), by the images' noise and by what the ansatz
         leaves over; the latter None if they can't be had.
-    leftover_covariance
-        (n, n) of the unknowns by what the ansatz leaves over.
+    noise_covariance, leftover_covariance
+        (n, n) of the unknowns by the images' noise and by what the ansatz leaves over: those
+        that the error bars are made of.
     spectrum, pattern
         Of the displacement without its affine part, and what is read off it.
     parts
@@ -90,6 +91,7 @@ class HarvestedFrame:
     error_x: FloatArray
     error_y: FloatArray
     by_noise: FieldErrors
+    noise_covariance: FloatArray
     by_leftover: FieldErrors | None = None
     leftover_covariance: FloatArray | None = None
     spectrum: Spectrum | None = None
@@ -261,11 +263,6 @@ class Harvest:
     def pitch(self) -> float:
         """Unit cell size l [mm]."""
         return float(self.experiment.get("specimen", {}).get("cell_size", 0.0))
-
-    @property
-    def order(self) -> int:
-        """Of the spline that interpolates the images."""
-        return int(self.experiment.get("correlation", {}).get("order", 5))
 
     @property
     def edge_px(self) -> int:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from modeharvest.harvest.experiment import read_experiment
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.pipeline import Harvesting
-from modeharvest.harvest.told import covariances
+from modeharvest.harvest.told import covariances, noise_of
 from modeharvest.harvest.twin import Twin
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.error_bars import FieldErrors, field_errors
@@ -130,10 +130,8 @@ def _scene(folder: Path, name: str) -> _Scene:
     box = harvesting.geometry.region.cellular
     x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)
     y = np.linspace(box.y_min, box.y_max, _POINTS, dtype=np.float64)
-    how = experiment.correlation
-    by_noise, _, _ = covariances(
-        measured, pair, prepared.noise.sd, experiment.specimen.cell_size, how.order
-    )
+    noise, cell = noise_of(prepared, name), experiment.specimen.cell_size
+    by_noise, _, _ = covariances(measured, pair, noise, cell)
     errors = field_errors(measured.result, x, y, by_noise)
     blank = measured.result
     scene = _Scene(

@@ -19,6 +19,10 @@ _MOVED = 2.0
 """Times the noise that a single image shows, beyond which motion is the likelier cause."""
 
 
+GIVEN = "given"
+"""Source of a noise that the experiment's file states."""
+
+
 @dataclass(frozen=True)
 class Noise:
     """White noise of each photograph.

@@ -95,7 +95,7 @@ class Measurement:
     gain_degree: int | None = None
     offset_degree: int | None = None
     edge_px: int = 3
-    order: int = 5
+    order: int | None = None
     formulation: str = "total"
 
     def __post_init__(self) -> None:

@@ -208,8 +208,8 @@ class Harvesting:
         """The photograph and what it is correlated with."""
         reference, mask = prepared.image(), prepared.mask()
         if self.experiment.correlation.formulation == "updated" and before is not None:
-            order = self.experiment.correlation.order
-            reference, seen = pulled_back(prepared.image(before), found[before].result, order)
+            result = found[before].result
+            reference, seen = pulled_back(prepared.image(before), result, result.order)
             mask = mask & seen
         return Pair(reference, prepared.image(name), mask, prepared.mask(name))
 

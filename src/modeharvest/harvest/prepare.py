@@ -23,7 +23,7 @@ from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.inputs import named_files, of_each_photograph
-from modeharvest.harvest.noise import Noise, estimated_noise, measured_noise
+from modeharvest.harvest.noise import GIVEN, Noise, estimated_noise, measured_noise
 from modeharvest.idic.specimen.material import MaterialOptions, find_material
 from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
@@ -203,7 +203,7 @@ def _given(base: Path, name: str) -> Path | None:
 def _noise(experiment: Experiment, base: Path, reference: Photograph, mask: BoolArray) -> Noise:
     """Given, measured or estimated, in this order; before any interpolation smooths it."""
     if experiment.noise.sd is not None:
-        return Noise(experiment.noise.sd, "given")
+        return Noise(experiment.noise.sd, GIVEN)
     repeats = experiment.images.repeats
     if not repeats:
         return estimated_noise(reference.image, mask)

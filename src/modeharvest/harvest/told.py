@@ -13,6 +13,7 @@ from modeharvest.errors import InputError
 from modeharvest.harvest.experiment import Experiment
 from modeharvest.harvest.geometry import Geometry
 from modeharvest.harvest.measure import Measured
+from modeharvest.harvest.noise import GIVEN, estimated_noise
 from modeharvest.harvest.optics import Optics
 from modeharvest.harvest.pair import Pair
 from modeharvest.harvest.prepare import Prepared
@@ -29,6 +30,7 @@ from modeharvest.idic.families.pattern import read_pattern
 from modeharvest.idic.fields.measured_spectrum import measured_spectrum
 from modeharvest.idic.finish import blurred_pair
 from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.noise_transfer import ImageNoise
 from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.pyramid import eroded
 from modeharvest.idic.speckle_width import speckle_width
@@ -112,12 +114,11 @@ def _frame(
     experiment: Experiment, prepared: Prepared, geometry: Geometry, name: str, measured: Measured
 ) -> HarvestedFrame:
     result, image = measured.result, prepared.image(name)
-    how, box = experiment.correlation, geometry.region.cellular
+    box = geometry.region.cellular
     cell = experiment.specimen.cell_size
     x, y = _axes(geometry.region.domain)
-    by_noise, by_leftover, warnings = covariances(
-        measured, _seen(prepared, name), prepared.noise.sd, cell, how.order
-    )
+    noise = noise_of(prepared, name)
+    by_noise, by_leftover, warnings = covariances(measured, _seen(prepared, name), noise, cell)
     seen = identifiability(result, prepared.mask())
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
@@ -130,11 +131,12 @@ def _frame(
         mask=prepared.mask(name),
         result=result,
         identifiability=seen,
-        agreement=_agreement(measured, prepared.image(), image, prepared, how.order),
+        agreement=_agreement(measured, prepared.image(), image, prepared, noise),
         error_x=x,
         error_y=y,
         by_noise=field_errors(result, x, y, by_noise),
         by_leftover=None if by_leftover is None else field_errors(result, x, y, by_leftover),
+        noise_covariance=by_noise,
         leftover_covariance=by_leftover,
         spectrum=spectrum,
         pattern=pattern,
@@ -143,6 +145,23 @@ def _frame(
         start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
         warnings=warnings,
     )
+
+
+def noise_of(prepared: Prepared, name: str) -> ImageNoise:
+    """Noise of the reference and of a deformed photograph [grey levels].
+
+    Unless it was given for both, the deformed one's is larger or smaller by as much as its finest
+    details are: a lamp that has aged, or other exposure, shows there.
+    """
+    sd = prepared.noise.sd
+    if prepared.noise.source == GIVEN:
+        return ImageNoise(sd, sd)
+    seen = _seen(prepared, name)
+    in_f, in_g = (
+        estimated_noise(image, np.ones(image.shape, dtype=np.bool_) if mask is None else mask).sd
+        for image, mask in ((seen.reference, seen.mask), (seen.deformed, seen.deformed_mask))
+    )
+    return ImageNoise(sd, sd * in_g / in_f if in_f > 0.0 else sd)
 
 
 def _parts(measured: Measured, geometry: Geometry, cell: float) -> tuple[PartSpectrum, ...]:
@@ -154,7 +173,7 @@ def _parts(measured: Measured, geometry: Geometry, cell: float) -> tuple[PartSpe
 
 
 def covariances(
-    measured: Measured, pair: Pair, noise_sd: float, cell: float, order: int
+    measured: Measured, pair: Pair, noise: ImageNoise, cell: float
 ) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
     """Covariances of the unknowns by the images' noise and by what the ansatz leaves over.
 
@@ -164,30 +183,28 @@ def covariances(
         What came out of a photograph.
     pair
         That was correlated.
-    noise_sd
-        Of each photograph [grey levels].
+    noise
+        Of the two photographs.
     cell
         Edge of the blocks that are taken for independent [mm].
-    order
-        Of the spline.
 
     Returns
     -------
     by_noise, by_leftover, warnings
         (n, n) each; the second None where there are too few cells, which the warnings say.
     """
-    result, blur = measured.result, measured.blur_px
+    result, blur, order = measured.result, measured.blur_px, measured.result.order
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
     if blur > 0.0:
         images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
-    seen = Compared.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX, order)
+    seen = Compared.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX)
     soft = seen.softness(result)
-    by_noise = softened(result, noise_sd, soft)
+    by_noise = softened(result, noise, soft)
     try:
         by_leftover = seen.leftover_covariance(result, cell, soft)
         if blur > 0.0:
             by_noise = noise_covariance(
-                result, seen.reference, seen.deformed, _noises(pair, blur, noise_sd), seen.used,
+                result, seen.reference, seen.deformed, _noises(pair, blur, noise), seen.used,
                 cell, order, soft,
             )  # fmt: skip
     except InputError as error:
@@ -200,15 +217,15 @@ _EDGE_PX = 3
 
 
 def _noises(
-    pair: Pair, blur: float, noise_sd: float
+    pair: Pair, blur: float, noise: ImageNoise
 ) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
     """What a blur makes of examples of white noise in both images."""
     rng = np.random.default_rng(0)
     quiet = blurred_pair(pair.reference, pair.deformed, pair.mask, pair.deformed_mask, blur)
     for _ in range(_EXAMPLES):
         f, g = (
-            image + np.float32(noise_sd) * rng.standard_normal(image.shape, dtype=np.float32)
-            for image in (pair.reference, pair.deformed)
+            image + np.float32(sd) * rng.standard_normal(image.shape, dtype=np.float32)
+            for image, sd in ((pair.reference, noise.reference), (pair.deformed, noise.deformed))
         )
         loud = blurred_pair(f, g, pair.mask, pair.deformed_mask, blur)
         yield loud[0] - quiet[0], loud[1] - quiet[1]
@@ -223,13 +240,14 @@ def _seen(prepared: Prepared, name: str) -> Pair:
 
 
 def _agreement(
-    measured: Measured, reference: NDArray[Any], image: NDArray[Any], prepared: Prepared, order: int
-) -> Agreement:
+    measured: Measured, reference: NDArray[Any], image: NDArray[Any], prepared: Prepared,
+    noise: ImageNoise,
+) -> Agreement:  # fmt: skip
     """The residual of the photographs as they are against their noise, lit alike."""
     result = measured.result
     if measured.blur_px == 0.0:
-        return result.agreement(prepared.noise.sd, order=order)
-    back, seen = pulled_back(image, result, order)
+        return result.agreement(noise)
+    back, seen = pulled_back(image, result, result.order)
     used = eroded(prepared.mask(), _EDGE_PX) & seen
     f, g = reference[used], back[used]
     gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
@@ -239,7 +257,7 @@ def _agreement(
     lags = lags_for(speckle_width(reference, used))
     return Agreement.of(
         rms, autocorrelation(residual, lags), int(used.sum()), result.ansatz.size,
-        prepared.noise.sd, order=order, lags_px=lags,
+        result.residual_noise(noise), lags,
     )  # fmt: skip
 
 

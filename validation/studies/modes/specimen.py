@@ -193,7 +193,7 @@ def _sd(result: Result, covariance: FloatArray, pitch: float) -> FloatArray:
 def _leftover_sd(scene: Scene, result: Result) -> FloatArray:
     """The same by what the ansatz leaves over, cell by cell."""
     pitch, how = scene.specimen.pitch, scene.how.options()
-    seen = Compared.of(result, scene.pair(), scene.masks(), how.edge_px, how.order)
+    seen = Compared.of(result, scene.pair(), scene.masks(), how.edge_px)
     return _sd(result, seen.leftover_covariance(result, pitch), pitch)
 
 

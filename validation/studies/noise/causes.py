@@ -46,7 +46,7 @@ _WEAK = 0.01
 def compared(scene: Scene, result: Result, images: Images) -> Compared:
     """What a correlation of images of this scene compared at its end."""
     options = scene.how.options()
-    return Compared.of(result, images, scene.masks(), options.edge_px, options.order)
+    return Compared.of(result, images, scene.masks(), options.edge_px)
 
 
 def explained(seen: Compared, result: Result) -> Compared:

@@ -88,7 +88,7 @@ class Factor:
             label,
             tuple(range(len(names))),
             lambda s, v: s.correlated(**{option: names[v]}),
-            lambda s: names.index(getattr(s.correlation, option)),
+            lambda s: _number(names, getattr(s.correlation, option)),
             whole=True,
             names=names,
         )
@@ -147,13 +147,18 @@ def _camera(setting: Setting, level: float) -> float | None:
     return level if setting.correlation.camera else None
 
 
+def _number(names: tuple[str, ...], chosen: str | None) -> int | None:
+    """Of a name; None for a choice that is left to the images."""
+    return None if chosen is None else names.index(chosen)
+
+
 FACTORS: dict[str, Factor] = {
     "order": Factor(
-        "order of the spline [-]", (3, 5), lambda s, v: s.correlated(order=v),
+        "order of the spline [-]", (3, 5, 11), lambda s, v: s.correlated(order=v),
         lambda s: s.correlation.order, whole=True,
     ),
     "gradient": Factor.choice(
-        "gradient that weighs the residual", "gradient", ("deformed", "mean", "reference")
+        "gradient that weighs the residual", "gradient", ("deformed", "reference")
     ),
     "speckle_size": Factor(
         "size of the speckle [times the base's]", (0.5, 0.7, 1.0, 1.4, 2.0), _speckle_size,

@@ -1,0 +1,288 @@
+"""Bias and scatter of small motions under noise: whether standard errors mean what they say.
+
+Motions of many pixels average over all positions between pixels, and so over the bias that
+interpolated noise makes; small ones don't. Here images move by 0, 0.125 ... 1 px along x, along y
+and both ways, and stretch by 0 ... 1 %; noise is in both images or in one; speckles are 3 to 12 px
+wide; polynomials are of degree 1 to 5. Each realisation of the noise comes as n and as -n: the
+mean of the two errors shows a bias long before it would show out of the scatter.
+
+The truth is in the ansatz, so that nothing is left over but noise. The Cramer-Rao bound is made of
+the pattern's exact gradient. What a few realisations say of scatter is mostly chance; so errors
+are set against those that the efficient linear estimator makes under the very same noise, which
+are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/det F over those of
+g), I = sum J J'. "Least squares" is the naive version: the deformed image's own
+gradient, and a quintic spline whatever the speckle.
+
+Run: scripts/env python benchmarks/small_motion.py [--pairs 4] [--step 0.125] [--only TEXT] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import CorrelationOptions, correlate
+from modeharvest.idic.noise_transfer import ImageNoise
+from modeharvest.idic.pyramid import FULL, eroded
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+
+FloatArray = NDArray[np.float64]
+
+PIXEL = 0.01
+GRID = PixelGrid.centred(220, 300, PIXEL)
+BORDER_PX = 24
+EVERY = 8
+PAPER_PX = 12.0
+"""Width of the default speckle."""
+LEAST_SQUARES = {"gradient": "deformed", "gradient_blur_px": 0.0, "order": 5}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table.
+
+    Parameters
+    ----------
+    in_f, in_g
+        Noise [fraction of full scale].
+    width_px
+        Full width at half maximum of the speckle's autocorrelation [px].
+    degree
+        Of the polynomials.
+    options
+        Of the correlation, other than by default.
+    """
+
+    in_f: float
+    in_g: float
+    width_px: float = PAPER_PX
+    degree: int = 1
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """For the table."""
+        where = "both" if self.in_f and self.in_g else "f" if self.in_f else "g"
+        how = ", least squares" if self.options else ""
+        noise = 100 * max(self.in_f, self.in_g)
+        return f"{noise:g} % in {where}, {self.width_px:g} px, degree {self.degree}{how}"
+
+
+ROWS = (
+    *(Row(s, s) for s in (0.002, 0.005, 0.01, 0.02, 0.04)),
+    *(Row(s, 0.0) for s in (0.002, 0.01, 0.04)),
+    *(Row(0.0, s) for s in (0.002, 0.01, 0.04)),
+    *(Row(s, s, width) for width in (3.0, 4.0, 6.0, 8.0) for s in (0.002, 0.01, 0.04)),
+    *(Row(0.01, 0.01, PAPER_PX, degree) for degree in (2, 3, 5)),
+    *(Row(s, s, options=LEAST_SQUARES) for s in (0.002, 0.01, 0.04)),
+    Row(0.0, 0.01, options=LEAST_SQUARES),
+    *(Row(0.01, 0.01, width, options=LEAST_SQUARES) for width in (3.0, 6.0)),
+)
+
+
+def motions(step: float) -> Iterator[tuple[float, float, float]]:
+    """Shifts along x and y [px], and strain along x [-]."""
+    for k in range(round(1.0 / step) + 1):
+        yield step * k, 0.0, 0.0
+        yield 0.0, step * k, 0.0
+        yield step * k, step * k, 0.0
+    for strain in (0.001, 0.002, 0.005, 0.01):
+        yield 0.0, 0.0, strain
+
+
+@lru_cache(maxsize=64)
+def speckle(width_px: float, seed: int) -> Speckle:
+    """The default speckle, finer."""
+    scale = width_px / PAPER_PX
+    spec = SpeckleSpec(standard_deviation=0.05 / scale, blur_px=3.0 * scale, seed=seed)
+    return Speckle(spec, GRID.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The errors under one motion.
+
+    Parameters
+    ----------
+    errors
+        (pairs, 2, n) of the unknowns under n and -n.
+    bounds
+        (pairs, n, n) covariances.
+    predicted
+        (pairs, 2, n, n) covariances that the results give, knowing the noise.
+    efficient
+        (pairs, n) errors of the efficient estimator under n.
+    to_px
+        (n, n): a' to_px a is the mean square of the displacement that a means, per component.
+    """
+
+    errors: FloatArray
+    bounds: FloatArray
+    predicted: FloatArray
+    efficient: FloatArray
+    to_px: FloatArray
+
+    @property
+    def bound(self) -> float:
+        """Mean square of the displacement's error by the bound [px^2]."""
+        return float(np.einsum("pij,ij->", self.bounds, self.to_px) / len(self.bounds))
+
+    @property
+    def mean_squares(self) -> FloatArray:
+        """Of the displacement's error, and of the efficient estimator's [px^2]."""
+        return np.array([
+            np.einsum("...i,ij,...j->...", errors, self.to_px, errors).mean()
+            for errors in (self.errors, self.efficient)
+        ])  # fmt: skip
+
+    @property
+    def bias_square(self) -> float:
+        """Of the displacement's bias, without that of the scatter of its mean [px^2]."""
+        means = self.errors.mean(axis=1)
+        products = np.einsum("pi,ij,qj->pq", means, self.to_px, means)
+        n = len(means)
+        return float((products.sum() - np.trace(products)) / (n * (n - 1)))
+
+    @property
+    def chi_squares(self) -> FloatArray:
+        """Mean squares of the unknowns' standardised errors.
+
+        Of the errors by the bound and by the predicted covariances, and of the efficient
+        estimator's by the bound.
+        """
+        n = self.errors.shape[-1]
+        pairs = (
+            (self.errors, self.bounds[:, None]),
+            (self.errors, self.predicted),
+            (self.efficient, self.bounds),
+        )
+        return np.array([
+            (e * np.linalg.solve(c, e[..., None])[..., 0]).sum(axis=-1).mean() / n
+            for e, c in pairs
+        ])  # fmt: skip
+
+
+def measure(row: Row, motion: tuple[float, float, float], pairs: int) -> Measured:
+    """Correlate all realisations under one motion."""
+    ansatz = Ansatz(Box.centred(GRID.cols * PIXEL, GRID.rows * PIXEL), v0_degree=row.degree)
+    mask = np.zeros(GRID.shape, dtype=np.bool_)
+    mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+    options = CorrelationOptions((FULL,), **row.options)
+    used = np.nonzero(eroded(mask, options.edge_px))
+    x, y = GRID.x[used[1], None], GRID.y[used[0], None]  # two-dimensional: points, not axes
+    S = ansatz.sensitivities(np.zeros(ansatz.size), x, y)[:, 0]
+    dx, dy, strain = motion
+    u = np.column_stack([dx * PIXEL + strain * x, np.full_like(x, dy * PIXEL)])
+    truth = np.linalg.lstsq(S[::EVERY].reshape(-1, ansatz.size), u[::EVERY].ravel(), rcond=None)[0]
+    across, up = np.meshgrid(GRID.x, GRID.y)
+    from_x, from_y = (across - dx * PIXEL) / (1.0 + strain), up - dy * PIXEL
+    came_from = GRID.to_px(from_x, from_y)
+    # Pixels of g that show what the pixels of f compared do.
+    inside = np.ones(GRID.shape, dtype=np.bool_)
+    for at, own in zip(came_from, used, strict=True):
+        inside &= (own.min() - 0.5 <= at) & (at < own.max() + 0.5)
+    there = [at[inside] for at in came_from]
+    S_g = ansatz.sensitivities(np.zeros(ansatz.size), from_x[inside, None], from_y[inside, None])
+    errors, bounds, predicted, efficient = [], [], [], []
+    for seed in range(pairs):
+        pattern = speckle(row.width_px, seed)
+        f, g = pattern.image(), pattern.exact(*came_from)
+        noise = np.random.default_rng([seed, 1]).normal(size=(2, *GRID.shape))
+        J, J_g = (
+            (d_col[:, None] * of[:, 0] / (1.0 + strain) - d_row[:, None] * of[:, 1]) / PIXEL
+            for (d_row, d_col), of in (
+                (pattern.gradient(*used), S), (pattern.gradient(*there), S_g[:, 0])
+            )
+        )  # fmt: skip
+        inverse = np.linalg.inv(J.T @ J)
+        bounds.append((row.in_f**2 + row.in_g**2 / (1.0 + strain)) * inverse)
+        push = row.in_f * noise[0][used] @ J
+        push -= row.in_g / (1.0 + strain) * noise[1][inside] @ J_g
+        efficient.append(inverse @ push)
+        found = [
+            correlate(
+                f + sign * row.in_f * noise[0], g + sign * row.in_g * noise[1], GRID, ansatz,
+                np.zeros(ansatz.size), mask, options=options,
+            )
+            for sign in (1, -1)
+        ]  # fmt: skip
+        known = ImageNoise(row.in_f, row.in_g)
+        errors.append([result.unknowns - truth for result in found])
+        predicted.append([result.covariance(known) for result in found])
+    to_px = np.einsum("pcn,pcm->nm", S[::EVERY], S[::EVERY]) / (2 * len(S[::EVERY])) / PIXEL**2
+    made = (np.array(values) for values in (errors, bounds, predicted, efficient))
+    return Measured(*made, to_px)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A row over all its motions.
+
+    Parameters
+    ----------
+    bound_px
+        Rms standard error of a component by the bound [px].
+    bias
+        Rms bias over that, under the worst motion [-].
+    ratio
+        Rms error over that of the efficient estimator, all motions [-].
+    chi_square, chi_square_predicted
+        Of the unknowns by the bound and by the results' own covariances, over that of the
+        efficient estimator by the bound [-].
+    """
+
+    bound_px: float
+    bias: float
+    ratio: float
+    chi_square: float
+    chi_square_predicted: float
+
+
+def summarise(row: Row, pairs: int, step: float) -> Summary:
+    """Measure a row."""
+    made = [measure(row, motion, pairs) for motion in motions(step)]
+    error, efficient = np.sum([one.mean_squares for one in made], axis=0)
+    by_bound, by_own, expected = np.sum([one.chi_squares for one in made], axis=0)
+    return Summary(
+        bound_px=float(np.sqrt(np.mean([one.bound for one in made]))),
+        bias=float(np.sqrt(max(max(0.0, one.bias_square) / one.bound for one in made))),
+        ratio=float(np.sqrt(error / efficient)),
+        chi_square=float(by_bound / expected),
+        chi_square_predicted=float(by_own / expected),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--pairs", type=int, default=4, help="realisations n, each with its -n")
+    parser.add_argument("--step", type=float, default=0.125, help="of the translations [px]")
+    parser.add_argument("--only", default="", help="rows whose names contain this text")
+    parser.add_argument("--json", type=Path, help="where to leave all numbers")
+    options = parser.parse_args()
+    print("| noise, speckle, polynomials | bound of *u* [px] | largest bias / bound | rms error / "
+          "bound | chi squared: bound | own covariance |\n|---|---|---|---|---|---|")  # fmt: skip
+    found = {}
+    for row in ROWS:
+        if options.only in row.name:
+            one = summarise(row, options.pairs, options.step)
+            found[row.name] = asdict(one)
+            print(f"| {row.name} | {one.bound_px:.2e} | {one.bias:.3f} | {one.ratio:.3f} | "
+                  f"{one.chi_square:.3f} | {one.chi_square_predicted:.3f} |",
+                  flush=True)  # fmt: skip
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
