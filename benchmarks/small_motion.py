@@ -13,7 +13,7 @@ are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/de
 g), I = sum J J'. "Least squares" is the naive version: the deformed image's own
 gradient, and a quintic spline whatever the speckle.
 
-Run: scripts/env python benchmarks/small_motion.py [--pairs 4] [--step 0.125] [--only TEXT] [--json FILE]
+Run: scripts/env python benchmarks/small_motion.py [--pairs 3] [--only TEXT] [--json FILE]
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def summarise(row: Row, pairs: int, step: float) -> Summary:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--pairs", type=int, default=4, help="realisations n, each with its -n")
+    parser.add_argument("--pairs", type=int, default=3, help="realisations n, each with its -n")
     parser.add_argument("--step", type=float, default=0.125, help="of the translations [px]")
     parser.add_argument("--only", default="", help="rows whose names contain this text")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")

@@ -94,7 +94,7 @@ def test_rows_that_no_snapshot_has_are_left_out() -> None:
 
 
 def test_what_standard_errors_mean_depends_on_the_images() -> None:
-    about = "Standard errors take the whole residual"
+    about = "the first takes the whole residual"
     assert "No noise was added" in note(summary(), about)
     assert "predicted noise of 0.01 of full scale" in note(summary(noise_sd=0.01), about)
     noisy = summary() | {"case": {"imaging": {"sensor": {"read_noise": 0.01, "full_well": 0.0}}}}
