@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.specimen.hole_motion import HoleMotion
-from modeharvest.idic.specimen.scene import compare_scenes, require_same_scene
+from modeharvest.idic.specimen.scene import _correlation, compare_scenes, require_same_scene
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
 
@@ -65,6 +65,22 @@ def test_turned_blocks_are_found() -> None:
     match = compare_scenes(SPECKLE.image(), image, expected=lambda p: (p - middle) @ turn + middle)
     assert match.share > 0.8
     assert np.median(np.abs(match.after - (match.before - middle) @ turn - middle)) < 1.0
+
+
+def test_correlations_are_the_definitions() -> None:
+    """Of a textbook's formula, place by place; none on a part of one grey."""
+    rng = np.random.default_rng(0)
+    window = rng.random((23, 19), dtype=np.float32)
+    window[:12, :12] = 0.5
+    blocks = rng.random((3, 7, 7), dtype=np.float32)
+    blocks[2] = 0.25
+    found = _correlation(window, blocks)
+    assert found.shape == (3, 17, 13)
+    for n, row, col in np.ndindex(found.shape):
+        part, block = window[row : row + 7, col : col + 7].astype(float), blocks[n].astype(float)
+        flat = np.ptp(part) == 0.0 or np.ptp(block) == 0.0
+        expected = 0.0 if flat else np.corrcoef(part.ravel(), block.ravel())[0, 1]
+        assert found[n, row, col] == pytest.approx(expected, abs=1e-5)  # single precision
 
 
 def test_blocks_in_mm_have_y_upwards() -> None:

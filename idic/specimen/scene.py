@@ -7,13 +7,13 @@ the reference, or the motion is larger than expected.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import distance_transform_cdt, map_coordinates
-from skimage.feature import match_template
 
 from modeharvest.errors import InputError
 from modeharvest.imaging.grid import PixelGrid
@@ -186,21 +186,44 @@ def _search(
     low = np.maximum(aim - half - reach, 0)
     high = np.minimum(aim + half + reach + 1, g.shape)
     window = g[low[0] : high[0], low[1] : high[1]]
-    place, value = aim, 0.0
-    for block in _turned(f, centre, half):
-        if np.ptp(block) == 0.0 or np.ptp(window) == 0.0:
-            continue
-        score = np.asarray(match_template(window, block))  # type: ignore[no-untyped-call]
-        best = np.array(np.unravel_index(int(np.argmax(score)), score.shape))
-        if score[best[0], best[1]] > value:
-            place, value = low + best + half, float(score[best[0], best[1]])
-    return place, value
+    correlation = _correlation(window, _turned(f, centre, half))
+    best = np.array(np.unravel_index(int(np.argmax(correlation)), correlation.shape)[1:])
+    value = float(correlation.max())
+    return (low + half + best, value) if value > 0.0 else (aim, 0.0)
 
 
-def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> Iterator[FloatImage]:
-    """The block around a pixel, turned by each of ``TURNS_DEG``."""
+def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> FloatImage:
+    """(turns, edge, edge) the block around a pixel, turned by each of ``TURNS_DEG``."""
     row, col = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
-    for degrees in TURNS_DEG:
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        at = centre[0] + c * row - s * col, centre[1] + s * row + c * col
-        yield map_coordinates(f, at, order=1, mode="nearest").astype(np.float32)
+    angle = np.radians(TURNS_DEG)[:, None, None]
+    c, s = np.cos(angle), np.sin(angle)
+    at = np.array([centre[0] + c * row - s * col, centre[1] + s * row + c * col])
+    return np.asarray(map_coordinates(f, at, order=1, mode="nearest"), dtype=np.float32)
+
+
+def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
+    """Normalised cross-correlation of blocks (n, k, k) everywhere in a window (rows, cols).
+
+    As ``skimage.feature.match_template``, which would transform the window anew for each block.
+
+    Returns
+    -------
+    (n, rows - k + 1, cols - k + 1); 0 where a block or what it lies on is of one grey.
+    """
+    k = blocks.shape[-1]
+    shape = tuple(next_fast_len(size, real=True) for size in window.shape)
+    window = window - window.mean()  # for sums without loss of digits
+    blocks = blocks - blocks.mean(axis=(1, 2), keepdims=True)
+    rows, cols = (size - k + 1 for size in window.shape)
+    product = rfft2(window, shape) * np.conj(rfft2(blocks, shape))
+    cross = irfft2(product, shape)[:, :rows, :cols].astype(np.float64)
+    variance = np.maximum(0.0, _box_mean(window**2, k) - _box_mean(window, k) ** 2)
+    norm = k * np.sqrt(variance * (blocks**2).sum(axis=(1, 2))[:, None, None])
+    there = norm > np.finfo(np.float32).eps
+    return np.asarray(np.divide(cross, norm, out=np.zeros_like(cross), where=there))
+
+
+def _box_mean(values: FloatImage, k: int) -> FloatArray:
+    """(rows - k + 1, cols - k + 1) mean over squares of k x k values."""
+    total = np.pad(values.astype(np.float64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    return np.asarray((total[k:, k:] - total[:-k, k:] - total[k:, :-k] + total[:-k, :-k]) / k**2)
