@@ -1,13 +1,14 @@
-"""What a campaign costs: one worker against two, and the overhead of cases of a second.
+"""What a campaign costs: one worker against two, the overhead of cases of a second, the start.
 
-Two questions, each answered by whole campaigns, their workers' start included and apart:
+Three questions, each answered by whole campaigns, their workers' start included and apart:
 
 * speedup: correlations of the paper's images at a reduced resolution from perturbed starts, by
   one worker and by two;
 * overhead: cases that sleep for a second, on two workers: what the campaign takes beyond that.
+* start: cases that do nothing, run by forks of a server process, as campaigns are, and by new
+  processes, dask's default.
 
-The workers' start (dask, and a server process that imports what they need and that they are forks
-of) takes a second, once for a campaign; it is told apart. The machine should have two idle cores.
+The machine should have two idle cores.
 
 Run: scripts/env python benchmarks/campaign.py [--starts 24] [--sleeps 60] [--pixel 0.02]
 """
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest.validation.campaign import Campaign, Case, Workers, grid
+from modeharvest.validation.workers import LOCAL
 
 SLEEP_S = 1.0
 
@@ -56,8 +58,9 @@ def sleep(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     return {}
 
 
-def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> Timing:
+def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int, method: str) -> Timing:
     """Run a campaign and look at the clock."""
+    LOCAL["distributed.worker.multiprocessing-method"] = method
     campaign = Campaign(function, cases, folder)
     begin, ticks = time.perf_counter(), []
 
@@ -70,10 +73,16 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> T
     return Timing(whole, ticks[1], ticks[-1], float(table["seconds"].sum()))
 
 
-def alone(function: str, cases: tuple[Case, ...], folder: Path, workers: int) -> Timing:
+def alone(
+    function: str,
+    cases: tuple[Case, ...],
+    folder: Path,
+    workers: int,
+    method: str = "forkserver",
+) -> Timing:
     """The same in a process of its own: workers of an earlier campaign would make it faster."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(run, function, cases, folder, workers).result()
+        return process.submit(run, function, cases, folder, workers, method).result()
 
 
 def speedup(starts: int, pixel: float, folder: Path) -> None:
@@ -116,15 +125,32 @@ def overhead(sleeps: int, folder: Path) -> None:
           f"{100 * (steady / steady_ideal - 1):.1f} % from the first to the last case")  # fmt: skip
 
 
+def start(repetitions: int, folder: Path) -> None:
+    """Forks of a server process against new processes, in turn."""
+    found: dict[str, list[Timing]] = {}
+    for n in range(repetitions):
+        for method in ("forkserver", "spawn"):
+            cases = grid({"seconds": 0.0, "number": 0}, number=list(range(8)))
+            timing = alone("campaign:sleep", cases, folder / f"{method}-{n}", 2, method)
+            found.setdefault(method, []).append(timing)
+    for method, timings in found.items():
+        first, whole = (sorted(getattr(t, name) for t in timings) for name in ("first", "whole"))
+        middle = len(timings) // 2
+        print(f"{method}: {first[middle]:.2f} s until the first case was done, "
+              f"{whole[middle]:.2f} s in all (medians of {len(timings)})")  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--starts", type=int, default=24, help="correlations in each campaign")
     parser.add_argument("--pixel", type=float, default=0.02, help="of their images [mm]")
     parser.add_argument("--sleeps", type=int, default=60, help="cases of a second")
-    options = parser.parse_args()
+    parser.add_argument("--repetitions", type=int, default=5, help="of the start, in turn")
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        speedup(options.starts, options.pixel, Path(folder) / "speedup")
-        overhead(options.sleeps, Path(folder) / "overhead")
+        speedup(given.starts, given.pixel, Path(folder) / "speedup")
+        overhead(given.sleeps, Path(folder) / "overhead")
+        start(given.repetitions, Path(folder) / "start")
 
 
 if __name__ == "__main__":

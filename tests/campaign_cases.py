@@ -20,6 +20,13 @@ def square(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
     return {"square": case["x"] ** 2, "process": os.getpid()}
 
 
+def held(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
+    """Wait, from x = 5 on, until a file says to go on."""
+    while case["x"] >= 5 and not (folder / "go").exists():
+        time.sleep(0.02)
+    return {"x_again": case["x"]}
+
+
 def dies_once(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
     """Kill its own worker, -9, the first time that x is 2; leave a line for each time it is run."""
     mark = folder / "died"

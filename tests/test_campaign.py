@@ -69,7 +69,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     with socket.socket() as other:  # a server that says something else
         other.bind(("127.0.0.1", 0))
         other.listen()
-        other.settimeout(20.0)
+        other.settimeout(600.0)  # of a machine however slow
         answer = threading.Thread(target=greet, args=(other,))
         answer.start()
         no_scheduler = f"tcp://127.0.0.1:{other.getsockname()[1]}"
@@ -121,10 +121,14 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
     monkeypatch.undo()
 
     # It dies in the fifth of eight cases.
-    monkeypatch.setattr(workers, "_PATIENCE_S", 2.0)  # to see that it is gone
     campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=list(range(8))), tmp_path)
+
+    def hurry(done: float, total: float, what: str) -> None:
+        if done == 4:  # from now on only its absence is waited for
+            monkeypatch.setattr(workers, "_PATIENCE_S", 1.0)
+
     with pytest.raises(InputError, match="went away; 4 of 8 are done and kept"):
-        campaign.run(elsewhere)
+        campaign.run(elsewhere, hurry)
     assert len(campaign.missing()) == 4
 
 
@@ -228,26 +232,31 @@ def test_a_campaign_opens_nothing_beyond_this_machine(tmp_path: Path) -> None:
     assert set(at) == {"127.0.0.1"}
 
 
+def half_done(folder: Path) -> Campaign:
+    """Of eight cases, five end by themselves."""
+    return Campaign("campaign_cases:held", grid({"x": 0}, x=list(range(8))), folder)
+
+
 def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     program = textwrap.dedent(f"""
         import sys
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
-        from test_campaign import squares
+        from test_campaign import half_done
         if __name__ == "__main__":
-            squares(Path({str(tmp_path)!r}), x=list(range(8)), wait=[0.5]).run()
+            half_done(Path({str(tmp_path)!r})).run()
     """)
     script = tmp_path / "run.py"
     script.write_text(program)
     run = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
-    campaign = squares(tmp_path, x=list(range(8)), wait=[0.5])
-    while len(campaign.missing()) > 5:
+    campaign = half_done(tmp_path)
+    while len(campaign.missing()) > 3:
         assert run.poll() is None
-        time.sleep(0.05)
+        time.sleep(0.02)
     os.killpg(run.pid, signal.SIGKILL)
     run.wait()
     finished = {path: path.read_bytes() for path in (tmp_path / "cases").glob("*.json")}
-    left = len(campaign.missing())
-    assert 0 < left <= 5
+    assert len(campaign.missing()) == 3
+    (tmp_path / "go").touch()
     assert campaign.run()["error"].eq("").all()
     assert all(path.read_bytes() == content for path, content in finished.items())

@@ -265,7 +265,7 @@ PATIENT = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
 def test_two_ranks_find_the_same(tmp_path: Path) -> None:
     command = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL, str(tmp_path)]
     run = subprocess.run(
-        command, capture_output=True, text=True, timeout=300, env=PATIENT, check=False
+        command, capture_output=True, text=True, timeout=1800, env=PATIENT, check=False
     )
     assert run.returncode == 0, run.stderr
     expected = reference()

@@ -24,8 +24,8 @@ from modeharvest.errors import InputError
 from modeharvest.files import require_writable
 from modeharvest.validation.case_run import named
 
-_PATIENCE_S = 5.0
-"""How long to wait for a scheduler that does not answer."""
+_PATIENCE_S = 30.0
+"""How long to wait for a scheduler that does not answer: it may be on a busy machine."""
 _LIBRARIES = ("OMP", "MKL", "OPENBLAS")
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
 """A worker has one thread: cores are shared out by cases. numba is told in each case, because
@@ -33,8 +33,8 @@ this stands in the parent's own environment for a while, where numba must not ch
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
 _NEVER = "1000 days"
-_LOCAL: dict[str, object] = {
-    # Forks of one server process, that has imported dask: three times as quick as new processes.
+LOCAL: dict[str, object] = {
+    # Forks of one server process, which has imported dask: quicker than new processes.
     "distributed.worker.multiprocessing-method": "forkserver" if _FORKS else "spawn",
     "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
     # Nobody need be reached through a network: who does not answer is slow. By default dask gives
@@ -50,6 +50,7 @@ _LOCAL: dict[str, object] = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
 }
+"""Dask's options for workers of this machine."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
 
     with ExitStack() as stack:
         stack.enter_context(_environment_kept())
-        stack.enter_context(dask.config.set(_LOCAL))
+        stack.enter_context(dask.config.set(LOCAL))
         with _interrupts_held():
             cluster = stack.enter_context(
                 LocalCluster(  # type: ignore[no-untyped-call]
