@@ -28,7 +28,7 @@ mesh_size = 0.5
 holes_x = 4
 holes_y = 6
 [imaging]
-pixel_size = 0.035
+pixel_size = 0.05
 [imaging.speckle]
 seed = 3
 """
@@ -247,7 +247,7 @@ def test_under_mpirun_one_rank_writes_and_talks(case: Path, finished: Path, tmp_
     ]
     patient = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}  # a waiting rank does not spin
     done = subprocess.run(
-        ["mpirun", "-n", "2", *command], capture_output=True, text=True, timeout=300, env=patient
+        ["mpirun", "-n", "2", *command], capture_output=True, text=True, timeout=1800, env=patient
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("critical strain") == 1
@@ -267,7 +267,7 @@ def test_a_full_disk_leaves_nothing_that_looks_finished(case: Path, tmp_path: Pa
         "main()\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=1800
     )
     assert done.returncode == 2, done.stderr
     assert "error: could not write" in done.stderr
