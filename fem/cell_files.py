@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, read_any_mesh
 from modeharvest.fem.lattices import UnitCell
-from modeharvest.fem.meshing import gmsh_options, quiet_gmsh
+from modeharvest.fem.meshing import gmsh_options, quiet_gmsh, require_size
 from modeharvest.fem.triangles import sound_t6
 from modeharvest.reading import require_file
 
@@ -110,8 +110,8 @@ def _from_model(
 ) -> UnitCell:
     """The cell in gmsh's current model."""
     if size is not None:
-        if not 0 < size < np.inf:
-            raise InputError(f"mesh size: expected a positive length in mm, got {size}")
+        low, high = np.reshape(gmsh.model.getBoundingBox(-1, -1), (2, 3))[:, :2]
+        require_size(size, float(np.prod(high - low)))
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
     if to_mesh:
         try:

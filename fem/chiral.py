@@ -25,7 +25,7 @@ import numpy as np
 
 from modeharvest.errors import InputError
 from modeharvest.fem.lattices import UnitCell
-from modeharvest.fem.meshing import Block, divisions_of, join, mesh_block
+from modeharvest.fem.meshing import Block, divisions_of, join, mesh_block, require_size
 
 HANDEDNESS = ("clockwise", "counterclockwise")
 
@@ -81,8 +81,7 @@ def chiral(
         LIGAMENT_THICKNESS * pitch if ligament_thickness is None else ligament_thickness,
         ligaments,
     )
-    if not 0 < size < math.inf:
-        raise InputError(f"mesh size: expected a positive length in mm, got {size}")
+    require_size(size, pitch**2)
     if handedness not in HANDEDNESS:
         raise InputError(
             f"chiral cell: expected handedness {' or '.join(map(repr, HANDEDNESS))}, got "

@@ -15,6 +15,8 @@ from modeharvest.fem.specimen import Specimen
 
 EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")
+SMALLEST_STEP = 1e-5
+"""Of a path [-]: with less it would never end."""
 _LARGEST_TILT = 1.0
 
 
@@ -42,10 +44,16 @@ class PathOptions:
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        steps = (self.first_step, self.largest_step, self.critical_tolerance, self.first_amplitude)
-        if not (all(step > 0 for step in steps) and self.growth > 1):
+        steps = (self.first_step, self.largest_step, self.first_amplitude)
+        if not (all(SMALLEST_STEP <= step < 1 for step in steps) and 1 < self.growth <= 100):
             raise InputError(
-                f"path options: expected positive steps and tolerance and growth > 1, got {self}"
+                f"path options: expected steps and an amplitude from {SMALLEST_STEP:g} to 1 and a "
+                f"growth above 1 and at most 100, got {self}"
+            )
+        if not 1e-12 <= self.critical_tolerance < 1:
+            raise InputError(
+                "path options: expected a critical_tolerance from 1e-12 to 1, got "
+                f"{self.critical_tolerance}"
             )
 
 

@@ -118,7 +118,11 @@ class Solution:
     info: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not len(self.mesh.cells):
+            raise InputError("expected cells of a mesh, got none: nothing to show")
         for s in self.snapshots:
+            if not np.isfinite(s.nominal_strain):
+                raise InputError(f"expected a finite nominal strain, got {s.nominal_strain}")
             if s.displacement.shape != self.mesh.nodes.shape:
                 raise InputError(
                     f"snapshot at strain {s.nominal_strain}: expected displacements of shape "

@@ -32,6 +32,8 @@ class Imperfection:
     def __post_init__(self) -> None:
         if not (self.position_sd >= 0 and self.diameter_sd >= 0):
             raise InputError(f"imperfection: expected standard deviations >= 0 mm, got {self}")
+        if self.seed < 0:
+            raise InputError(f"imperfection: expected a seed of 0 or more, got {self.seed}")
 
     @property
     def is_none(self) -> bool:

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.meshing import Block, divisions_of, join, mesh_block, quarter_cell
+from modeharvest.fem.meshing import (
+    Block,
+    divisions_of,
+    join,
+    mesh_block,
+    quarter_cell,
+    require_size,
+)
 from modeharvest.fem.periodicity import Periodicity, find_periodicity
 
 FloatArray = NDArray[np.float64]
@@ -149,5 +156,4 @@ def _check(pitch: float, diameter: float, size: float) -> None:
             "unit cell: expected 0 < diameter < pitch (holes must not touch), got "
             f"diameter = {diameter} mm, pitch = {pitch} mm"
         )
-    if not 0 < size < math.inf:
-        raise InputError(f"mesh size: expected a positive length in mm, got {size}")
+    require_size(size, pitch**2)

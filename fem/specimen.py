@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 
+MOST_HOLES = 1000
+"""In a direction."""
+
 
 @dataclass(frozen=True)
 class Specimen:
@@ -44,9 +47,9 @@ class Specimen:
     grading_y: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.holes_x < 1 or self.holes_y < 1:
+        if not (1 <= self.holes_x <= MOST_HOLES and 1 <= self.holes_y <= MOST_HOLES):
             raise InputError(
-                "specimen: expected at least 1 x 1 holes, got "
+                f"specimen: expected 1 x 1 to {MOST_HOLES} x {MOST_HOLES} holes, got "
                 f"{self.holes_x} x {self.holes_y}; set holes_x and holes_y"
             )
         if not 0 < self.diameter < self.pitch:

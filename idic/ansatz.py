@@ -21,6 +21,19 @@ from modeharvest.idic.support import Taper
 FloatArray = NDArray[np.float64]
 
 
+HIGHEST_DEGREE = 20
+"""Of a slow field: 231 unknowns for a component; higher ones show waves as short as the pattern."""
+
+
+def require_degrees(v0_degree: int, v_degree: int) -> None:
+    """Raise InputError unless v0 and v_i can be of these degrees."""
+    if not (1 <= v0_degree <= HIGHEST_DEGREE and 0 <= v_degree <= HIGHEST_DEGREE):
+        raise InputError(
+            f"expected v0_degree from 1 and v_degree from 0 to {HIGHEST_DEGREE}, got {v0_degree} "
+            f"and {v_degree}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Ansatz:
     """Slow field v0, amplitudes v_i and modes phi_i, and the order of their unknowns.
@@ -48,11 +61,7 @@ class Ansatz:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "modes", tuple(self.modes))
-        if self.v0_degree < 1 or self.v_degree < 0:
-            raise InputError(
-                "expected degrees of at least 1 for v0 and 0 for v_i, got "
-                f"{self.v0_degree} and {self.v_degree}"
-            )
+        require_degrees(self.v0_degree, self.v_degree)
 
     @classmethod
     def square(

@@ -41,6 +41,9 @@ _LEAST = 1e-3
 """On coarse levels, directions with an eigenvalue below this share of the largest one wait for
 the finest level: what a blur does to the images would send them into other valleys."""
 
+_WIDEST_PX = 100
+"""Blur of a gradient, rim of the material: wider than any ligament that speckle is seen on."""
+
 
 @dataclass(frozen=True)
 class CorrelationOptions:
@@ -78,16 +81,18 @@ class CorrelationOptions:
 
     def __post_init__(self) -> None:
         known = [gradient.value for gradient in Gradient]
-        if self.gradient not in (None, *known) or not (self.gradient_blur_px or 0.0) >= 0.0:
+        blur = self.gradient_blur_px or 0.0
+        if self.gradient not in (None, *known) or not 0.0 <= blur <= _WIDEST_PX:
             raise InputError(
-                f"expected a gradient among {known} and a blur of it of at least 0 px, got "
+                f"expected a gradient among {known} and a blur of it of 0 to {_WIDEST_PX} px, got "
                 f"{self.gradient!r} and {self.gradient_blur_px}"
             )
         if not self.levels:
             raise InputError("expected at least one level from coarse to fine, got none")
-        if self.edge_px < 0 or self.order not in (None, *ORDERS):
+        if not 0 <= self.edge_px <= _WIDEST_PX or self.order not in (None, *ORDERS):
             raise InputError(
-                f"expected edge_px >= 0 and order 3, 5 or 11, got {self.edge_px} and {self.order}"
+                f"expected edge_px from 0 to {_WIDEST_PX} and order 3, 5 or 11, got "
+                f"{self.edge_px} and {self.order}"
             )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, require_degrees
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import CorrelationOptions
@@ -60,11 +60,7 @@ class Identification:
     gradient_blur_px: float | None = None
 
     def __post_init__(self) -> None:
-        if self.v0_degree < 1 or self.v_degree < 0:
-            raise InputError(
-                "correlation: expected v0_degree >= 1 and v_degree >= 0, got "
-                f"{self.v0_degree} and {self.v_degree}"
-            )
+        require_degrees(self.v0_degree, self.v_degree)
         if self.start_amplitude == 0.0:
             raise InputError(
                 "correlation: expected a start_amplitude that is not 0 mm (the mode could not be "

@@ -55,9 +55,9 @@ class CalibrationTarget:
                 "calibration: expected finite shifts (along columns, along rows) [px], got "
                 f"{self.shifts_px}"
             )
-        if not 0.0 <= self.stage_sd_px < np.inf:
+        if not 0.0 <= self.stage_sd_px <= 1000.0:
             raise InputError(
-                f"calibration: expected a stage_sd_px of 0 or more, got {self.stage_sd_px}"
+                f"calibration: expected a stage_sd_px of 0 to 1000 px, got {self.stage_sd_px}"
             )
         if self.seed < 0:
             raise InputError(f"calibration: expected a seed of 0 or more, got {self.seed}")

@@ -31,6 +31,8 @@ FloatArray = NDArray[np.float64]
 SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
 _NARROWEST_BLUR_PX = 0.75  # 3 x 3 samples a pixel
+_WIDEST_BLUR_PX = 100.0  # beyond it no speckle is left
+_LOWEST_FREQUENCY = 1e-4  # cycles/px: grains of thousands of pixels
 _WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations away
 
 
@@ -139,15 +141,16 @@ class SpeckleSpec:
 
 
 def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> None:
-    if not (blur_px >= _NARROWEST_BLUR_PX and math.isfinite(blur_px)):
+    if not _NARROWEST_BLUR_PX <= blur_px <= _WIDEST_BLUR_PX:
         raise InputError(
-            f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px, got {blur_px} px"
+            f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px and at most "
+            f"{_WIDEST_BLUR_PX:g} px, got {blur_px} px"
         )
     widest = _WIDEST_FREQUENCY * Grains(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
-    if not 0.0 < cycles_per_px <= widest:
+    if not _LOWEST_FREQUENCY <= cycles_per_px <= widest:
         raise InputError(
-            f"{what}: expected a spectral standard deviation above 0 and at most {widest:g} "
-            f"cycles/px with a blur of {blur_px} px, got {cycles_per_px} cycles/px"
+            f"{what}: expected a spectral standard deviation from {_LOWEST_FREQUENCY:g} to "
+            f"{widest:g} cycles/px with a blur of {blur_px} px, got {cycles_per_px} cycles/px"
         )
 
 

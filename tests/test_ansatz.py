@@ -111,5 +111,5 @@ def test_bad_input() -> None:
     bad[43] = np.nan
     with pytest.raises(InputError, match=r"v1\[1,0\]"):
         ansatz.checked(bad)
-    with pytest.raises(InputError, match="degrees"):
+    with pytest.raises(InputError, match="v0_degree from 1"):
         Ansatz(Box.centred(1, 1), v0_degree=0)

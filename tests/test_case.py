@@ -73,7 +73,7 @@ def test_plain_values_make_the_same_case_again() -> None:
         ('[experiment.material]\nkind = "ogdn"', "kind among"),
         ("[experiment.material]\nmodul = [1.0]", "did you mean 'moduli'?"),
         ("[experiment.specimen]\ndiameter = 2.5", "0 < diameter < pitch"),
-        ("[experiment.specimen]\nholes_x = 0", "at least 1 x 1 holes"),
+        ("[experiment.specimen]\nholes_x = 0", "expected 1 x 1 to 1000 x 1000 holes"),
         ('[experiment.specimen]\nholes_x = "six"', "'six'"),
         ("[experiment.specimen]\nbulk_x = -1.0", "bulk edges of 0 mm or more"),
         ("[experiment]\nstrains = [0.1, 0.05]", "ascending"),

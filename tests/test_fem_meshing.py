@@ -274,7 +274,7 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
         (lambda: Specimen(diameter=2.0), r"0 < diameter < pitch.*got diameter = 2.0 mm"),
         (lambda: Specimen(diameter=1.9), "0 < diameter < pitch"),
         (lambda: Specimen(diameter=-1.0), "0 < diameter < pitch"),
-        (lambda: Specimen(holes_x=0), "at least 1 x 1 holes, got 0 x 10"),
+        (lambda: Specimen(holes_x=0), "1 x 1 to 1000 x 1000 holes, got 0 x 10"),
         (lambda: Specimen(bulk_x=-0.1), "bulk edges of 0 mm or more"),
         (lambda: Specimen(diameter=float("nan")), "0 < diameter < pitch"),
         (lambda: Specimen(bulk_y=float("nan")), "bulk edges of 0 mm or more"),

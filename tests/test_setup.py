@@ -75,10 +75,10 @@ def test_options_are_handed_on() -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"v0_degree": 0}, "v0_degree >= 1"),
-        ({"v_degree": -1}, "v_degree >= 0"),
+        ({"v0_degree": 0}, "v0_degree from 1"),
+        ({"v_degree": -1}, "v_degree from 0"),
         ({"start_amplitude": 0.0}, "start_amplitude that is not 0 mm"),
-        ({"edge_px": -1}, "edge_px >= 0"),
+        ({"edge_px": -1}, "edge_px from 0"),
         ({"order": 4}, "order 3, 5 or 11"),
     ],
 )

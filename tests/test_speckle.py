@@ -159,7 +159,7 @@ def test_seed_decides() -> None:
         ({"bright": 1.5}, "grey levels"),
         ({"seed": -1}, "seed"),
         ({"standard_deviation": 0.2, "blur_px": 1.0, "seed": -1}, "seed"),
-        ({"standard_deviation": 0.3, "blur_px": 1.0}, "at most 0.25"),
+        ({"standard_deviation": 0.3, "blur_px": 1.0}, "to 0.25"),
     ],
 )
 def test_refuses_what_cannot_be_made(bad: dict[str, Any], message: str) -> None:

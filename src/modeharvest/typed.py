@@ -18,8 +18,8 @@ from modeharvest.errors import InputError
 CHECKS = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 """No unknown keys, no infinite numbers; nested dataclasses have the same rules."""
 
-_LARGEST_INTEGER = 2**53
-"""Beyond it floats skip integers, and no count is meant."""
+_LARGEST = 1e15
+"""Whatever its unit, no length, stress or count that is meant is larger; squares don't overflow."""
 T = TypeVar("T")
 
 
@@ -47,7 +47,7 @@ def require_types(given: object, found: object, where: str = "") -> None:
     Raises
     ------
     InputError
-        If a boolean or a text became a number, a number a boolean, or an integer is too large.
+        If a boolean or a text became a number, a number a boolean, or a number is beyond all use.
     """
     if isinstance(given, Mapping):
         for key, value in given.items():
@@ -58,8 +58,8 @@ def require_types(given: object, found: object, where: str = "") -> None:
             require_types(value, inner, f"{where}.{k}")
     elif _kind(given) and _kind(found) and _kind(given) != _kind(found):
         raise InputError(f"{where}: expected {_kind(found)}, got {given!r}")
-    elif type(given) is int and abs(given) > _LARGEST_INTEGER:
-        raise InputError(f"{where}: expected a number below {_LARGEST_INTEGER}, got {given:.3e}")
+    elif _kind(given) == "a number" and abs(given) > _LARGEST:  # type: ignore[arg-type]
+        raise InputError(f"{where}: expected a number below {_LARGEST:g}, got {given}")
 
 
 def _kind(value: object) -> str:

@@ -22,9 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.errors import InputError
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.memory import require_memory
 
 FloatArray = NDArray[np.float64]
 
+_BYTES_PER_PIXEL = 300.0
+"""Of making the images."""
 _STEEPEST = 0.9
 """Largest derivative of the motion, 2 pi A / p [-]: at 1 the image folds."""
 _NEAR = 1e-3
@@ -62,6 +65,10 @@ class Star:
                 "star: expected an odd number of rows, at least 31, and at least 100 columns, got "
                 f"{self.rows} x {self.cols} px"
             )
+        require_memory(
+            _BYTES_PER_PIXEL * self.rows * self.cols, f"a star of {self.rows} x {self.cols} px",
+            "take fewer --rows or --cols",
+        )  # fmt: skip
         steepest = 2.0 * np.pi * self.amplitude_px / self.shortest_px
         if not (0.0 < steepest <= _STEEPEST and 0.0 < self.shortest_px < self.longest_px < np.inf):
             raise InputError(

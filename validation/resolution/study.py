@@ -17,7 +17,7 @@ from modeharvest.validation.resolution.buckled import Buckled
 from modeharvest.validation.resolution.curves import AXES, WAVED, Curves
 from modeharvest.validation.resolution.findings import MOTIONS, findings
 from modeharvest.validation.resolution.measure import Subject
-from modeharvest.validation.studies.study import Findings, require_different, require_mode
+from modeharvest.validation.studies.study import MOST, Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject as Experiment
 
 
@@ -73,10 +73,10 @@ class Resolution:
                 "study: expected an amplitude above 0 and up to 2 px and noise above 0 and below "
                 f"0.1 of full scale, got {self.amplitude_px} and {self.noise}"
             )
-        if self.pattern == 0.0 or self.realisations < 2 or self.seed < 0:
+        if self.pattern == 0.0 or not 2 <= self.realisations <= MOST or self.seed < 0:
             raise InputError(
-                "study: expected a pattern that is not 0 mm, 2 realisations or more and a seed of "
-                f"0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
+                f"study: expected a pattern that is not 0 mm, 2 to {MOST} realisations and a seed "
+                f"of 0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
             )
 
     @property

@@ -133,6 +133,10 @@ def require_mode(correlation: Identification) -> None:
         )
 
 
+MOST = 100_000
+"""Of what is repeated in a study; each is a case and its file."""
+
+
 def require_different(name: str, values: tuple[Any, ...]) -> None:
     """Raise InputError if a value comes twice."""
     if len(set(values)) < len(values):

@@ -22,6 +22,10 @@ UNUSABLE, FAULT, INTERRUPTED, UNREAD = 2, 70, 130, 1
 of sysexits.h); after Ctrl-C; where nobody reads what is printed (as in ``| head``)."""
 
 
+was_interrupted = False
+"""Set by Ctrl-C."""
+
+
 class InterruptionError(Exception):
     """Ctrl-C, under a name that the command-line library does not take for its own."""
 
@@ -45,7 +49,7 @@ def tell(error: BaseException) -> int:
     """
     if isinstance(error, BrokenPipeError):
         return UNREAD
-    if isinstance(error, (InterruptionError, KeyboardInterrupt)):
+    if was_interrupted or isinstance(error, (InterruptionError, KeyboardInterrupt)):
         _print("interrupted; run the same command again to continue where it stopped")
         return INTERRUPTED
     _print(f"[red]error:[/red] {escape(_line(error))}")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import _thread
 import functools
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -77,6 +79,10 @@ for command in (benchmark.make, benchmark.star, benchmark.resolution):
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 
 
+_AGAIN_S = 0.05
+"""After which an interruption comes again that was lost in a destructor."""
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         print(__version__)
@@ -95,7 +101,9 @@ def _common(
 def main() -> None:
     """Entry point of the ``modeharvest`` command."""
     _open_streams()
-    sys.unraisablehook = _keep_interruption
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+        sys.unraisablehook = _keep_interruption
     if is_first():
         _run()
     else:  # under mpirun one speaks for all
@@ -140,9 +148,17 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _interrupt(number: int, frame: object) -> NoReturn:
+    """Ctrl-C, whatever libraries make of the exception: PETSc turns it into one of its own."""
+    messages.was_interrupted = True
+    raise KeyboardInterrupt
+
+
 def _keep_interruption(ignored: UnraisableHookArgs) -> None:
     """Ctrl-C during a destructor or a callback, where Python can only print it, comes again."""
     if issubclass(ignored.exc_type, KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
+        again = threading.Timer(_AGAIN_S, _thread.interrupt_main)  # after this has returned
+        again.daemon = True
+        again.start()
     else:
         sys.__unraisablehook__(ignored)

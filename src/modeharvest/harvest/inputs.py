@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
     paths: list[Path] = []
     for name in names:
         if any(sign in name for sign in "*?["):
-            found = sorted(base.glob(name))
+            found = sorted(p for p in map(Path, glob.glob(str(base / name))) if p.is_file())
             if not found:
                 raise InputError(f"expected files that match {base / name}, found none")
             paths += found
@@ -93,7 +94,7 @@ def require_inputs(experiment: Experiment, base: Path) -> None:
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
-            f"expected the files that the experiment names, found no such file: {missing[0]}{more}"
+            f"expected the files that the experiment names, found no file {missing[0]}{more}"
         )
     masks = experiment.specimen.deformed_material
     of_each_photograph(experiment, base, masks, "specimen.deformed_material")

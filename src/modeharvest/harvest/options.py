@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from modeharvest.errors import InputError
+from modeharvest.idic.ansatz import require_degrees
 from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import CorrelationOptions
 from modeharvest.typed import nearest
@@ -57,6 +58,8 @@ class LocalTable:
                 "local: expected unit 'auto', 'px' or 'mm' and y_axis 'auto', 'down' or 'up', got "
                 f"{self.unit!r} and {self.y_axis!r}"
             )
+        if self.first_pixel not in (0, 1):
+            raise InputError(f"local: expected first_pixel 0 or 1, got {self.first_pixel}")
         if self.subset < 5 or self.subset % 2 == 0 or self.step < 1:
             raise InputError(
                 "local: expected an odd subset >= 5 px and step >= 1 px, got "
@@ -99,11 +102,7 @@ class Measurement:
     formulation: str = "total"
 
     def __post_init__(self) -> None:
-        if self.v0_degree < 1 or self.v_degree < 0:
-            raise InputError(
-                "correlation: expected v0_degree >= 1 and v_degree >= 0, got "
-                f"{self.v0_degree} and {self.v_degree}"
-            )
+        require_degrees(self.v0_degree, self.v_degree)
         if self.family not in ("auto", "square"):
             raise InputError(
                 f"correlation: expected family 'auto' or 'square', got {self.family!r}"

@@ -19,6 +19,7 @@ The tables are the dataclasses of :mod:`modeharvest.lattice.kinds` and
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -87,6 +88,13 @@ class StudyPlan:
                     raise InputError(f"unknown name {name!r}{nearest(name, among)}")
         if not self.loadings or not self.ratios:
             raise InputError("study: expected a ratio and a loading or more, got none")
+        if not (4 <= self.divisions <= 200 and 0 < self.largest < 1):
+            raise InputError(
+                "study: expected 4 to 200 divisions and 0 < largest < 1, got "
+                f"{self.divisions} and {self.largest}"
+            )
+        if not all(0 < pitch < math.inf for pitch in self.pitches):
+            raise InputError(f"study: expected pitches above 0 mm, got {self.pitches}")
         if not all(0 < ratio < 1 for ratio in (*self.ratios, *self.overlays)):
             raise InputError(f"study: expected 0 < d/l < 1, got {self.ratios}, {self.overlays}")
 

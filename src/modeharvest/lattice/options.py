@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from modeharvest.errors import InputError
 from modeharvest.fem.dispersion import ZONES, Wave, in_plane
+from modeharvest.fem.experiment import SMALLEST_STEP
 from modeharvest.fem.macroscopic import (
     MacroLoading,
     Rates,
@@ -111,11 +112,13 @@ class Search:
     largest_step: float = 0.02
 
     def __post_init__(self) -> None:
-        if not (0 < self.largest < 1 and self.largest_step > 0) or self.divisions < 2:
+        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
             raise InputError(
-                "search: expected 0 < largest < 1, a positive step and 2 divisions or more, got "
+                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
                 f"{self}"
             )
+        if not 2 <= self.divisions <= 200:
+            raise InputError(f"search: expected 2 to 200 divisions, got {self.divisions}")
 
 
 @dataclass(frozen=True)
@@ -151,10 +154,15 @@ class DispersionPlan:
                 "dispersion: expected two corners or more, and no fewer points, got "
                 f"{len(tour)} corners and {self.points} points"
             )
-        if self.points < 8 or self.bands < 1 or self.map_divisions < 0 or self.map_divisions % 2:
+        if not (8 <= self.points <= 10_000 and 1 <= self.bands <= 100):
             raise InputError(
-                "dispersion: expected 8 points or more, a band or more and an even number of map "
-                f"divisions, got {self}"
+                "dispersion: expected 8 to 10000 points and 1 to 100 bands, got "
+                f"{self.points} and {self.bands}"
+            )
+        if not 0 <= self.map_divisions <= 1000 or self.map_divisions % 2:
+            raise InputError(
+                "dispersion: expected an even number of map divisions from 0 to 1000, got "
+                f"{self.map_divisions}"
             )
 
     def tour(self, lattice: Lattice, loading: Loading) -> tuple[tuple[str, Wave], ...]:

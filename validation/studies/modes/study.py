@@ -75,9 +75,9 @@ class Modes:
             raise InputError(f"study: expected materials among {list(MATERIALS)}, got {unknown}")
         if 0.0 in (*self.gradings_x, *self.gradings_y):
             raise InputError("study: expected gradings other than 0, which the base has, got 0")
-        if not 0.0 < self.largest < 0.5 or self.divisions < 4:
+        if not (0.0 < self.largest < 0.5 and 4 <= self.divisions <= 200):
             raise InputError(
-                "study: expected largest between 0 and 0.5 and divisions of 4 or more, got "
+                "study: expected largest between 0 and 0.5 and 4 to 200 divisions, got "
                 f"{self.largest} and {self.divisions}"
             )
         for name in ("ratios", "pitches", "materials", "gradings_x", "gradings_y"):

@@ -21,7 +21,7 @@ from modeharvest.validation.studies.against_truth import against_truth
 from modeharvest.validation.studies.noise import findings as told
 from modeharvest.validation.studies.noise.causes import LADDER, compared, covariances
 from modeharvest.validation.studies.noise.fields import PARTS, Points
-from modeharvest.validation.studies.study import Findings, require_different
+from modeharvest.validation.studies.study import MOST, Findings, require_different
 from modeharvest.validation.studies.subject import Images, Scene, Subject
 
 FloatArray = NDArray[np.float64]
@@ -58,9 +58,9 @@ class Noise:
             raise InputError(
                 f"study: expected levels above 0 and below 1 of full scale, got {list(self.levels)}"
             )
-        if self.pairs < 2 or self.seed < 0:
+        if not 2 <= self.pairs <= MOST or self.seed < 0:
             raise InputError(
-                "study: expected pairs of 2 or more and a seed of 0 or more, got "
+                f"study: expected 2 to {MOST} pairs and a seed of 0 or more, got "
                 f"{self.pairs} and {self.seed}"
             )
         require_different("levels", self.levels)

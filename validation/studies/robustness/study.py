@@ -17,7 +17,7 @@ from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies.robustness import findings as told
-from modeharvest.validation.studies.study import Findings, require_different, require_mode
+from modeharvest.validation.studies.study import MOST, Findings, require_different, require_mode
 from modeharvest.validation.studies.subject import Scene, Subject
 
 FloatArray = NDArray[np.float64]
@@ -59,9 +59,9 @@ class Robustness:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.starts < 1 or self.per_radius < 0 or self.seed < 0:
+        if not (1 <= self.starts <= MOST and 0 <= self.per_radius <= MOST) or self.seed < 0:
             raise InputError(
-                "study: expected starts of 1 or more, per_radius and seed of 0 or more, got "
+                f"study: expected 1 to {MOST} starts, per_radius and seed of 0 or more, got "
                 f"{self.starts}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
