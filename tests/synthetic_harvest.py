@@ -84,7 +84,7 @@ def frame(name: str, strain: float, amplitude: float, held: bool = False) -> Har
     result = Result(
         kinematics, GRID, a, 1e-13 * np.eye(kinematics.size), 45.0, int(MASK.sum()), 0,
         Outcome.CONVERGED, 1e3, tuple(Iteration(f, n, 60.0, s, 0.0, 100) for f, n, s in steps),
-        residual_correlation=0.1,
+        residual_correlation=0.1, slope_square=1e13 * GRID.pixel_size**2 / int(MASK.sum()),
     )  # fmt: skip
     x, y = GRID.x[::8], GRID.y[::8]
     leftover = 1e-8 * np.eye(kinematics.size)
@@ -106,6 +106,7 @@ def frame(name: str, strain: float, amplitude: float, held: bool = False) -> Har
         error_y=y,
         by_noise=field_errors(result, x, y, result.covariance(NOISE)),
         by_leftover=field_errors(result, x, y, leftover),
+        noise_covariance=result.covariance(NOISE),
         leftover_covariance=leftover,
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
