@@ -57,6 +57,6 @@ cell_size = 1.9                      # mm, the distance of neighbouring holes
 # gain_degree = 0                    # e.g. the light changes between the photographs: by a factor
 # offset_degree = 0                  # e.g. and by a summand; higher degrees for uneven changes
 # edge_px = 3                        # rim of the material that is not compared
-# order = 5                          # e.g.; of the spline, 3, 5 or 11; if left out, as the speckle asks for
+# order = 5                          # e.g. of the spline: 3, 5 or 11; else as the speckle asks for
 # formulation = "total"              # "total", or "updated" for speckles that change on the way
 """
