@@ -132,8 +132,9 @@ def test_a_plain_global_dic_has_a_report_too(harvest: Harvest, tmp_path: File) -
     plain = Ansatz(made_up.DOMAIN, (), v0_degree=3)
     result = replace(frame.result, ansatz=plain, unknowns=plain.start(0.05),
                      inverse=1e-12 * np.eye(plain.size))  # fmt: skip
-    errors = field_errors(result, frame.error_x, frame.error_y, result.covariance(made_up.NOISE))
-    frame = replace(frame, result=result, by_noise=errors,
+    by_noise = result.covariance(made_up.NOISE)
+    errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
+    frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
     ids = Page(report(replace(bare(harvest), frames=(frame,)), tmp_path)).ids
     assert "v0x-1" in ids
@@ -149,8 +150,9 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
     both = replace(frame.result.ansatz, modes=(*frame.result.ansatz.modes, single))
     result = replace(frame.result, ansatz=both, unknowns=both.start(0.05, 0.4),
                      inverse=1e-12 * np.eye(both.size))  # fmt: skip
-    errors = field_errors(result, frame.error_x, frame.error_y, result.covariance(made_up.NOISE))
-    frame = replace(frame, result=result, by_noise=errors,
+    by_noise = result.covariance(made_up.NOISE)
+    errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
+    frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
     atlas = HarvestAtlas(replace(bare(harvest), frames=(frame,)))
     second = [panel for panel in panels(atlas) if "2" in panel.key]
@@ -203,7 +205,7 @@ def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) ->
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     unknown = bare(harvest)
     lost = replace(unknown.frames[0].result, inverse=np.diag([np.inf] * 77))
-    frame = replace(unknown.frames[0], result=lost)
+    frame = replace(unknown.frames[0], result=lost, noise_covariance=lost.inverse)
     told = harvest_summary(replace(unknown, frames=(frame,)))
     assert json.dumps(told, allow_nan=False)
     assert told["frames"][0]["modes"][0]["parameters"][0]["sd_noise"] is None
