@@ -63,7 +63,8 @@ _EXPLANATIONS = {
     ),
     Outcome.TRAPPED: (
         "The iteration ended where parts of the images don't match at all: a local minimum; "
-        "start closer, or with other mode parameters."
+        "start closer, with other mode parameters, or with coarser speckle: fine speckle beside "
+        "a large displacement that the ansatz can't describe traps it, from any start."
     ),
     Outcome.UNWEIGHTED: (
         "The least-squares minimum was found, but from there no way to where the gradient that "
