@@ -377,18 +377,21 @@ def test_a_full_or_closed_terminal_is_no_fault(tail: str, code: int, said: str) 
 
 
 INTERRUPTED = """
-import os, signal, sys, threading
+import signal, sys
 from modeharvest import case_file, cli
+from modeharvest.cli.messages import bars
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
 
 class Swallows:
     def __del__(self):
         signal.raise_signal(signal.SIGINT)  # as Ctrl-C during a destructor
 
 def work(name):
-    {work}
-    for _ in range(10_000_000):
-        pass
-    print("it went on")
+    with bars() as progress:
+        {work}
+        progress(1, 2, "work")
+        print("it went on")
 
 case_file.case_text = work
 sys.argv = ["modeharvest", "cases", "paper-virtual"]
@@ -401,17 +404,24 @@ cli.main()
     [
         "Swallows()",
         "signal.raise_signal(signal.SIGINT)",
-        "\n    try:\n        signal.raise_signal(signal.SIGINT)\n"
-        "    except BaseException as error:\n        raise RuntimeError('a library') from error",
+        "\n        try:\n            signal.raise_signal(signal.SIGINT)\n"
+        "        except BaseException as error:\n            raise RuntimeError from error",
+        "\n        try:\n            signal.raise_signal(signal.SIGINT)\n"
+        "        except BaseException:\n            pass",
     ],
-    ids=["in a destructor", "plain", "taken for an error"],
+    ids=["in a destructor", "plain", "taken for an error", "dropped"],
 )
 def test_ctrl_c_is_never_swallowed(work: str) -> None:
     done = run("-c", INTERRUPTED.format(work=work))
-    assert done.returncode == 130
+    assert done.returncode == 130, done.stderr
     assert done.stderr.count("interrupted;") == 1
     assert "Traceback" not in done.stderr
     assert "went on" not in done.stdout
+
+
+def test_ctrl_c_counts_even_at_the_end() -> None:
+    script = INTERRUPTED.replace('progress(1, 2, "work")', "pass")
+    assert run("-c", script.format(work="Swallows()")).returncode == 130
 
 
 # --- environments -------------------------------------------------------------------------

@@ -1,5 +1,16 @@
-"""``python -m modeharvest`` is the ``modeharvest`` command."""
+"""``python -m modeharvest`` and the ``modeharvest`` command."""
 
-from modeharvest.cli import main
+import sys
 
-main()
+
+def start() -> None:
+    """Load the command line and run it; Ctrl-C may come before there is anything to catch it."""
+    try:
+        from modeharvest.cli import main
+    except KeyboardInterrupt:
+        sys.exit(130)
+    main()
+
+
+if __name__ == "__main__":
+    start()

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from modeharvest.console import ProgressBars, compilation_announced
 from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.progress import Progress
 
 console = Console(stderr=True)
 
@@ -23,18 +24,30 @@ of sysexits.h); after Ctrl-C; where nobody reads what is printed (as in ``| head
 
 
 was_interrupted = False
-"""Set by Ctrl-C."""
+"""Set by Ctrl-C, whose exception can get lost: Python drops it in destructors and callbacks, numba
+while it looks for a kernel, and PETSc makes another one of it."""
 
 
 class InterruptionError(Exception):
     """Ctrl-C, under a name that the command-line library does not take for its own."""
 
 
+def end_if_interrupted() -> None:
+    """Raise KeyboardInterrupt if there was one that got lost."""
+    if was_interrupted:
+        raise KeyboardInterrupt
+
+
 @contextmanager
-def bars() -> Iterator[ProgressBars]:
-    """Progress bars for the work of a ``with`` block."""
+def bars() -> Iterator[Progress]:
+    """Progress bars for the work of a ``with`` block, which ends at the next step after Ctrl-C."""
     with ProgressBars(console) as drawn, compilation_announced(console):
-        yield drawn
+
+        def listener(done: float, total: float, what: str) -> None:
+            end_if_interrupted()
+            drawn(done, total, what)
+
+        yield listener
 
 
 def warn(message: str) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import _thread
 import functools
 import os
 import signal
 import sys
-import threading
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -65,6 +63,7 @@ def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
     def run(*arguments: Any, **options: Any) -> None:
         try:
             command(*arguments, **options)
+            messages.end_if_interrupted()
         except KeyboardInterrupt as error:
             raise messages.InterruptionError from error
 
@@ -77,10 +76,6 @@ for family, commands in _FAMILIES.items():
 for command in (benchmark.make, benchmark.star, benchmark.resolution):
     benchmark_app.command()(_interruptible(command))
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
-
-
-_AGAIN_S = 0.05
-"""After which an interruption comes again that was lost in a destructor."""
 
 
 def _version(wanted: bool) -> None:
@@ -101,15 +96,13 @@ def _common(
 def main() -> None:
     """Entry point of the ``modeharvest`` command."""
     _open_streams()
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
-        sys.unraisablehook = _keep_interruption
-    if is_first():
-        _run()
-    else:  # under mpirun one speaks for all
-        messages.console.quiet = True
-        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+    with _interruptions_remembered():
+        if is_first():
             _run()
+        else:  # under mpirun one speaks for all
+            messages.console.quiet = True
+            with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+                _run()
 
 
 def _run() -> None:
@@ -148,17 +141,30 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+@contextmanager
+def _interruptions_remembered() -> Iterator[None]:
+    """Note Ctrl-C, unless the caller has it ignored, as shells do in the background."""
+    messages.was_interrupted = False
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    hook = sys.unraisablehook
+    signal.signal(signal.SIGINT, _interrupt)
+    sys.unraisablehook = _unless_interrupted
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = hook
+
+
 def _interrupt(number: int, frame: object) -> NoReturn:
-    """Ctrl-C, whatever libraries make of the exception: PETSc turns it into one of its own."""
+    """Ctrl-C, whatever becomes of the exception: see ``messages.end_if_interrupted``."""
     messages.was_interrupted = True
     raise KeyboardInterrupt
 
 
-def _keep_interruption(ignored: UnraisableHookArgs) -> None:
-    """Ctrl-C during a destructor or a callback, where Python can only print it, comes again."""
-    if issubclass(ignored.exc_type, KeyboardInterrupt):
-        again = threading.Timer(_AGAIN_S, _thread.interrupt_main)  # after this has returned
-        again.daemon = True
-        again.start()
-    else:
+def _unless_interrupted(ignored: UnraisableHookArgs) -> None:
+    """Tell nothing of an interruption in a destructor or a callback: it isn't lost."""
+    if not issubclass(ignored.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(ignored)
