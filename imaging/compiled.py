@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import re
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import llvmlite.binding
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +21,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # Sums may be reordered, so that they are vectorised; NaN and infinity keep their meaning.
 _RELAXED = {"contract", "reassoc", "nsz", "arcp"}
+_PACKAGE = Path(__file__).parents[1]
 _kept = True
 
 
@@ -39,12 +47,65 @@ def compiled(
     def decorate(kernel: F) -> F:
         global _kept
         try:
-            return cast(F, numba.njit(kernel, cache=True, **options))
+            return cast(F, _stamped(numba.njit(kernel, cache=True, **options)))
         except RuntimeError:  # no folder for it can be written to
             _kept = False
             return cast(F, numba.njit(kernel, **options))
 
     return decorate
+
+
+def _stamped(kernel: Any) -> Any:
+    """Have a kept kernel compiled anew when one that it calls has changed, too.
+
+    numba looks at the kernel's own file only. What it compares is no public part of it: where that
+    is not found, numba's own behaviour is left.
+    """
+    index = cast(Any, getattr(getattr(kernel, "_cache", None), "_cache_file", None))
+    if index is not None and hasattr(index, "_source_stamp"):
+        callees = _read_by(Path(inspect.getfile(kernel.py_func)))
+        index._source_stamp = index._source_stamp, _digest(*callees)
+    return kernel
+
+
+_IMPORTED = re.compile(r"^from modeharvest\.([\w.]+) import", re.MULTILINE)
+
+
+@cache
+def _read_by(path: Path) -> tuple[Path, ...]:
+    """The files of kernels that a file imports from, directly or not, and itself."""
+    found, waiting = {path}, [path]
+    while waiting:
+        for name in _IMPORTED.findall(waiting.pop().read_text("utf-8")):
+            other = _PACKAGE / f"{name.replace('.', '/')}.py"
+            if other not in found and _has_kernels(other):
+                found.add(other)
+                waiting.append(other)
+    return tuple(sorted(found))
+
+
+@cache
+def _has_kernels(path: Path) -> bool:
+    return path.is_file() and "compiled" in path.read_text("utf-8")
+
+
+@cache
+def _digest(*paths: Path) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()[:16]
+
+
+def sources() -> str:
+    """A short text that differs for other kernels, another numba, or another processor."""
+    files = [path for folder in ("imaging", "idic") for path in (_PACKAGE / folder).rglob("*.py")]
+    host = numba.__version__, llvmlite.binding.get_host_cpu_name(), sys.version
+    text = _digest(*sorted(filter(_has_kernels, files))), *host
+    return hashlib.sha256("".join(text).encode()).hexdigest()[:16]
+
+
+def kept_in(kernel: Callable[..., object]) -> Path | None:
+    """The folder that a kernel is kept in; None if it is not."""
+    stats = getattr(kernel, "stats", None)
+    return Path(stats.cache_path) if stats is not None and stats.cache_path else None
 
 
 def are_kept() -> bool:

@@ -25,6 +25,7 @@ from modeharvest.files import read_json
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
+from modeharvest.precompile import precompiling
 from modeharvest.progress import Progress, silent
 from modeharvest.ranks import is_first
 from modeharvest.stages import Stages, digest
@@ -158,9 +159,13 @@ class Run:
             At the end, if the simulation did not reach all strains asked for: what it did
             reach is reported.
         """
-        solution = self.fem() if self.solution is None else self._solution()
-        self.image()
-        self.correlate()
+        ahead = [stage for stage in ("image", "correlate") if not self.stages.finished(stage)]
+        with precompiling(ahead) as kernels:
+            solution = self.fem() if self.solution is None else self._solution()
+            kernels.wait("image", self.progress)
+            self.image()
+            kernels.wait("correlate", self.progress)
+            self.correlate()
         summary = self.validate()
         outcome = str(solution.info.get("outcome", "complete"))
         if outcome != "complete":

@@ -23,6 +23,11 @@ def _world() -> Any:
     return MPI.COMM_WORLD
 
 
+def is_alone() -> bool:
+    """Whether no launcher of MPI started this process."""
+    return _world() is None
+
+
 def is_first() -> bool:
     """Whether this is rank 0, the one that writes and talks."""
     world = _world()
