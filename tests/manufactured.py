@@ -22,6 +22,8 @@ PIXEL = 0.01
 GRID = PixelGrid.centred(360, 320, PIXEL)
 DOMAIN = Box.centred(2.6, 3.0)
 CELLULAR = Box.centred(2.0, 2.4)
+STEP = 1e-6
+"""Of finite differences [mm]: Newton needs no more digits of a gradient than these leave."""
 
 
 def one_mode() -> Ansatz:
@@ -101,19 +103,36 @@ def speckle(seed: int = 2, grid: PixelGrid = GRID) -> Pattern:
 
 def reference_points(ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID) -> FloatArray:
     """(rows, cols, 2): X with X + u(X) = x at the pixels x, solved to rounding by iteration."""
-    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
-    reference = at.copy()
-    for _ in range(300):
+
+    def displacement(points: FloatArray) -> FloatArray:
         # Far outside the domain the polynomials run away; nothing is sampled there.
-        inside = np.stack(
-            [np.clip(reference[..., 0], -1.5, 1.5), np.clip(reference[..., 1], -1.7, 1.7)], -1
-        )
-        moved = at - ansatz.displacement_at(a, inside)
-        change = abs(moved - reference).max()
-        reference = moved
-        if change < 1e-13:
-            return reference
-    raise AssertionError(f"the inverse mapping has not converged: {change} mm")
+        return ansatz.displacement_at(a, np.clip(points, (-1.5, -1.7), (1.5, 1.7)))
+
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1).reshape(-1, 2)
+    reference = at.copy()
+    left = np.arange(len(at))
+    for n in range(300):
+        points = reference[left]
+        u = displacement(points)
+        step = at[left] - u - points
+        reference[left] += step
+        far = abs(step).max(axis=1) > 1e-13
+        left, points, u, step = left[far], points[far], u[far], step[far]
+        if not len(left):
+            return reference.reshape(*grid.shape, 2)
+        if n < 10:  # Newton; after that, for what lies at kinks, plain fixed-point iteration
+            gradient = np.stack(
+                [(displacement(points + h) - u) / STEP for h in STEP * np.eye(2)], axis=-1
+            )
+            reference[left] = points + _solved(np.eye(2) + gradient, step)
+    raise AssertionError(f"the inverse mapping has not converged: {abs(step).max()} mm")
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """(n, 2) of matrices (n, 2, 2) and right-hand sides (n, 2)."""
+    (p, q), (r, s) = np.moveaxis(matrix, 0, -1)
+    x, y = right.T
+    return np.stack([s * x - q * y, p * y - r * x], axis=-1) / (p * s - q * r)[:, None]
 
 
 def image_pair(
