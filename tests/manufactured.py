@@ -101,31 +101,38 @@ def speckle(seed: int = 2, grid: PixelGrid = GRID) -> Pattern:
     return lambda x, y: exact(*grid.to_px(x, y))
 
 
-def reference_points(ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID) -> FloatArray:
-    """(rows, cols, 2): X with X + u(X) = x at the pixels x, solved to rounding by iteration."""
-
-    def displacement(points: FloatArray) -> FloatArray:
-        # Far outside the domain the polynomials run away; nothing is sampled there.
-        return ansatz.displacement_at(a, np.clip(points, (-1.5, -1.7), (1.5, 1.7)))
-
-    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1).reshape(-1, 2)
-    reference = at.copy()
-    left = np.arange(len(at))
+def inverted(
+    displacement: Callable[[FloatArray], FloatArray], at: FloatArray, tolerance: float
+) -> FloatArray:
+    """(..., 2): X with X + u(X) = x at positions x (..., 2) [mm], to a tolerance [mm]."""
+    x = at.reshape(-1, 2)
+    reference = x.copy()
+    left = np.arange(len(x))
     for n in range(300):
         points = reference[left]
         u = displacement(points)
-        step = at[left] - u - points
+        step = x[left] - u - points
         reference[left] += step
-        far = abs(step).max(axis=1) > 1e-13
+        far = abs(step).max(axis=1) > tolerance
         left, points, u, step = left[far], points[far], u[far], step[far]
         if not len(left):
-            return reference.reshape(*grid.shape, 2)
+            return reference.reshape(at.shape)
         if n < 10:  # Newton; after that, for what lies at kinks, plain fixed-point iteration
             gradient = np.stack(
                 [(displacement(points + h) - u) / STEP for h in STEP * np.eye(2)], axis=-1
             )
             reference[left] = points + _solved(np.eye(2) + gradient, step)
     raise AssertionError(f"the inverse mapping has not converged: {abs(step).max()} mm")
+
+
+def reference_points(ansatz: Ansatz, a: FloatArray, grid: PixelGrid = GRID) -> FloatArray:
+    """(rows, cols, 2): X with X + u(X) = x at the pixels x, solved to rounding."""
+
+    def displacement(points: FloatArray) -> FloatArray:
+        # Far outside the domain the polynomials run away; nothing is sampled there.
+        return ansatz.displacement_at(a, np.clip(points, (-1.5, -1.7), (1.5, 1.7)))
+
+    return inverted(displacement, np.stack(np.meshgrid(grid.x, grid.y), axis=-1), 1e-13)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:

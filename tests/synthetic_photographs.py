@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
+from manufactured import inverted
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
@@ -83,15 +84,7 @@ class Photographed:
 
     def came_from(self, displacement: Displacement) -> FloatArray:
         """(rows, cols, 2) X with X + u(X) at the pixels, to 3e-5 px."""
-        at = self.points
-        reference = at.copy()
-        for _ in range(100):
-            moved = at - displacement(reference)
-            change = float(abs(moved - reference).max())
-            reference = moved
-            if change < 3e-5 * self.grid.pixel_size:
-                return reference
-        raise AssertionError(f"the inverse mapping has not converged: {change} mm")
+        return inverted(displacement, self.points, 3e-5 * self.grid.pixel_size)
 
     def save(self, folder: Path, states: dict[str, Displacement | None]) -> None:
         """Write a photograph of each state, and of the reference."""
