@@ -138,7 +138,8 @@ class Campaign:
         """The cases as they get done, or fail for certain.
 
         A connection that breaks is made anew. Only where that fails is the scheduler gone:
-        whatever dask says of a case, no other conclusion is drawn from it.
+        whatever dask says of a case, no other conclusion is drawn from it
+        (docs/decisions/0011-campaigns-on-busy-machines.md).
         """
         left, in_vain = list(cases), 0
         while left:
