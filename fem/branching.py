@@ -60,14 +60,14 @@ def follow_branch(
             amplitude = min(wanted, reach)
             strain, guess = _predict(points, amplitude)
             constraint = Constraint(weights, critical.u, amplitude)
-            state = walker.equilibrium(strain, guess, constraint)
+            state = walker.equilibrium(strain, guess, constraint, with_modes=False)
         point = None if state is None else _branch_point(state, weights, critical.u)
         # Under prescribed strain Newton may fall back to the primary path.
         if state is None or point is None or point.amplitude < 0.2 * min(wanted, reach):
             reach = 0.5 * (points[-1].amplitude + min(wanted, reach))
             if reach - points[-1].amplitude < shortest:
                 return found
-            walker.factor = None  # it may belong to the failed state
+            walker.factor = None  # it may be that of the state refused
             continue
         points.append(point)
         reach = walker.options.growth * point.amplitude

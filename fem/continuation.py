@@ -16,11 +16,12 @@ from petsc4py import PETSc
 from modeharvest.fem.corrector import Constraint, Outcome, correct, path_tangent
 from modeharvest.fem.equilibrium import Factor, Structure
 from modeharvest.fem.experiment import PathOptions
-from modeharvest.fem.stability import Mode, modes_nearest_zero
+from modeharvest.fem.stability import Mode, lowest_modes
 from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
-MODES = 8  # computed at every equilibrium
+_MODES = 4  # computed, or all that are negative and one more
+_RESIDUAL = 1e-3  # of modes: a millionth of their eigenvalues
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class State:
 class Walker:
     """Follows the paths of one structure; the last state's factor serves the next step.
 
-    ``factor`` and ``modes`` (those nearest to zero) belong to the state settled last.
+    ``factor`` and ``modes`` (the lowest ones) belong to the state found last.
     """
 
     structure: Structure
@@ -69,25 +70,33 @@ class Walker:
         return self._settle(self.structure.zero(), 0.0)
 
     def equilibrium(
-        self, strain: float, guess: PETSc.Vec, constraint: Constraint | None = None
+        self,
+        strain: float,
+        guess: PETSc.Vec,
+        constraint: Constraint | None = None,
+        with_modes: bool = True,
     ) -> State | None:
         """The equilibrium near ``guess``, at ``strain`` or where the constraint holds.
 
         None if Newton does not get there, or gets to a state with a reversed element.
         """
         found = correct(self.structure, guess, strain, self.factor, constraint)
-        if found.outcome is not Outcome.CONVERGED:
+        if (
+            found.outcome is not Outcome.CONVERGED
+            or self.structure.smallest_jacobian(found.u) <= 0.0
+        ):
+            self.factor = None  # it may be that of a state astray
             return None
-        if self.structure.smallest_jacobian(found.u) <= 0.0:
-            return None
-        return self._settle(found.u, found.strain)
+        return self._settle(found.u, found.strain, with_modes)
 
-    def _settle(self, u: PETSc.Vec, strain: float) -> State:
-        """Factorise at a converged equilibrium: its inertia, and its rate along the path."""
+    def _settle(self, u: PETSc.Vec, strain: float, with_modes: bool = True) -> State:
+        """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
+        eigenvalues: tuple[float, ...] = ()
         self.factor = self.structure.factor(u)
+        if with_modes:
+            self.modes = lowest_modes(self.factor, self.mass, _MODES, self.modes, _RESIDUAL)
+            eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
         tangent = path_tangent(self.structure, self.factor, self.structure.load(u))
-        self.modes = modes_nearest_zero(self.structure.tangent, self.factor, self.mass, MODES)
-        eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
         return State(strain, u, tangent, self.factor.negative_pivots, eigenvalues)
 
     # -- the primary path ---------------------------------------------------------------
@@ -126,7 +135,7 @@ class Walker:
                 strain = target if pieces == 1 else here + (target - here) / pieces
                 state = self.equilibrium(strain, _extrapolate(states, strain))
                 if state is None or (refuse_unstable and state.negative_pivots > 0):
-                    self.factor = None  # it may belong to the failed state
+                    self.factor = None  # it may be that of the state refused
                     step = 0.5 * (strain - here)
                     if step < _SMALLEST_STEP:
                         return False

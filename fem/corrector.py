@@ -1,7 +1,7 @@
 """Newton's method back to equilibrium, with as few factorisations as it takes.
 
-A solve with a factor that is there costs a twentieth of a new factorisation, so the tangent
-is kept ("chord" iterations) as long as it makes the residual shrink fast enough.
+An iteration with a factor that is there costs an eighth of a new factorisation, so the tangent
+is kept ("chord" iterations) as long as that is the shorter way.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from modeharvest.fem.equilibrium import Factor, Structure
 
-_SHRINKS = 0.35  # a chord step that leaves more than this of the residual calls for a new factor
+_PATIENCE = 9  # chord iterations still to come for which a new factor isn't worth its cost
 _MAX_FACTORS = 8
 _SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
 _MAX_ITERATIONS = 60
@@ -78,14 +78,17 @@ def correct(
         Prescribe an amplitude instead of the strain.
     """
     iterate = _Iterate(structure, guess, strain, factor, constraint)
+    outcome = Outcome.SLOW
     for _ in range(_MAX_ITERATIONS):
         iterate.evaluate()
         if iterate.is_solved:
-            return Correction(iterate.u, iterate.strain, Outcome.CONVERGED)
+            outcome = Outcome.CONVERGED
+            break
         if not iterate.prepare_step():
-            return Correction(iterate.u, iterate.strain, Outcome.DIVERGED)
+            outcome = Outcome.DIVERGED
+            break
         iterate.step()
-    return Correction(iterate.u, iterate.strain, Outcome.SLOW)
+    return Correction(iterate.u, iterate.strain, outcome)
 
 
 class _Iterate:
@@ -103,23 +106,28 @@ class _Iterate:
         self.u, self.strain = guess.copy(), strain
         structure.prescribe(self.u, strain)
         self.tangent: PETSc.Vec | None = None
+        self.small = self._tolerance()
         self.factors, self.is_fresh = 0, False
         self.best = math.inf  # smallest residual so far, before the last step
         self.last: tuple[PETSc.Vec, float] | None = None  # where the last step came from
         self.share = 1.0  # of the full step, where that was too long
 
     def evaluate(self) -> None:
-        """Residual, load and the constraint's miss at the present state."""
+        """Residual and the constraint's miss at the present state."""
         self.residual = self.structure.residual(self.u)
-        self.load = self.structure.load(self.u)
         self.miss = 0.0 if self.constraint is None else self.constraint.value(self.u)
         self.size = float(self.residual.norm())
 
     @property
     def is_solved(self) -> bool:
         """Whether the residual and the constraint are within tolerance."""
-        small = STRAIN_TOLERANCE * self.load.norm()
-        return math.isfinite(self.size) and self.size <= small and abs(self.miss) <= 1e-9
+        if not (self.size <= self.small and abs(self.miss) <= 1e-9):
+            return False
+        self.small = self._tolerance()  # it was that of the guess
+        return self.size <= self.small
+
+    def _tolerance(self) -> float:
+        return STRAIN_TOLERANCE * float(self.structure.load(self.u).norm())
 
     def prepare_step(self) -> bool:
         """Decide from where, and with which factor, to step next; False to give up.
@@ -134,12 +142,19 @@ class _Iterate:
                 self.share *= 0.5
                 return self.share > _SMALLEST_SHARE
             return self._refactor()
-        slow = self.size > _SHRINKS * self.best and self.share == 1.0
+        is_slow = self.share == 1.0 and self._iterations_left > _PATIENCE
         self.share = 1.0
-        if self.factor is None or slow:
+        if self.factor is None or is_slow:
             return self._refactor()
         self.is_fresh = False
         return True
+
+    @property
+    def _iterations_left(self) -> float:
+        """How many more it will take at the rate of the last one; 0 before the first."""
+        if math.isinf(self.best):
+            return 0.0
+        return math.log(self.size / self.small) / math.log(self.best / self.size)
 
     def _refactor(self) -> bool:
         if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
@@ -157,7 +172,8 @@ class _Iterate:
         step.scale(-1.0)
         if self.constraint is not None:
             if self.tangent is None:
-                self.tangent = path_tangent(self.structure, self.factor, self.load)
+                load = self.structure.load(self.u)
+                self.tangent = path_tangent(self.structure, self.factor, load)
             weights = self.constraint.weights
             change = -(self.miss + float(weights.dot(step))) / float(weights.dot(self.tangent))
             step.axpy(change, self.tangent)

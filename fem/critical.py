@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from petsc4py import PETSc
+from scipy.optimize import brentq
 
-from modeharvest.fem.continuation import MODES, State, Walker, along, interpolate
+from modeharvest.fem.continuation import State, Walker, along, interpolate
 from modeharvest.fem.stability import Mode
 
 _SEARCHES = 20  # equilibria tried on the way to one critical point
+_NEAR = 1e-3  # of strain: the next estimate is right
 _ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to become
 
 
@@ -44,131 +45,117 @@ class Critical:
 def locate_critical(walker: Walker, low: State, high: State) -> Critical | None:
     """The first critical point between a stable state and the unstable one reached last.
 
-    Interpolates the critical eigenvalue between equilibria, within the bracket that the
-    inertia gives. Where the inertia below the point found is not zero, another mode
-    became critical earlier, and that one is looked for. None if an equilibrium in
-    between can't be found, or if no eigenvalue passes zero: then the two states are not on
-    one path.
+    Any field's curvature x . K x is above the lowest eigenvalue, by the square of what it is off
+    the mode. So the strain where it passes zero on the interpolated path, the least one for the
+    modes known, is an estimate from above. An equilibrium there gives better modes, and the next
+    estimate's error goes with the square of this one's. Two equilibria a tolerance below and
+    above are the proof; where the inertia below isn't zero, another mode became critical
+    earlier, and the search goes on.
+
+    None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the
+    two states are not on one path.
     """
-    modes = walker.modes
-    for _ in range(MODES):
-        found = _approach(walker, low, high, modes)
-        if found is None:
-            return None
-        low, critical, below = found
-        (_, first), (_, last) = critical.eigenvalues[0], critical.eigenvalues[-1]
-        if abs(last) > _ZERO * abs(first):
-            return None
-        if below is None or below.negative_pivots == 0:
+    search = _Search(walker, low, high)
+    for k in range(_SEARCHES):
+        walker.progress(k, 4, "critical point")
+        estimate = search.estimate()
+        is_near = estimate is not None and abs(estimate - search.latest) < _NEAR
+        if estimate is None or (k % 3 == 2 and not is_near):
+            estimate = 0.5 * (search.low.strain + search.high.strain)
+        if not is_near:
+            if search.step(estimate) is None:
+                return None
+            continue
+        critical = search.prove(estimate)
+        if critical is not None or search.is_over:
             return critical
-        high, modes = below, walker.modes
     return None
 
 
-def _approach(
-    walker: Walker, low: State, high: State, modes: list[Mode]
-) -> tuple[State, Critical, State | None] | None:
-    """A critical point between the states, the last stable state, the one just below it.
+class _Search:
+    """A bracket of the first critical point, and the modes that may become critical in it.
 
-    ``modes`` are those at ``high``; afterwards ``walker.modes`` are those just below.
+    ``latest`` is the strain of the state reached last; ``is_over`` says that there is no point.
     """
-    narrowed = _with_negative_mode(walker, low, high, modes)
-    if narrowed is None:
-        return None
-    low, high, modes = narrowed
-    estimate, critical = _first_crossing(walker, low, high, modes)
-    history = [(high.strain, critical.eigenvalue)]
-    state = high
-    for k in range(_SEARCHES):
-        walker.progress(k, 6, "critical point")
-        if not low.strain < estimate < high.strain:  # it followed a mode that is later
-            estimate, critical = _first_crossing(walker, low, high, modes)
-            history = [(high.strain, critical.eigenvalue)]
-        if not low.strain < estimate < high.strain:
-            estimate = 0.5 * (low.strain + high.strain)
-        found = walker.equilibrium(estimate, interpolate(low, high, estimate))
-        if found is None:
+
+    def __init__(self, walker: Walker, low: State, high: State) -> None:
+        self.walker, self.low, self.high = walker, low, high
+        self.latest, self.is_over = high.strain, False
+        self._visited = [(high, walker.modes)]
+        self._offs: list[float] = []  # of the unstable states reached, from the next estimate
+        self._candidates = [mode for mode in walker.modes if mode.eigenvalue < 0]
+
+    def estimate(self) -> float | None:
+        """Where the curvature of a candidate first passes zero; None if none does."""
+        low, strain = self.low.strain, self.high.strain
+        tolerance = 0.1 * self.walker.options.critical_tolerance
+        for mode in self._candidates:
+            if self._curvature(strain, mode) < 0 < self._curvature(low, mode):
+                strain = float(brentq(self._curvature, low, strain, (mode,), tolerance))
+        if strain == self.high.strain:
             return None
-        state, nearby = found, walker.modes
-        critical = max(nearby, key=lambda mode: abs(mode.overlap(critical.vector)))
-        history.append((state.strain, critical.eigenvalue))
-        if state.negative_pivots:
-            high, modes = state, nearby if _has_negative(nearby) else modes
-        else:
-            low = state
-        previous, estimate = estimate, _root(history)
-        if abs(estimate - previous) < walker.options.critical_tolerance:
-            break
-    return low, *_prove(walker, estimate, state, nearby, history)
+        if self.latest == self.high.strain:
+            self._offs.append(self.latest - strain)
+            if len(self._offs) > 1:
+                before, off = sum(self._offs[-2:]), self._offs[-1]
+                strain -= off * (off / before) ** 2
+        return strain
 
+    def _curvature(self, strain: float, mode: Mode) -> float:
+        u = interpolate(self.low, self.high, strain)
+        return self.walker.structure.curvature(u, mode.vector)
 
-def _with_negative_mode(
-    walker: Walker, low: State, high: State, modes: list[Mode]
-) -> tuple[State, State, list[Mode]] | None:
-    """The bracket, halved until the modes at its end tell which one is negative there.
-
-    A mode that is just critical hides those further from zero: next to its inverse eigenvalue,
-    theirs are lost in the eigensolver's tolerance.
-    """
-    while not _has_negative(modes):
-        if high.strain - low.strain < walker.options.critical_tolerance:
-            return None
-        strain = 0.5 * (low.strain + high.strain)
-        state = walker.equilibrium(strain, interpolate(low, high, strain))
+    def step(self, strain: float) -> State | None:
+        """An equilibrium within the bracket, which becomes one of its ends; None if not found."""
+        state = self.walker.equilibrium(strain, interpolate(self.low, self.high, strain))
         if state is None:
             return None
+        modes, self.latest = self.walker.modes, strain
+        self._visited.append((state, modes))
+        negative = [mode for mode in modes if mode.eigenvalue < 0]
         if state.negative_pivots:
-            high, modes = state, walker.modes
+            self.high, self._candidates = state, negative
         else:
-            low = state
-    return low, high, modes
+            self.low, self._candidates = state, [*self._candidates, *modes[:1]]
+        return state
+
+    def prove(self, strain: float) -> Critical | None:
+        """The critical point near a strain, if the inertia on both sides says that it is the first.
+
+        If not, the bracket is smaller, or there is nothing more to look for.
+        """
+        walker, tolerance = self.walker, self.walker.options.critical_tolerance
+        below = self.step(strain - tolerance)
+        if below is None or below.negative_pivots:
+            self.is_over = below is None
+            return None
+        mode, *_ = modes = walker.modes
+        guess = along(below, strain + tolerance)
+        above = walker.equilibrium(strain + tolerance, guess, with_modes=False)
+        if above is None or not above.negative_pivots:
+            self.low, self.is_over = above or below, above is None
+            return None
+        beyond = walker.structure.curvature(above.u, mode.vector)
+        values = [(s.strain, _alike(mode, known).eigenvalue) for s, known in self._visited]
+        values.append((above.strain, beyond))
+        (last, final), (far, first) = values[-2], values[0]
+        # In proportion to the distance, unless the two states are not on one path.
+        share = 10 * tolerance / (far - last)
+        if final > max(share, _ZERO) * abs(first):
+            self.is_over = True
+            return None
+        if beyond < 0:
+            strain = last + 2 * tolerance * final / (final - beyond)
+        return Critical(
+            strain,
+            along(below, strain),
+            modes,
+            values,
+            below.negative_pivots,
+            above.negative_pivots,
+        )
 
 
-def _has_negative(modes: list[Mode]) -> bool:
-    return any(mode.eigenvalue < 0 for mode in modes)
-
-
-def _first_crossing(
-    walker: Walker, low: State, high: State, modes: list[Mode]
-) -> tuple[float, Mode]:
-    """Of the modes negative at ``high``: where the first one crosses zero, and which.
-
-    At ``low`` the eigenvalue is estimated by the mode's Rayleigh quotient.
-    """
-    stiffness = walker.structure.stiffness(low.u)
-    crossings = []
-    for mode in (m for m in modes if m.eigenvalue < 0):
-        quotient = float(mode.vector.dot(stiffness * mode.vector))
-        points = [(low.strain, quotient), (high.strain, mode.eigenvalue)]
-        crossings.append((_root(points), mode))
-    return min(crossings, key=lambda crossing: crossing[0])
-
-
-def _prove(
-    walker: Walker,
-    strain: float,
-    near: State,
-    modes: list[Mode],
-    history: list[tuple[float, float]],
-) -> tuple[Critical, State | None]:
-    """The inertia a tolerance above and below the critical strain; the state below."""
-    tolerance = walker.options.critical_tolerance
-    above, below = (
-        walker.equilibrium(strain + side, along(near, strain + side))
-        for side in (tolerance, -tolerance)
-    )
-    counts = (-1 if state is None else state.negative_pivots for state in (below, above))
-    modes = sorted(modes, key=lambda mode: abs(mode.eigenvalue))
-    return Critical(strain, along(near, strain), modes, history, *counts), below
-
-
-def _root(points: Sequence[tuple[float, float]]) -> float:
-    """Strain of zero eigenvalue by inverse interpolation through the last three points."""
-    strains, values = (np.array(column) for column in zip(*points[-3:], strict=True))
-    if len(strains) == 1:
-        return float(strains[0])
-    weights = [
-        np.prod([values[j] / (values[j] - values[i]) for j in range(len(values)) if j != i])
-        for i in range(len(values))
-    ]
-    return float(np.dot(weights, strains))
+def _alike(mode: Mode, modes: Sequence[Mode]) -> Mode:
+    """That one of the modes of another state which is most like a mode."""
+    return max(modes, key=lambda other: abs(mode.overlap(other.vector)))

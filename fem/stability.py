@@ -6,13 +6,22 @@ which can't miss a mode. The eigenpairs say which mode it is and how far from ze
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
-from slepc4py import SLEPc
 
 from modeharvest.fem.equilibrium import Factor
+
+FloatArray = NDArray[np.float64]
+
+_NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
+_MOST_NEGATIVE = 24  # of the modes that are computed
+_LARGEST_SPACE = 60  # in blocks
+_DEPENDENT = 1e-12  # what is left of a vector's squared length where nothing is left
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,61 +51,132 @@ class Mode:
         return Mode(self.eigenvalue, -self.vector, -self.weighted)
 
 
-class _Solve:
-    """A preconditioner that is the exact inverse: the factor at hand."""
-
-    def __init__(self, factor: Factor) -> None:
-        self._factor = factor
-
-    def apply(self, _: Any, rhs: PETSc.Vec, solution: PETSc.Vec) -> None:
-        self._factor.solve(rhs).copy(solution)
-
-
-def modes_nearest_zero(
-    stiffness: PETSc.Mat, factor: Factor, mass: PETSc.Mat, count: int
+def lowest_modes(
+    factor: Factor,
+    mass: PETSc.Mat,
+    count: int,
+    near: Sequence[Mode] = (),
+    tolerance: float = 1e-10,
 ) -> list[Mode]:
-    """The ``count`` modes whose eigenvalues are nearest to zero, by ascending eigenvalue.
+    """The lowest modes, by ascending eigenvalue: all negative ones, and at least one positive.
 
-    Shift-and-invert Lanczos about zero with the factor that is there already, so no further
-    factorisation is needed. Deterministic: the start vector is fixed.
+    Lanczos' method in blocks with the inverse of the stiffness, whose factor is there already. The
+    inertia says how many negative eigenvalues there are to be found; of more than 24 only those
+    nearest to zero are. Deterministic.
 
     Parameters
     ----------
-    stiffness, factor
-        Tangent stiffness and its factor.
+    factor
+        Of the tangent stiffness.
     mass
         Mass matrix with zero rows at the constrained components.
     count
-        Number of modes wanted; at least as many are returned unless the problem is smaller.
+        Number of modes wanted; more are returned if more are negative.
+    near
+        Modes of a state nearby, as a start.
+    tolerance
+        By which a mode may be mixed with others, for that with the largest eigenvalue; less for
+        those nearer to zero. Relative errors of eigenvalues go with its square.
     """
-    solver = SLEPc.EPS().create(mass.comm)
-    solver.setOperators(stiffness, mass)
-    solver.setProblemType(SLEPc.EPS.ProblemType.GHEP)
-    transform = solver.getST()
-    transform.setType(SLEPc.ST.Type.SINVERT)
-    ksp = transform.getKSP()
-    ksp.setType(PETSc.KSP.Type.PREONLY)
-    ksp.getPC().setType(PETSc.PC.Type.PYTHON)
-    ksp.getPC().setPythonContext(_Solve(factor))
-    solver.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
-    solver.setTarget(0.0)
-    solver.setDimensions(count)
-    solver.setTolerances(1e-8, 200)
-    solver.setPurify(False)  # the start vector is in the range of K^-1 M already
-    start = mass.createVecRight()
-    first, last = start.getOwnershipRange()
-    start.array[:] = [((k * 7919) % 1009) / 1009.0 - 0.5 for k in range(first, last)]
-    solver.setInitialSpace([factor.solve(mass * start)])
-    solver.solve()
-    modes = [_mode(solver, mass, k) for k in range(solver.getConverged())]
+    negative = min(factor.negative_pivots, _MOST_NEGATIVE)
+    positive = max(count - negative, 1)
+    krylov = _Krylov(factor, mass, _start(mass, count, near))
+    for _ in range(_LARGEST_SPACE):
+        krylov.grow()
+        inverse, mix = np.linalg.eigh(krylov.projected)
+        place = np.arange(len(inverse))
+        wanted = np.where(inverse < 0, place < negative, place >= len(place) - positive)
+        residual = np.linalg.norm(krylov.rest @ mix[-krylov.rest.shape[1] :], axis=0)
+        are_there = np.sum(wanted) == negative + positive
+        if krylov.is_exhausted or (
+            are_there and residual[wanted].max() <= tolerance * np.abs(inverse[wanted]).min()
+        ):
+            break
+    vectors, weighted = mix[:, wanted].T @ krylov.vectors, mix[:, wanted].T @ krylov.images
+    modes = [
+        Mode(1.0 / float(value), _distributed(mass, x), _distributed(mass, y))
+        for value, x, y in zip(inverse[wanted], vectors, weighted, strict=True)
+    ]
     return sorted(modes, key=lambda mode: mode.eigenvalue)
 
 
-def _mode(solver: Any, mass: PETSc.Mat, k: int) -> Mode:
+class _Krylov:
+    """A space that grows by blocks of K^-1 M times the last.
+
+    Vectors are rows, of which every rank has its columns: ``vectors`` (k, n) are M-orthonormal,
+    ``images`` are M times them, ``projected`` (k, k) is K^-1 M within the space, and ``rest``
+    says by which combinations of the vectors to come K^-1 M leads out of it.
+    """
+
+    def __init__(self, factor: Factor, mass: PETSc.Mat, start: FloatArray) -> None:
+        self._factor, self._mass = factor, mass
+        self._comm = mass.comm.tompi4py()
+        self.vectors = self.images = start[:0]
+        self.projected: FloatArray = np.zeros((0, 0))
+        self._next = self._orthonormal(start)
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether K^-1 M does not lead out of the space any more."""
+        return len(self._next[0]) == 0
+
+    def grow(self) -> None:
+        """Take the next block in, and make the one to come."""
+        old, (block, image) = len(self.projected), self._next
+        self.vectors = np.vstack([self.vectors, block])
+        self.images = np.vstack([self.images, image])
+        ahead = self._applied(self._factor.solve_block, image)
+        column = self._products(self.images, ahead)
+        projected = np.zeros((len(column), len(column)))
+        projected[:old, :old] = self.projected
+        projected[:, old:], projected[old:, :] = column, column.T
+        projected[old:, old:] = 0.5 * (column[old:] + column[old:].T)
+        self.projected = projected
+        self._next = self._orthonormal(ahead - column.T @ self.vectors)
+        self.rest = self._products(self._next[1], ahead)
+
+    def _orthonormal(self, block: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """An M-orthonormal basis of a block that the space lacks, and M times it.
+
+        What rounding left of the space is taken out of the basis, which is then made anew
+        (Stathopoulos & Wu, SIAM J. Sci. Comput. 23 (2002) 2165-2182).
+        """
+        block, image = self._normalised(block, self._applied(self._mass.matMult, block))
+        known = self._products(block, self.images)
+        return self._normalised(block - known @ self.vectors, image - known @ self.images)
+
+    def _normalised(self, block: FloatArray, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal combinations of vectors; those that depend on others are left out."""
+        gram = self._products(block, image)
+        size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        squares, turn = np.linalg.eigh(gram / np.outer(size, size))
+        kept = squares > _DEPENDENT
+        change = (turn[:, kept] / np.sqrt(squares[kept]) / size[:, None]).T
+        return change @ block, change @ image
+
+    def _applied(self, operator: Callable[[PETSc.Mat], PETSc.Mat], block: FloatArray) -> FloatArray:
+        """A linear operator on the vectors of a block."""
+        size = (self._mass.getSizes()[0], (PETSc.DECIDE, len(block)))
+        columns = PETSc.Mat().createDense(size, array=block.T, comm=self._mass.comm)
+        result = operator(columns)  # named, because its array doesn't keep it alive
+        return np.array(result.getDenseArray().T)
+
+    def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """All inner products of two sets of vectors, over all ranks."""
+        products = left @ right.T
+        self._comm.Allreduce(MPI.IN_PLACE, products)
+        return np.asarray(products)
+
+
+def _start(mass: PETSc.Mat, count: int, near: Sequence[Mode]) -> FloatArray:
+    """The modes given and vectors at random, zero at the constrained components."""
+    free = mass.getDiagonal().array != 0
+    width = _NOISE if near else count
+    noise = np.random.default_rng(mass.comm.rank).standard_normal((width, len(free)))
+    return np.vstack([*(mode.vector.array for mode in near), noise * free])
+
+
+def _distributed(mass: PETSc.Mat, values: FloatArray) -> PETSc.Vec:
     vector = mass.createVecRight()
-    eigenvalue = solver.getEigenpair(k, vector).real
-    weighted = mass * vector
-    norm = vector.dot(weighted) ** 0.5
-    vector.scale(1.0 / norm)
-    weighted.scale(1.0 / norm)
-    return Mode(float(eigenvalue), vector, weighted)
+    vector.array[:] = values
+    return vector
