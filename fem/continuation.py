@@ -67,7 +67,8 @@ class Walker:
 
     def start(self) -> State:
         """The undeformed state."""
-        return self._settle(self.structure.zero(), 0.0)
+        u = self.structure.zero()
+        return self._settle(u, 0.0, self.structure.load(u))
 
     def equilibrium(
         self,
@@ -87,16 +88,18 @@ class Walker:
         ):
             self.factor = None  # it may be that of a state astray
             return None
-        return self._settle(found.u, found.strain, with_modes)
+        return self._settle(found.u, found.strain, found.load, with_modes)
 
-    def _settle(self, u: PETSc.Vec, strain: float, with_modes: bool = True) -> State:
+    def _settle(
+        self, u: PETSc.Vec, strain: float, load: PETSc.Vec, with_modes: bool = True
+    ) -> State:
         """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
         eigenvalues: tuple[float, ...] = ()
         self.factor = self.structure.factor(u)
         if with_modes:
             self.modes = lowest_modes(self.factor, self.mass, _MODES, self.modes, _RESIDUAL)
             eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
-        tangent = path_tangent(self.structure, self.factor, self.structure.load(u))
+        tangent = path_tangent(self.structure, self.factor, load)
         return State(strain, u, tangent, self.factor.negative_pivots, eigenvalues)
 
     # -- the primary path ---------------------------------------------------------------

@@ -7,7 +7,7 @@ is kept ("chord" iterations) as long as that is the shorter way.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from petsc4py import PETSc
@@ -48,10 +48,11 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Where Newton's method arrived: displacement, nominal strain, and why it stopped."""
+    """Where Newton's method arrived, the load there (see ``Structure.load``), why it stopped."""
 
     u: PETSc.Vec
     strain: float
+    load: PETSc.Vec
     outcome: Outcome
 
 
@@ -84,15 +85,19 @@ def correct(
         if iterate.is_solved:
             outcome = Outcome.CONVERGED
             break
-        if not iterate.prepare_step():
+        if not iterate.advance():
             outcome = Outcome.DIVERGED
             break
-        iterate.step()
-    return Correction(iterate.u, iterate.strain, outcome)
+    return Correction(iterate.u, iterate.strain, iterate.load, outcome)
 
 
 class _Iterate:
-    """A Newton iteration under way: where it is, and how the last step went."""
+    """A Newton iteration under way: where it is, and the step that led there.
+
+    A step is judged by the next one that the same factor would make from there, which is
+    a measure of the error in millimetres (natural monotonicity: Deuflhard, Newton Methods for
+    Nonlinear Problems, Springer 2011, section 2.1); residuals are governed by what is stiff.
+    """
 
     def __init__(
         self,
@@ -106,11 +111,9 @@ class _Iterate:
         self.u, self.strain = guess.copy(), strain
         structure.prescribe(self.u, strain)
         self.tangent: PETSc.Vec | None = None
-        self.small = self._tolerance()
-        self.factors, self.is_fresh = 0, False
-        self.best = math.inf  # smallest residual so far, before the last step
-        self.last: tuple[PETSc.Vec, float] | None = None  # where the last step came from
-        self.share = 1.0  # of the full step, where that was too long
+        self._weigh()
+        self.factors = 0
+        self.last: _Step | None = None
 
     def evaluate(self) -> None:
         """Residual and the constraint's miss at the present state."""
@@ -123,63 +126,82 @@ class _Iterate:
         """Whether the residual and the constraint are within tolerance."""
         if not (self.size <= self.small and abs(self.miss) <= 1e-9):
             return False
-        self.small = self._tolerance()  # it was that of the guess
+        self._weigh()  # the tolerance was that of the guess
         return self.size <= self.small
 
-    def _tolerance(self) -> float:
-        return STRAIN_TOLERANCE * float(self.structure.load(self.u).norm())
+    def _weigh(self) -> None:
+        """The load at the present state, which says how small a residual has to be."""
+        self.load = self.structure.load(self.u)
+        self.small = STRAIN_TOLERANCE * float(self.load.norm())
 
-    def prepare_step(self) -> bool:
-        """Decide from where, and with which factor, to step next; False to give up.
-
-        A step that did not lower the residual is taken back: it is halved if its factor was
-        fresh, and tried with a fresh factor otherwise.
-        """
-        if self.last is not None and not self.size < self.best:
-            self.u, self.strain = self.last[0].copy(), self.last[1]
-            self.evaluate()
-            if self.is_fresh:
-                self.share *= 0.5
-                return self.share > _SMALLEST_SHARE
-            return self._refactor()
-        is_slow = self.share == 1.0 and self._iterations_left > _PATIENCE
-        self.share = 1.0
-        if self.factor is None or is_slow:
-            return self._refactor()
-        self.is_fresh = False
+    def advance(self) -> bool:
+        """Take the next step, with a new factor where that pays; False to give up."""
+        last, step = self.last, None
+        if self.factor is not None and math.isfinite(self.size):
+            step = self._step(is_fresh=False)
+        rate = 0.0 if last is None else math.inf
+        if last is not None and step is not None:
+            rate = step.length / last.length
+        if last is not None and not rate < 1.0:
+            self.u, self.strain = last.start.copy(), last.strain
+            if last.is_fresh:
+                step = last.halved()
+                if step.share < _SMALLEST_SHARE:
+                    return False
+            else:
+                self.evaluate()
+                step = None
+        elif self._iterations_left(rate) > _PATIENCE:
+            step = None
+        if step is None:
+            if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
+                return False
+            self.factor, self.tangent = self.structure.factor(self.u), None
+            self.factors += 1
+            self._weigh()
+            step = self._step(is_fresh=True)
+        self._take(step)
         return True
 
-    @property
-    def _iterations_left(self) -> float:
-        """How many more it will take at the rate of the last one; 0 before the first."""
-        if math.isinf(self.best):
-            return 0.0
-        return math.log(self.size / self.small) / math.log(self.best / self.size)
+    def _iterations_left(self, rate: float) -> float:
+        """How many more it will take if each leaves this much of the error."""
+        left = max(math.log(self.size / self.small), 0.0)
+        return left / -math.log(rate) if rate > 0.0 else 0.0
 
-    def _refactor(self) -> bool:
-        if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
-            return False
-        self.factor, self.tangent = self.structure.factor(self.u), None
-        self.factors += 1
-        self.is_fresh = True
-        return True
-
-    def step(self) -> None:
-        """Move by (a share of) the Newton step, along the constraint if there is one."""
+    def _step(self, is_fresh: bool) -> _Step:
+        """The Newton step with the factor at hand, along the constraint if there is one."""
         assert self.factor is not None
-        self.best, self.last = self.size, (self.u.copy(), self.strain)
         step, change = self.factor.solve(self.residual), 0.0
         step.scale(-1.0)
         if self.constraint is not None:
             if self.tangent is None:
-                load = self.structure.load(self.u)
-                self.tangent = path_tangent(self.structure, self.factor, load)
+                self.tangent = path_tangent(self.structure, self.factor, self.load)
             weights = self.constraint.weights
             change = -(self.miss + float(weights.dot(step))) / float(weights.dot(self.tangent))
             step.axpy(change, self.tangent)
-        self.u.axpy(self.share, step)
-        self.strain += self.share * change
+        return _Step(self.u, self.strain, step, change, float(step.norm()), is_fresh)
+
+    def _take(self, step: _Step) -> None:
+        self.u, self.last = step.start.copy(), step
+        self.u.axpy(step.share, step.direction)
+        self.strain = step.strain + step.share * step.change
         self.structure.prescribe(self.u, self.strain)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step from a state, and whether the tangent there was factorised for it."""
+
+    start: PETSc.Vec
+    strain: float
+    direction: PETSc.Vec
+    change: float
+    length: float
+    is_fresh: bool
+    share: float = 1.0
+
+    def halved(self) -> _Step:
+        return replace(self, share=0.5 * self.share)
 
 
 def path_tangent(structure: Structure, factor: Factor, load: PETSc.Vec) -> PETSc.Vec:

@@ -77,7 +77,7 @@ class _Run:
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _primary(self) -> tuple[list[State], Critical | None]:
-        """The primary path through all strains, and where it becomes unstable.
+        """The primary path, and where it becomes unstable; beyond that only if it is asked for.
 
         Without a bifurcation there is one natural path, which bends where the pattern sets in:
         in an imperfect specimen, under tilted loading, and in a specimen with an odd number of
@@ -92,7 +92,8 @@ class _Run:
                 return path, None
             critical = locate_critical(self.walker, path[-2], path[-1])
             if critical is not None:
-                self.walker.primary(path, strains)
+                if "primary" in self.experiment.branches:
+                    self.walker.primary(path, strains)
                 return path, critical
             path.pop()
             self.walker.factor = None
