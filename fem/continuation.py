@@ -20,7 +20,7 @@ from modeharvest.fem.stability import Mode, lowest_modes
 from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
-_MODES = 4  # computed, or all that are negative and one more
+_MODES = 3  # computed, or all that are negative and one more
 _RESIDUAL = 1e-3  # of modes: a millionth of their eigenvalues
 
 

@@ -1,6 +1,6 @@
 """Newton's method back to equilibrium, with as few factorisations as it takes.
 
-An iteration with a factor that is there costs an eighth of a new factorisation, so the tangent
+An iteration with a factor that is there costs an eighth of a new one, so the tangent
 is kept ("chord" iterations) as long as that is the shorter way.
 """
 
@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from modeharvest.fem.equilibrium import Factor, Structure
 
-_PATIENCE = 9  # chord iterations still to come for which a new factor isn't worth its cost
+_PATIENCE = 12  # chord iterations still to come for which a new factor isn't worth its cost
 _MAX_FACTORS = 8
 _SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
 _MAX_ITERATIONS = 60

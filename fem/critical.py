@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from petsc4py import PETSc
 from scipy.optimize import brentq
@@ -89,9 +90,10 @@ class _Search:
         """Where the curvature of a candidate first passes zero; None if none does."""
         low, strain = self.low.strain, self.high.strain
         tolerance = 0.1 * self.walker.options.critical_tolerance
+        curvature = cache(self._curvature)
         for mode in self._candidates:
-            if self._curvature(strain, mode) < 0 < self._curvature(low, mode):
-                strain = float(brentq(self._curvature, low, strain, (mode,), tolerance))
+            if curvature(strain, mode) < 0 < curvature(low, mode):
+                strain = float(brentq(curvature, low, strain, (mode,), tolerance))
         if strain == self.high.strain:
             return None
         if self.latest == self.high.strain:

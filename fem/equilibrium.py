@@ -85,8 +85,6 @@ class Factor:
         self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
         self._factor.setMumpsIcntl(24, 1)  # null pivots are detected instead of divided by
         self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
-        if matrix.comm.size == 1:
-            self._factor.setMumpsIcntl(7, 0)  # approximate minimum degree: quickly found
         self.update()
 
     def update(self) -> None:

@@ -37,10 +37,10 @@ class PathOptions:
         Most by which the mode's amplitude may grow in one step along the branch [-].
     """
 
-    first_step: float = 0.026
-    largest_step: float = 0.03
+    first_step: float = 0.04
+    largest_step: float = 0.04
     critical_tolerance: float = 1e-7
-    first_amplitude: float = 0.04
+    first_amplitude: float = 0.08
     growth: float = 2.0
 
     def __post_init__(self) -> None:

@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 _NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
 _MOST_NEGATIVE = 24  # of the modes that are computed
 _LARGEST_SPACE = 60  # in blocks
-_DEPENDENT = 1e-12  # what is left of a vector's squared length where nothing is left
+_ROOM = 48  # in vectors, at first
+_LITTLE, _DEPENDENT = 1e-4, 1e-12  # left of a vector's squared length: little, nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +112,17 @@ class _Krylov:
     def __init__(self, factor: Factor, mass: PETSc.Mat, start: FloatArray) -> None:
         self._factor, self._mass = factor, mass
         self._comm = mass.comm.tompi4py()
-        self.vectors = self.images = start[:0]
+        self._rows = np.empty((2, _ROOM, start.shape[1]))
         self.projected: FloatArray = np.zeros((0, 0))
         self._next = self._orthonormal(start)
+
+    @property
+    def vectors(self) -> FloatArray:
+        return self._rows[0, : len(self.projected)]
+
+    @property
+    def images(self) -> FloatArray:
+        return self._rows[1, : len(self.projected)]
 
     @property
     def is_exhausted(self) -> bool:
@@ -122,37 +131,45 @@ class _Krylov:
 
     def grow(self) -> None:
         """Take the next block in, and make the one to come."""
-        old, (block, image) = len(self.projected), self._next
-        self.vectors = np.vstack([self.vectors, block])
-        self.images = np.vstack([self.images, image])
-        ahead = self._applied(self._factor.solve_block, image)
+        old, new = len(self.projected), len(self.projected) + len(self._next[0])
+        while new > self._rows.shape[1]:
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)], axis=1)
+        self._rows[:, old:new] = self._next
+        ahead = self._applied(self._factor.solve_block, self._rows[1, old:new])
+        self.projected = np.pad(self.projected, (0, new - old))
         column = self._products(self.images, ahead)
-        projected = np.zeros((len(column), len(column)))
-        projected[:old, :old] = self.projected
-        projected[:, old:], projected[old:, :] = column, column.T
-        projected[old:, old:] = 0.5 * (column[old:] + column[old:].T)
-        self.projected = projected
+        self.projected[:, old:], self.projected[old:, :] = column, column.T
+        self.projected[old:, old:] = 0.5 * (column[old:] + column[old:].T)
         self._next = self._orthonormal(ahead - column.T @ self.vectors)
         self.rest = self._products(self._next[1], ahead)
 
     def _orthonormal(self, block: FloatArray) -> tuple[FloatArray, FloatArray]:
         """An M-orthonormal basis of a block that the space lacks, and M times it.
 
-        What rounding left of the space is taken out of the basis, which is then made anew
-        (Stathopoulos & Wu, SIAM J. Sci. Comput. 23 (2002) 2165-2182).
+        Where little was left of some vectors it is mostly rounding: what it has of the space is
+        taken out, and the basis made anew (Stathopoulos & Wu, SIAM J. Sci. Comput. 23 (2002)
+        2165-2182).
         """
-        block, image = self._normalised(block, self._applied(self._mass.matMult, block))
-        known = self._products(block, self.images)
-        return self._normalised(block - known @ self.vectors, image - known @ self.images)
+        block, image, left = self._normalised(block, self._applied(self._mass.matMult, block))
+        if left < _LITTLE:
+            known = self._products(block, self.images)
+            block, image = block - known @ self.vectors, image - known @ self.images
+            block, image, _ = self._normalised(block, image)
+        return block, image
 
-    def _normalised(self, block: FloatArray, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal combinations of vectors; those that depend on others are left out."""
+    def _normalised(
+        self, block: FloatArray, image: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Orthonormal combinations of vectors; those that depend on others are left out.
+
+        And what was least left of a vector's squared length.
+        """
         gram = self._products(block, image)
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         squares, turn = np.linalg.eigh(gram / np.outer(size, size))
         kept = squares > _DEPENDENT
         change = (turn[:, kept] / np.sqrt(squares[kept]) / size[:, None]).T
-        return change @ block, change @ image
+        return change @ block, change @ image, float(squares[0])
 
     def _applied(self, operator: Callable[[PETSc.Mat], PETSc.Mat], block: FloatArray) -> FloatArray:
         """A linear operator on the vectors of a block."""
