@@ -20,8 +20,9 @@ from modeharvest.fem.stability import Mode, lowest_modes
 from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
+_STRETCH = 0.1  # of a step, by which steps may be longer if one is saved
 _MODES = 3  # computed, or all that are negative and one more
-_RESIDUAL = 1e-3  # of modes: a millionth of their eigenvalues
+_RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ class Walker:
         for target in (t for t in targets if t > states[-1].strain + 1e-12):
             while states[-1].strain < target - 1e-12:
                 here = states[-1].strain
-                pieces = max(1, int(np.ceil((target - here) / step - 1e-9)))
+                pieces = max(1, int(np.ceil((target - here) / step - _STRETCH)))
                 strain = target if pieces == 1 else here + (target - here) / pieces
                 state = self.equilibrium(strain, _extrapolate(states, strain))
                 if state is None or (refuse_unstable and state.negative_pivots > 0):

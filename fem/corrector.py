@@ -158,7 +158,8 @@ class _Iterate:
                 return False
             self.factor, self.tangent = self.structure.factor(self.u), None
             self.factors += 1
-            self._weigh()
+            if self.constraint is not None:
+                self._weigh()
             step = self._step(is_fresh=True)
         self._take(step)
         return True
