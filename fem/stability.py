@@ -112,7 +112,7 @@ class _Krylov:
     def __init__(self, factor: Factor, mass: PETSc.Mat, start: FloatArray) -> None:
         self._factor, self._mass = factor, mass
         self._comm = mass.comm.tompi4py()
-        self._rows = np.empty((2, _ROOM, start.shape[1]))
+        self._rows: FloatArray = np.empty((2, _ROOM, start.shape[1]))
         self.projected: FloatArray = np.zeros((0, 0))
         self._next = self._orthonormal(start)
 
