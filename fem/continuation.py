@@ -20,6 +20,7 @@ from modeharvest.fem.stability import Mode, lowest_modes
 from modeharvest.progress import Progress, silent
 
 _SMALLEST_STEP = 1e-5  # of nominal strain
+_MISS = 0.2  # of a step, by which a prediction may be off on a path without a bifurcation
 _STRETCH = 0.1  # of a step, by which steps may be longer if one is saved
 _MODES = 3  # computed, or all that are negative and one more
 _RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
@@ -123,8 +124,8 @@ class Walker:
         until_unstable
             Stop after the first state with negative pivots.
         refuse_unstable
-            Take a step that lands on an unstable state for a slip off a stable path (that of
-            an imperfect specimen) and shorten it.
+            Take a step that lands on an unstable state, or far from where it was expected, for a
+            slip off a stable path (that of an imperfect specimen) and shorten it.
 
         Returns
         -------
@@ -137,8 +138,9 @@ class Walker:
                 here = states[-1].strain
                 pieces = max(1, int(np.ceil((target - here) / step - _STRETCH)))
                 strain = target if pieces == 1 else here + (target - here) / pieces
-                state = self.equilibrium(strain, _extrapolate(states, strain))
-                if state is None or (refuse_unstable and state.negative_pivots > 0):
+                guess = _extrapolate(states, strain)
+                state = self.equilibrium(strain, guess)
+                if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
                     self.factor = None  # it may be that of the state refused
                     step = 0.5 * (strain - here)
                     if step < _SMALLEST_STEP:
@@ -150,6 +152,11 @@ class Walker:
                 if until_unstable and state.negative_pivots > 0:
                     return True
         return True
+
+
+def _is_slip(before: State, state: State, guess: PETSc.Vec) -> bool:
+    step, miss = state.u - before.u, state.u - guess
+    return bool(state.negative_pivots > 0 or miss.norm() > _MISS * step.norm())
 
 
 def _extrapolate(states: Sequence[State], strain: float) -> PETSc.Vec:
