@@ -33,9 +33,9 @@ from modeharvest.validation.study import Measured, validate
 
 STAGES = ("fem", "image", "correlate", "validate")
 _NO_DOLFINX = (
-    "the finite-element stage needs dolfinx >= 0.9, slepc4py and gmsh: install them with 'conda "
-    "install -c conda-forge fenics-dolfinx slepc4py python-gmsh' or, on Debian 13, 'apt install "
-    "python3-dolfinx python3-slepc4py python3-gmsh python3-h5py-mpi'; or take a solution "
+    "the finite-element stage needs dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda "
+    "install -c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'; or take a solution "
     "made elsewhere: --solution FILE"
 )
 

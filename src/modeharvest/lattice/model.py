@@ -14,9 +14,9 @@ if TYPE_CHECKING:  # their modules need dolfinx
     from modeharvest.fem.lattices import UnitCell
 
 _NO_DOLFINX = (
-    "infinite lattices need dolfinx >= 0.9, slepc4py and gmsh: install them with 'conda install "
-    "-c conda-forge fenics-dolfinx slepc4py python-gmsh' or, on Debian 13, 'apt install "
-    "python3-dolfinx python3-slepc4py python3-gmsh python3-h5py-mpi'"
+    "infinite lattices need dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda install "
+    "-c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'"
 )
 
 
