@@ -45,7 +45,7 @@ class PathOptions:
 
     def __post_init__(self) -> None:
         steps = (self.first_step, self.largest_step, self.first_amplitude)
-        if not (all(SMALLEST_STEP <= step < 1 for step in steps) and 1 < self.growth <= 100):
+        if not (all(SMALLEST_STEP <= step <= 1 for step in steps) and 1 < self.growth <= 100):
             raise InputError(
                 f"path options: expected steps and an amplitude from {SMALLEST_STEP:g} to 1 and a "
                 f"growth above 1 and at most 100, got {self}"
