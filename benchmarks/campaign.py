@@ -42,14 +42,11 @@ class Timing:
     first, last
         Until the first case was done (what starting the workers takes, and one case), and until
         the last was: the rest is stopping them.
-    work
-        Seconds that the cases themselves took, all together.
     """
 
     whole: float
     first: float
     last: float
-    work: float
 
 
 def sleep(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
@@ -70,7 +67,7 @@ def run(function: str, cases: tuple[Case, ...], folder: Path, workers: int, meth
     table = campaign.run(Workers(workers), listen)
     whole = time.perf_counter() - begin
     assert (table["error"] == "").all(), table["error"].iloc[0]
-    return Timing(whole, ticks[1], ticks[-1], float(table["seconds"].sum()))
+    return Timing(whole, ticks[1], ticks[-1])
 
 
 def alone(
@@ -105,8 +102,7 @@ def speedup(starts: int, pixel: float, folder: Path) -> None:
         timing = alone(study.function, cases, own, workers)
         found.setdefault(workers, []).append(timing)
         print(f"{workers} worker{'s' * (workers > 1)}: {timing.whole:.1f} s, "
-              f"{timing.first:.1f} s until the first case was done, "
-              f"{timing.work:.1f} s of work in the cases")  # fmt: skip
+              f"{timing.first:.1f} s until the first case was done")  # fmt: skip
     whole = {n: sum(t.whole for t in timings) for n, timings in found.items()}
     after = {n: sum(t.last - t.first for t in timings) for n, timings in found.items()}
     print(f"two workers are {whole[1] / whole[2]:.2f} times one with their start, "

@@ -15,8 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from modeharvest.files import read_json
-from modeharvest.pipeline import STAGES
+from modeharvest.stages import Stages
+
+STAGES = ("fem", "image", "correlate", "validate")
 
 
 def main() -> None:
@@ -39,7 +40,7 @@ def main() -> None:
             begin = time.perf_counter()
             subprocess.run(command, env=environment, check=True, capture_output=True)
             whole = time.perf_counter() - begin
-            seconds = read_json(out / "summary.json")["timings_s"]
+            seconds = Stages(out).timings
             peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
             print(f"{kernels:10}" + "".join(f"{seconds[s]:14.1f}" for s in STAGES), end="")
             print(f"{whole:14.1f}{peak:14.0f}")

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from typing import Any
 
 from modeharvest.errors import InputError
 from modeharvest.fem.imperfection import Imperfection
@@ -133,3 +135,23 @@ class Experiment:
     def is_perfect(self) -> bool:
         """Whether specimen and loading keep their symmetries, so that there is a bifurcation."""
         return self.imperfection.is_none and self.tilt == 0.0
+
+    def described(self) -> dict[str, dict[str, Any]]:
+        """What is tested, in a solution's ``info``: specimen, material, loading, imperfection.
+
+        As JSON gives it back; the rest of the options says how the solution is found.
+        """
+        material: Any = self.material
+        tables = {
+            "specimen": asdict(self.specimen),
+            "material": {"kind": type(material).__name__, **vars(material)},
+            "loading": {
+                "edges": self.edges,
+                "length_mm": self.specimen.length,
+                "tilt_rad": self.tilt,
+                "guided": self.guided,
+            },
+            "imperfection": asdict(self.imperfection),
+        }
+        plain: dict[str, dict[str, Any]] = json.loads(json.dumps(tables))
+        return plain

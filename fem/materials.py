@@ -8,6 +8,7 @@ that constants can be stated and checked without it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -105,6 +106,25 @@ class TwoTermI1:
             - 2.0 * self.c1 * ufl.ln(J)
             + 0.5 * self.bulk * (J - 1.0) ** 2
         )
+
+
+def material_in_words(table: Mapping[str, Any]) -> str:
+    """A material's kind and constants, and whether they are this project's default.
+
+    Parameters
+    ----------
+    table
+        ``kind`` and the constants, as in a case or in a solution's ``info``.
+    """
+    constants = {name: value for name, value in table.items() if name != "kind"}
+    values = ", ".join(f"{name} {_plain_number(value)}" for name, value in constants.items())
+    usual = {name: _plain_number(value) for name, value in vars(Ogden()).items()}
+    is_usual = {name: _plain_number(value) for name, value in constants.items()} == usual
+    return f"{'default ' * is_usual}material {table['kind']}: {values} (moduli in MPa)"
+
+
+def _plain_number(value: Any) -> str:
+    return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"
 
 
 def power_sum_of_stretches(F: Any, m: float) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -182,16 +182,8 @@ class _Run:
     ) -> dict[str, Any]:
         e = self.experiment
         return {
-            "specimen": asdict(e.specimen),
-            "material": {"kind": type(e.material).__name__, **vars(e.material)},
-            "loading": {
-                "edges": e.edges,
-                "length_mm": e.specimen.length,
-                "tilt_rad": e.tilt,
-                "guided": e.guided,
-            },
+            **e.described(),
             "mesh_size_mm": e.mesh_size,
-            "imperfection": asdict(e.imperfection),
             "critical": None if critical is None else self._critical_info(critical),
             "path": {
                 name: self._curve(states) for name, states in {"primary": path, **branches}.items()

@@ -60,7 +60,7 @@ class Result:
     history
         Every iteration of every level.
     timings_s
-        Seconds for each stage.
+        Seconds for each step; not in a result's file, which two runs leave the same.
     residual_correlation
         Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a
         displacement. See :meth:`agreement`.

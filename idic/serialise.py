@@ -57,7 +57,6 @@ def result_to_dict(result: Result) -> dict[str, Any]:
         "left_image": result.left_image,
         "condition_number": _finite(result.condition_number),
         "history": [{k: _finite(v) for k, v in vars(s).items()} for s in result.history],
-        "timings_s": dict(result.timings_s),
         "residual_correlation": _finite(result.residual_correlation),
         "residual_lags_px": list(result.residual_lags_px),
         "unmatched": _finite(result.unmatched),
@@ -80,7 +79,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
     weighting = content["weighting"]
-    plain = ("pixels", "left_image", "timings_s", "order")
+    plain = ("pixels", "left_image", "order")
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
     return {
         **{name: content[name] for name in plain},

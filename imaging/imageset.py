@@ -9,8 +9,8 @@
 The number in a file's name is the nominal strain in hundredths of a percent (0780 is 7.80 %).
 The plain images are noise-free averages over the pixels in float32; those with the bits in
 their name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says
-how the set was made and is written last: without it, the set isn't finished. In it, besides
-what makes the set anew:
+how the set was made and is written last: without it, the set isn't finished. Files are compared
+with the sizes and SHA-256 in it when they are read. It also holds what makes the set anew, and:
 
 ``noise``
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
@@ -38,14 +38,14 @@ from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json, read_record, write_json
+from modeharvest.files import read_record, sha256_of, write_json
 from modeharvest.imaging.exposure import Camera
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.integrate import Scene
 from modeharvest.imaging.io import read_image, read_mask
 from modeharvest.imaging.isoparametric import Located, locate
 from modeharvest.imaging.render import Truth, render_deformed, render_reference
-from modeharvest.imaging.set_key import FORMAT, image_key, sha256_of
+from modeharvest.imaging.set_key import FORMAT, image_key
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle import Speckle
 from modeharvest.imaging.truth import read_displacement, read_truth, write_truth
@@ -67,7 +67,9 @@ _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """A finished set on disk; images and truth are read when asked for.
+    """A finished set on disk; images and truth are read, and checked, when asked for.
+
+    A file that is missing, or not what was written, raises InputError.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ class ImageSet:
     @classmethod
     def read(cls, folder: Path | str) -> ImageSet:
         """Open a set; InputError if it isn't there or isn't finished."""
-        what, remedy = "a finished image set", "make it with 'modeharvest image'"
+        what, remedy = "a finished image set", "make it again with 'modeharvest image'"
         path = Path(folder) / SIDECAR
         with reading(path, what, remedy):
             images = cls(Path(folder), read_record(path, FORMAT, what, remedy))
@@ -121,7 +123,7 @@ class ImageSet:
 
     def mask(self) -> BoolArray:
         """(rows, cols) True where the reference image shows material."""
-        return read_mask(self.folder / self.info["reference"]["mask"])
+        return read_mask(self._whole(self.info["reference"]["mask"]))
 
     def deformed(self, strain: float, *, camera: bool = False) -> NDArray[np.float32]:
         """(rows, cols) deformed image [fraction of full scale] at a nominal strain [-]."""
@@ -129,7 +131,7 @@ class ImageSet:
 
     def deformed_mask(self, strain: float) -> BoolArray:
         """(rows, cols) True where the deformed image shows material."""
-        return read_mask(self.folder / self._snapshot(strain)["mask"])
+        return read_mask(self._whole(self._snapshot(strain)["mask"]))
 
     def noise_sd(self, strain: float | None = None) -> FloatArray:
         """(rows, cols) predicted standard deviation of a camera image [fraction of full scale].
@@ -141,19 +143,42 @@ class ImageSet:
 
     def truth(self, strain: float) -> Truth:
         """Read the truth behind the deformed image at a nominal strain [-]."""
-        return read_truth(self.folder / self._snapshot(strain)["truth"])
+        return read_truth(self._whole(self._snapshot(strain)["truth"]))
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file of the set, the sidecar last."""
+        return (*(self.folder / name for name in self.info["files"]), self.folder / SIDECAR)
+
+    def is_whole(self) -> bool:
+        """Whether every file is what was written, by its SHA-256."""
+        try:
+            for name in self.info["files"]:
+                self._whole(name)
+        except (InputError, KeyError, TypeError):
+            return False
+        return True
 
     def displacement(self, strain: float) -> FloatArray:
         """(rows, cols, 2) true displacement [mm] at the reference image's pixels, NaN off it."""
-        return read_displacement(self.folder / self._snapshot(strain)["truth"])
+        return read_displacement(self._whole(self._snapshot(strain)["truth"]))
 
     def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
-        path = self.folder / entry["camera_image" if camera else "image"]
-        image = read_image(path)
+        image = read_image(self._whole(entry["camera_image" if camera else "image"]))
         if camera:  # a 12-bit camera's white is 4095, which the file's 16 bits don't know
             full_scale = 255.0 if self.spec.bits <= 8 else 65535.0
             image *= np.float32(full_scale / (2**self.spec.bits - 1))
         return image
+
+    def _whole(self, name: str) -> Path:
+        """The path of a file; InputError unless its SHA-256 is the one it was written with."""
+        path = self.folder / name
+        if sha256_of(path) != self.info["files"][name]["sha256"]:
+            raise InputError(
+                f"expected {path} as {SIDECAR} has its SHA-256, got another file or none; make it "
+                "again with 'modeharvest image'"
+            )
+        return path
 
     def _snapshot(self, strain: float) -> dict[str, Any]:
         for entry in self.info["snapshots"]:
@@ -166,31 +191,13 @@ class ImageSet:
         )
 
 
-def is_complete(folder: Path | str, key: str, *, verify: bool = False) -> bool:
-    """Whether ``folder`` holds a finished set of that key, with all files of the listed sizes.
-
-    Parameters
-    ----------
-    folder
-        Where the set may be.
-    key
-        Of :func:`image_key`.
-    verify
-        Compare the files' SHA-256 digests, too.
-    """
-    folder = Path(folder)
+def is_complete(folder: Path | str, key: str) -> bool:
+    """Whether ``folder`` holds a whole set of that key (:func:`image_key`)."""
     try:
-        info = read_json(folder / SIDECAR)
-        if info["format"] != FORMAT or info["key"] != key:
-            return False
-        for name, entry in info["files"].items():
-            if (folder / name).stat().st_size != entry["bytes"]:
-                return False
-            if verify and sha256_of(folder / name) != entry["sha256"]:
-                return False
-    except (InputError, OSError, KeyError, TypeError):
+        found = ImageSet.read(folder)
+    except InputError:
         return False
-    return True
+    return found.info.get("key") == key and found.is_whole()
 
 
 def make_images(
@@ -211,8 +218,8 @@ def make_images(
     spec
         How.
     folder
-        Where to write; made if it doesn't exist. A finished set of the same solution, strains
-        and spec is left as it is; any other set there is replaced.
+        Where to write; made if it doesn't exist. A whole set of the same solution, strains, spec
+        and code is left as it is; any other set there is replaced.
     progress
         Listener.
 

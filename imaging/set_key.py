@@ -6,17 +6,16 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 
 from modeharvest.fem.field import Solution
+from modeharvest.files import sha256_of
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.versions import source_digest
 
 FORMAT = "modeharvest-images-1"
-PIXELS = 3
-"""Counts the changes of the code that changed a pixel, if only by rounding."""
 
 
 def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
@@ -37,20 +36,14 @@ def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -
         If a snapshot is missing, or a distortion's file can't be read.
     """
     digest = hashlib.sha256()
-    wanted = {"format": FORMAT, "pixels": PIXELS, "spec": asdict(spec),
+    wanted = {"format": FORMAT, "code": source_digest("fem", "imaging"), "spec": asdict(spec),
               "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
     digest.update(json.dumps(wanted, sort_keys=True).encode())
     if isinstance(spec.distortion, str):
         read_distortion(spec.distortion)  # says what is wrong with it
-        digest.update(sha256_of(Path(spec.distortion)).encode())
+        digest.update(sha256_of(spec.distortion).encode())
     for array in (solution.mesh.nodes, solution.mesh.cells):
         digest.update(array.tobytes())
     for strain in strains:
         digest.update(np.ascontiguousarray(solution.at(strain).displacement).tobytes())
     return digest.hexdigest()
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's content, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -183,7 +183,6 @@ def harvest(
         full_scale=LEVELS,
         sentences=("The material was found by its speckle.",),
         truth=HarvestTruth(truth, lens(1.01), rows),
-        timings={"prepare": 1.0, "correlate": 12.3},
         versions={"modeharvest": "0"},
     )
 

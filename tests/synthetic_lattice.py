@@ -145,7 +145,10 @@ def run(**changes: Any) -> LatticeRun:
     point = CriticalPoint("uniaxial along x", CRITICAL, True, "critical", (M,), (0,), (1,))
     parts: dict[str, Any] = {
         "title": "Made up <for tests>",
-        "case": {"lattice": {"kind": "square", "pitch": PITCH}},
+        "case": {
+            "lattice": {"kind": "square", "pitch": PITCH},
+            "material": {"kind": "two-term-I1", "c1": 0.55, "c2": 0.3, "bulk": 55.0},
+        },
         "command": "modeharvest modes made-up --out DIR",
         "mesh": mesh,
         "lattice": lattice,
@@ -158,7 +161,6 @@ def run(**changes: Any) -> LatticeRun:
         "study": study(),
         "exports": {"modes.h5": "modes and branches"},
         "notes": ("A note <of the caller>.",),
-        "timings": {"critical": 1.5},
         "versions": {"modeharvest": "0"},
     }
     return LatticeRun(**{**parts, **changes})

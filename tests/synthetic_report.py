@@ -145,7 +145,6 @@ def summary(of: Atlas, critical: float | None = 0.06) -> dict[str, Any]:
             {"quantity": "best fit", "unit": "px", "expected": "at most 1", "obtained": 1.5,
              "ok": False, "source": "made up"},
         ],
-        "timings_s": {"fem": 1.0, "image": None, "correlate": 2.0, "validate": 3.0},
     }  # fmt: skip
 
 

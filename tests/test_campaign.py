@@ -21,6 +21,7 @@ from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.validation import workers
 from modeharvest.validation.campaign import Campaign, Workers, grid
+from modeharvest.versions import source_digest
 
 BASE = {"x": 0, "wait": 0.0, "bad": -1}
 
@@ -112,8 +113,12 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
 
     # Of another version, or where the folder is not.
     for said, message in (
-        (("0.0.1", True), r"expected modeharvest .*, got 0\.0\.1 on the one at tcp"),
-        ((__version__, False), "expected workers that can write to the folder"),
+        (
+            ("0.0.1", source_digest(), True),
+            r"expected modeharvest .*, got 0\.0\.1 .*on the one at tcp",
+        ),
+        ((__version__, "0" * 64, True), r"expected modeharvest .*, got .* with 0{12} on the one"),
+        ((__version__, source_digest(), False), "expected workers that can write to the folder"),
     ):
         monkeypatch.setattr(workers, "introduce", lambda function, mark, said=said: said)
         with pytest.raises(InputError, match=message):

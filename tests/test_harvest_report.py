@@ -63,7 +63,7 @@ def bare(harvest: Harvest) -> Harvest:
                     spectrum=None, pattern=None, local=None, start_sentences=())  # fmt: skip
     return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
                    calibration=None, full_scale=None, sentences=(), truth=None,
-                   timings={}, versions={})  # fmt: skip
+                   versions={})  # fmt: skip
 
 
 def test_nothing_is_loaded_from_elsewhere(text: str) -> None:

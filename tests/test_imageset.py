@@ -8,6 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import tifffile
 
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
@@ -118,7 +119,7 @@ def test_another_set_replaces_it_without_leftovers(
     again = make_images(plate(), strains, spec, made.folder)
     listed = {*again.info["files"], "images.json", "notes.txt"}
     assert {p.name for p in made.folder.iterdir()} == listed
-    assert is_complete(made.folder, image_key(plate(), strains, spec), verify=True)
+    assert is_complete(made.folder, image_key(plate(), strains, spec))
     assert not is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
 
 
@@ -134,7 +135,7 @@ def test_key_depends_on_the_sensor_and_on_the_code_that_makes_pixels(
 ) -> None:
     keys = {image_key(plate(), STRAINS, SPEC)}
     keys.add(image_key(plate(), STRAINS, replace(SPEC, sensor=Sensor(read_noise=0.01))))
-    monkeypatch.setattr(set_key, "PIXELS", set_key.PIXELS + 1)
+    monkeypatch.setattr(set_key, "source_digest", lambda *folders: "of other code")
     keys.add(image_key(plate(), STRAINS, SPEC))
     assert len(keys) == 3
 
@@ -247,11 +248,34 @@ def test_damage_is_noticed_and_repaired(made: ImageSet, name: str) -> None:
     path.write_bytes(whole[:-1])
     assert not is_complete(made.folder, key)
     path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert not is_complete(made.folder, key, verify=True)
+    assert not is_complete(made.folder, key)
     path.unlink()
     assert not is_complete(made.folder, key)
     make_images(plate(), STRAINS, SPEC, made.folder)
     assert path.read_bytes() == whole
+
+
+def test_an_image_that_is_not_what_was_written_is_not_read(made: ImageSet) -> None:
+    """Every value of the other set is a sound image: only its digest tells."""
+    readers = {
+        "reference.tif": made.reference,
+        "mask.tif": made.mask,
+        "deformed_0780_8bit.tif": lambda: made.deformed(0.078, camera=True),
+        "deformed_1280_mask.tif": lambda: made.deformed_mask(0.128),
+        "truth_0780.h5": lambda: made.truth(0.078),
+    }
+    others = {"truth_0780.h5": "truth_1280.h5", "deformed_0780_8bit.tif": "reference_8bit.tif"}
+    for name, read in readers.items():
+        read()
+        path = made.folder / name
+        if name in others:
+            path.write_bytes((made.folder / others[name]).read_bytes())
+        else:
+            pixels = tifffile.imread(path)
+            tifffile.imwrite(path, np.roll(pixels, 1, axis=0), photometric="minisblack")
+        with pytest.raises(InputError, match=f"{name} as images.json has its SHA-256") as error:
+            read()
+        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
@@ -282,7 +306,7 @@ def test_asks_for_what_is_there(made: ImageSet) -> None:
     for clash in ((), (0.078, 0.078)):
         with pytest.raises(InputError, match=r"differ by 0\.01 %"):
             make_images(plate(), clash, SPEC, made.folder)
-    assert is_complete(made.folder, image_key(plate(), STRAINS, SPEC), verify=True)
+    assert is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
 
 
 def test_grid_is_centred_and_holds_every_state_with_its_margin() -> None:

@@ -149,7 +149,7 @@ def measured(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> tupl
             LatticeMode, "of", lambda specimen, material, divisions: lattice_mode(specimen.pitch)
         )
         cases = study.prepare(subject, folder)
-        rows = [{**case, "error": "", "seconds": 1.0, **one_specimen(case, folder)}
+        rows = [{**case, "error": "", **one_specimen(case, folder)}
                 for case in cases]  # fmt: skip
     return study, pd.DataFrame(rows), folder
 

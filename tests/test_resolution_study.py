@@ -154,7 +154,7 @@ def table(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> pd.Data
     study = Resolution(strain=0.1, pattern=5.0, degrees=(1, 2, 3), measured=(3,), realisations=12)
     rows: list[dict[str, Any]] = []
     for case in study.prepare(experiment, folder):
-        rows.append({**case, "seconds": 0.0, "error": "", **one_case(case, folder)})
+        rows.append({**case, "error": "", **one_case(case, folder)})
     return pd.DataFrame(rows)
 
 

@@ -17,7 +17,7 @@ import pytest
 from html_page import Page
 from scipy import stats
 
-from modeharvest import __version__, cli
+from modeharvest import cli
 from modeharvest.case import shipped_solution
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
@@ -25,7 +25,7 @@ from modeharvest.files import read_json, write_json
 from modeharvest.studies.case import StudyCase, read_study, shipped_studies
 from modeharvest.studies.pipeline import StudyPipeline
 from modeharvest.validation.campaign import Campaign
-from modeharvest.validation.case_run import run_case
+from modeharvest.validation.case_run import run_case, store
 from modeharvest.validation.studies.noise import causes as noise_causes
 from modeharvest.validation.studies.noise.statistics import Pairs
 from modeharvest.validation.studies.noise.study import Noise, one_realisation
@@ -34,6 +34,7 @@ from modeharvest.validation.studies.robustness.study import Robustness, one_star
 from modeharvest.validation.studies.subject import Scene, Subject
 from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
 from modeharvest.validation.studies.systematic.study import Systematic, one_level
+from modeharvest.versions import source_digest
 
 PAPER = shipped_solution("paper-virtual")
 TINY = """
@@ -68,7 +69,7 @@ def starts_table(distances: list[float], outcomes: list[str] | None = None) -> p
     n = len(distances)
     return pd.DataFrame({
         "radius": 0.1, "start": range(n), "strain_error": 0.0, "seed": 0, "error": "",
-        "seconds": 1.0, "distance_px": distances, "start_distance_px": 9.0,
+        "distance_px": distances, "start_distance_px": 9.0,
         "epsilon_percent": np.array(distances), "outcome": outcomes or ["converged"] * n,
         "iterations": 5, "all_iterations": 20, "residual": 0.01,
     })  # fmt: skip
@@ -223,7 +224,7 @@ def test_noise_study_on_tiny_images(
     study = Noise(levels=(0.002,), pairs=2)
     cases = study.prepare(subject, folder)
     assert len(cases) == 5
-    rows = [{**case, "error": "", "seconds": 0.1, **one_realisation(case, folder)}
+    rows = [{**case, "error": "", **one_realisation(case, folder)}
             for case in cases]  # fmt: skip
     found = study.findings(pd.DataFrame(rows), folder)
     summary = found.attachments["Noise levels"].set_index("quantity")
@@ -419,7 +420,7 @@ def threads(case: Mapping[str, Any], folder: Path) -> dict[str, int]:
 def test_a_case_has_one_thread(tmp_path: Path) -> None:
     before = numba.get_num_threads()
     try:
-        run_case("test_studies:threads", {}, str(tmp_path), __version__)
+        run_case("test_studies:threads", {}, str(tmp_path), source_digest())
         (path,) = (tmp_path / "cases").iterdir()
         assert read_json(path)["result"] == {"threads": 1}
     finally:
@@ -437,8 +438,7 @@ def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
     traceback = "Traceback …\nMemoryError: too large"
     for one, error in zip(cases, ("", traceback), strict=True):
-        record = {"version": __version__, "seconds": 1.0, "error": error}
-        write_json(plan.path(one), {**record, "result": None if error else result})
+        store(plan.path(one), one, None if error else result, error)
     monkeypatch.setattr(Campaign, "missing", lambda self: ())
     summary = pipeline.all()
     (failure,) = summary["failed"]

@@ -2,9 +2,9 @@
 
 A case is a mapping of plain values, its seed among them. What becomes of it is written, whole or
 not at all, by the worker that ran it, to ``cases/KEY.json`` with KEY the digest of the function's
-name, the case and modeharvest's version: a campaign that is killed goes on where it was, an
-option that is changed makes anew what it touches and nothing else, and results of another
-version are never mixed with this one's. A case that fails is stored with its traceback, and the
+name, the case and modeharvest's code: a campaign that is killed goes on where it was, an
+option that is changed makes anew what it touches and nothing else, and results of other
+code are never mixed with this one's. A case that fails is stored with its traceback, and the
 rest goes on.
 
 Workers are processes of dask.distributed: of this machine, or of any scheduler by its address.
@@ -22,10 +22,10 @@ from typing import Any
 
 import pandas as pd
 
-from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.files import atomic, require_writable
 from modeharvest.progress import Progress, silent
+from modeharvest.stages import exclusive
 from modeharvest.validation.case_run import (
     Case,
     named,
@@ -33,8 +33,10 @@ from modeharvest.validation.case_run import (
     result_path,
     run_case,
     store,
+    stored,
 )
 from modeharvest.validation.workers import Workers
+from modeharvest.versions import source_digest
 
 __all__ = ["Campaign", "Case", "Workers", "grid"]
 
@@ -99,22 +101,23 @@ class Campaign:
         Raises
         ------
         InputError
-            If the folder can't be written to, the scheduler is not there or goes away, or its
-            workers can't do the work.
+            If the folder can't be written to or another process works in it, the scheduler is
+            not there or goes away, or its workers can't do the work.
         """
         require_writable(self.folder)
-        missing = self.missing()
-        done = len(self.cases) - len(missing)
-        progress(done, len(self.cases), "campaign")
-        for _ in self._settled(missing, workers or Workers()):
-            done += 1
+        with exclusive(self.folder):
+            missing = self.missing()
+            done = len(self.cases) - len(missing)
             progress(done, len(self.cases), "campaign")
-        table = self.table()
-        _write(table, self.folder)
+            for _ in self._settled(missing, workers or Workers()):
+                done += 1
+                progress(done, len(self.cases), "campaign")
+            table = self.table()
+            _write(table, self.folder)
         return table
 
     def table(self) -> pd.DataFrame:
-        """A row for each case: its values, ``seconds``, ``error`` (empty if none), its result."""
+        """A row for each case: its values, ``error`` (empty if none), its result."""
         return pd.DataFrame([self._row(case) for case in self.cases])
 
     def of_other_versions(self) -> dict[str, int]:
@@ -123,7 +126,7 @@ class Campaign:
         counts: dict[str, int] = {}
         for path in sorted((self.folder / "cases").glob("*.json")):
             if path not in wanted:
-                version = str(read_result(path).get("version", "unknown"))
+                version = str(stored(path).get("version", "unknown"))
                 counts[version] = counts.get(version, 0) + 1
         return counts
 
@@ -132,7 +135,7 @@ class Campaign:
         error = record.get("error", "not run") if record else "not run"
         last = error.strip().splitlines()[-1] if error else ""
         found = record.get("result") or {}
-        return {**case, "seconds": record.get("seconds"), "error": last, **found}
+        return {**case, "error": last, **found}
 
     def _settled(self, cases: Sequence[Case], workers: Workers) -> Iterator[Case]:
         """The cases as they get done, or fail for certain.
@@ -185,7 +188,7 @@ class Campaign:
         for suspect in killed:
             for case, outcome in self._submitted(client, [suspect]):
                 if outcome is _Outcome.KILLED:
-                    store(self.path(case), case, None, _KILLED, 0.0)
+                    store(self.path(case), case, None, _KILLED)
                 yield case, outcome
 
     def _submitted(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
@@ -194,7 +197,7 @@ class Campaign:
 
         folder = str(self.folder.resolve())  # workers elsewhere have another current one
         futures = {
-            client.submit(run_case, self.function, case, folder, __version__, pure=False): case
+            client.submit(run_case, self.function, case, folder, source_digest(), pure=False): case
             for case in cases
         }
         completed = as_completed(list(futures))  # type: ignore[no-untyped-call]
@@ -211,7 +214,7 @@ class Campaign:
             elif isinstance(failure := future.exception(), KilledWorker):
                 yield case, _Outcome.KILLED
             else:
-                store(self.path(case), case, None, f"{type(failure).__name__}: {failure}", 0.0)
+                store(self.path(case), case, None, f"{type(failure).__name__}: {failure}")
                 yield case, _Outcome.SETTLED
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
+from modeharvest.fem.materials import material_in_words
 from modeharvest.files import atomic
 from modeharvest.idic.families.pattern import Pattern
 from modeharvest.idic.families.spectrum import Spectrum
@@ -93,6 +94,7 @@ def write_report(
         headings=headings,
         hero=to_svg(draw_hero(atlas, len(comparisons) - 1), "hero", "Image and pattern"),
         keys=words.key_numbers(summary),
+        material=material_in_words(case["experiment"]["material"]),
         sections=_sections(atlas, summary, headings, progress),
         curves=_curves(solution, summary),
         convergence=[
@@ -102,7 +104,6 @@ def write_report(
         numbers=words.number_rows(summary),
         modes=words.mode_rows(summary),
         reservations=words.notes(summary),
-        timings={k: v for k, v in summary["timings_s"].items() if k != "validate"},
     )  # fmt: skip
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")

@@ -28,8 +28,9 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
 ``expected``
     Rows of expected and obtained values.
-``inverse_map_max_residual_px``, ``factorisations``, ``timings_s``, ``versions``
-    How good the images are, and what it all took.
+``inverse_map_max_residual_px``, ``factorisations``, ``versions``
+    How good the images are, what the path took, and with which software. Seconds are in
+    ``timings.json``, so that two runs leave the same summary.
 ``simulation_outcome``, ``warnings``
     How far the simulation got, and what to beware of.
 """
@@ -37,7 +38,6 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass
@@ -101,7 +101,6 @@ class Measured:
 def validate(
     measured: Measured,
     case: Mapping[str, Any],
-    timings_s: Mapping[str, float | None],
     folder: Path,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -113,8 +112,6 @@ def validate(
         What is to be judged.
     case
         What was run, as plain values, for the record; its ``title`` heads the report.
-    timings_s
-        Seconds that the stages before took; this one's are added.
     folder
         Where ``summary.json`` and ``report.html`` go.
     progress
@@ -125,7 +122,6 @@ def validate(
     dict
         The content of ``summary.json``.
     """
-    begin = time.perf_counter()
     comparisons = []
     for k, strain in enumerate(sorted(measured.results)):
         progress(k, len(measured.results), "compare with the truth")
@@ -138,11 +134,9 @@ def validate(
         )
 
     summary = _summary(measured, case, snapshots)
-    summary["timings_s"] = {**timings_s, "validate": time.perf_counter() - begin}
     page = folder / "report.html"
     solution, images = measured.solution, measured.images
     write_report(page, dict(case), solution, images, comparisons, spectra, summary, progress)
-    summary["timings_s"]["validate"] = time.perf_counter() - begin
     write_json(folder / "summary.json", summary)
     return summary
 

@@ -23,6 +23,7 @@ from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.files import require_writable
 from modeharvest.validation.case_run import named
+from modeharvest.versions import source_digest
 
 _PATIENCE_S = 30.0
 """How long to wait for a scheduler that does not answer: it may be on a busy machine."""
@@ -212,14 +213,15 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
     for worker, answer in answers.items():
         if isinstance(answer, Exception):
             raise InputError(
-                f"expected workers of {scheduler} with modeharvest {__version__} and {function}, "
+                f"expected workers of {scheduler} with this modeharvest and {function}, "
                 f"but the one at {worker} says {type(answer).__name__}: {answer}; install both"
             )
-        version, sees = answer
-        if version != __version__:
+        version, code, sees = answer
+        if (version, code) != (__version__, source_digest()):
             raise InputError(
-                f"expected modeharvest {__version__} on all workers of {scheduler}, got {version} "
-                f"on the one at {worker}; install the same version there"
+                f"expected modeharvest {__version__} with the code {source_digest()[:12]} on all "
+                f"workers of {scheduler}, got {version} with {code[:12]} on the one at {worker}; "
+                "install the same there"
             )
         if not sees:
             raise InputError(
@@ -228,7 +230,11 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
             )
 
 
-def introduce(function: str, mark: str) -> tuple[str, bool]:
-    """What a worker says of itself: its version, and whether it can write where a file is."""
+def introduce(function: str, mark: str) -> tuple[str, str, bool]:
+    """What a worker says of itself: version, code, and whether it can write where a file is."""
     named(function)
-    return __version__, Path(mark).exists() and os.access(Path(mark).parent, os.W_OK)
+    return (
+        __version__,
+        source_digest(),
+        Path(mark).exists() and os.access(Path(mark).parent, os.W_OK),
+    )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +23,10 @@ def atomic(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds.
 
     Whatever ends the block early (an exception, a full disk, Ctrl-C) removes the temporary
-    file, so a reader never sees half a file. The suffix is kept, because libraries choose
-    formats by it.
+    file, so a reader never sees half a file; what a killed process left of it is removed by the
+    next that writes ``path``. File and folder reach the disk before the block ends, so that a
+    power cut leaves no empty file under a finished name. The suffix is kept, because libraries
+    choose formats by it.
 
     Raises
     ------
@@ -33,13 +37,49 @@ def atomic(path: Path | str) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_orphans(path)
         yield temporary
+        _flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
+        if os.name == "posix":  # elsewhere a folder can't be opened
+            _flush(path.parent, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"could not write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):  # it may never have been there, nor its folder
             temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path, mode: int) -> None:
+    """Have the disk itself store a file or a folder's names."""
+    descriptor = os.open(path, mode)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove_orphans(path: Path) -> None:
+    """Remove temporary files of ``path`` whose process is no more."""
+    before, after = f".{path.stem}.", f".part{path.suffix}"
+    for name in os.listdir(path.parent):
+        if name.startswith(before) and name.endswith(after):
+            number = name[len(before) : len(name) - len(after)]
+            if number.isdecimal() and not may_be_alive(int(number)):
+                path.with_name(name).unlink(missing_ok=True)
+
+
+def may_be_alive(process: int) -> bool:
+    """Whether this machine may have a process of that id; where it can't tell, it says yes."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)  # sends nothing
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's; no id at all
+        return True
+    return True
 
 
 def require_writable(folder: Path | str) -> None:
@@ -66,7 +106,13 @@ def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
     with h5py.File(memory, "w") as file:
         yield file
     with atomic(path) as temporary:
-        temporary.write_bytes(memory.getvalue())
+        temporary.write_bytes(memory.getbuffer())
+
+
+def copy_whole(source: Path | str, path: Path | str) -> None:
+    """Copy a file, atomically."""
+    with atomic(path) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def write_json(path: Path | str, content: Any) -> None:
@@ -104,3 +150,12 @@ def read_record(path: Path | str, form: str, what: str, remedy: str) -> dict[str
         if got != form:
             raise InputError(f"expected {form} in {path}, got {got!r}; {remedy}")
         return dict(content)
+
+
+def sha256_of(path: Path | str) -> str:
+    """SHA-256 of a file's content, hexadecimal; empty if it can't be read."""
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""

@@ -6,32 +6,34 @@
     images/                     image      speckle images, masks, truth
     correlation/                correlate  one result for each image
     report.html summary.json    validate   how wrong it was, and why
-    stages.json                            which stages are finished, and what they took
+    stages.json timings.json               which stages are finished, and what they took
 
-A stage whose inputs have not changed is not run again.
+A stage whose inputs, options and code have not changed, and whose files are what it wrote, is
+not run again. Two runs of a case leave the same bytes in every file but ``timings.json``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from modeharvest import __version__
 from modeharvest.case import Case, read_case, shipped_cases, shipped_solution
 from modeharvest.errors import InputError, MissingDependencyError
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.files import read_json
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
-from modeharvest.imaging.imageset import ImageSet, image_key, make_images
+from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
 from modeharvest.precompile import precompiling
 from modeharvest.progress import Progress, silent
-from modeharvest.ranks import is_first
-from modeharvest.stages import Stages, digest
+from modeharvest.ranks import on_first
+from modeharvest.stages import Stages, exclusive, stage_key
 from modeharvest.validation.study import Measured, validate
 
-STAGES = ("fem", "image", "correlate", "validate")
+_COMPLETE = "complete"
 _NO_DOLFINX = (
     "the finite-element stage needs dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda "
     "install -c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
@@ -53,7 +55,7 @@ class Run:
     progress
         Listener.
     solution
-        A solution file to use instead of the folder's own.
+        A solution file to use instead of simulating.
     """
 
     case: Case
@@ -77,28 +79,45 @@ class Run:
             If dolfinx is not there and no solution of this case is shipped.
         """
         path = self.folder / "solution.h5"
+        vtu = path.with_suffix(".vtu")
 
-        def work() -> None:
+        def write(solution: Solution) -> None:
+            solution.write(path)
+            solution.write_vtu(vtu)
+
+        def work() -> tuple[Path, ...]:
             solution = self._simulate()
-            if is_first():
-                solution.write(path)
-                solution.write_vtu(path.with_suffix(".vtu"))
+            on_first(lambda: write(solution))
+            return path, vtu
 
-        key = digest([self.case.plain()["experiment"], __version__])
-        self.stages.do("fem", key, work, path, collective=True)
+        key = stage_key(self.case.plain()["experiment"], "fem")
+        self.stages.do("fem", key, work, collective=True)
         return Solution.read(path)
 
+    def solved(self) -> Solution:
+        """The solution that was given, or else a simulated one.
+
+        Raises
+        ------
+        InputError
+            If the one given is of another experiment, or lacks one of its strains.
+        """
+        return self.fem() if self.solution is None else self._solution()
+
     def image(self) -> ImageSet:
-        """Make images and truth of the solution's snapshots in ``images/``."""
+        """Make images and truth of the solution's snapshots in ``images/``.
+
+        Raises
+        ------
+        InputError
+            If the solution is of another experiment, or lacks one of its strains although its
+            simulation did not end early.
+        """
         solution, folder = self._solution(), self.folder / "images"
-        strains = self._strains(solution)
-        spec = self.case.imaging
+        strains, spec = self._strains(solution), self.case.imaging
         key = image_key(solution, strains, spec)
         self.stages.do(
-            "image",
-            key,
-            lambda: make_images(solution, strains, spec, folder, self.progress),
-            folder / "images.json",
+            "image", key, lambda: make_images(solution, strains, spec, folder, self.progress).files
         )
         return ImageSet.read(folder)
 
@@ -108,16 +127,17 @@ class Run:
         Raises
         ------
         InputError
-            If the images were made with other options than this case's.
+            If the images were made of another experiment or with other options than this case's.
         """
         images = self._images()
         paths = {strain: self._result_path(strain) for strain in images.strains}
 
-        def work() -> None:
+        def work() -> list[Path]:
             for strain, path in paths.items():
                 self._correlate_one(images, strain).write(path)
+            return list(paths.values())
 
-        self.stages.do("correlate", self._correlate_key(images), work, *paths.values())
+        self.stages.do("correlate", self._correlate_key(images), work)
         return {strain: Result.read(path) for strain, path in paths.items()}
 
     def validate(self) -> dict[str, Any]:
@@ -129,24 +149,24 @@ class Run:
             If the results are not of these images and this case.
         """
         images = self._images()
-        key = self._correlate_key(images)
-        if self.stages.finished("correlate").get("key") != key:
+        correlated = self._correlate_key(images)
+        if not self.stages.is_finished("correlate", correlated):
             raise InputError(
                 f"expected results of this case in {self.folder / 'correlation'}, found none that "
-                "are finished; make them with 'modeharvest correlate'"
+                "are finished and whole; make them with 'modeharvest correlate'"
             )
-        results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
-        path = self.folder / "summary.json"
+        path, page = self.folder / "summary.json", self.folder / "report.html"
 
-        def work() -> None:
+        def work() -> tuple[Path, Path]:
+            results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
             case = self.case
-            experiment, how = case.experiment, case.correlation
-            measured = Measured(experiment, how, self._solution(), images, results)
-            taken = {stage: self.stages.finished(stage).get("seconds") for stage in STAGES[:-1]}
-            validate(measured, case.plain(), taken, self.folder, self.progress)
+            measured = Measured(
+                case.experiment, case.correlation, self._solution(), images, results
+            )
+            validate(measured, case.plain(), self.folder, self.progress)
+            return path, page
 
-        key = digest([key, self.case.title, __version__])
-        self.stages.do("validate", key, work, path, self.folder / "report.html")
+        self.stages.do("validate", stage_key([correlated, self.case.title]), work)
         summary: dict[str, Any] = read_json(path)
         return summary
 
@@ -156,35 +176,40 @@ class Run:
         Raises
         ------
         InputError
-            At the end, if the simulation did not reach all strains asked for: what it did
-            reach is reported.
+            At once, if another process works in the folder. At the end, if the simulation did
+            not reach all strains asked for: what it did reach is reported.
         """
-        ahead = [stage for stage in ("image", "correlate") if not self.stages.finished(stage)]
-        with precompiling(ahead) as kernels:
-            solution = self.fem() if self.solution is None else self._solution()
-            kernels.wait("image", self.progress)
-            self.image()
-            kernels.wait("correlate", self.progress)
-            self.correlate()
-        summary = self.validate()
-        outcome = str(solution.info.get("outcome", "complete"))
-        if outcome != "complete":
+        with exclusive(self.folder):
+            ahead = [stage for stage in ("image", "correlate") if stage not in self.stages.timings]
+            with precompiling(ahead) as kernels:
+                solution = self.solved()
+                kernels.wait("image", self.progress)
+                self.image()
+                kernels.wait("correlate", self.progress)
+                self.correlate()
+            summary = self.validate()
+        outcome = _outcome(solution.info)
+        if outcome != _COMPLETE:
             raise InputError(f"simulation {outcome}; what was reached is in {self.folder}")
         return summary
 
     # -- parts --------------------------------------------------------------------------
 
     def _images(self) -> ImageSet:
+        advice = "make it again with 'modeharvest image'"
+        self.stages.require_whole(self.folder / "images" / SIDECAR, advice)
         images = ImageSet.read(self.folder / "images")
+        hint = f"in {images.folder}; make them again with 'modeharvest image'"
         if images.spec != self.case.imaging:
-            raise InputError(
-                f"expected images made with this case's options in {images.folder}, found others; "
-                "make them again with 'modeharvest image'"
-            )
+            raise InputError(f"expected images made with this case's options, got others {hint}")
+        info = images.info["solution"]
+        require_same_experiment(info, self.case.experiment, f"images {hint}")
+        self._reached(info, images.strains, f"images {hint}")
         return images
 
     def _correlate_key(self, images: ImageSet) -> str:
-        return digest([images.info["key"], self.case.plain()["correlation"], __version__])
+        how = self.case.plain()["correlation"]
+        return stage_key([images.info["key"], how], "fem", "imaging", "idic")
 
     def _simulate(self) -> Solution:
         try:
@@ -205,18 +230,46 @@ class Run:
         return None
 
     def _solution(self) -> Solution:
-        return Solution.read(self.solution or self.folder / "solution.h5")
+        """The solution that was given, or the folder's own; InputError if it isn't this case's."""
+        if self.solution is None:
+            advice = "make it again with 'modeharvest fem', or give it by --solution"
+            self.stages.require_whole(self._solution_path, advice)
+        solution = Solution.read(self._solution_path)
+        require_same_experiment(solution.info, self.case.experiment, self._solution_path)
+        self._strains(solution)
+        return solution
+
+    @property
+    def _solution_path(self) -> Path:
+        return self.solution or self.folder / "solution.h5"
 
     def _strains(self, solution: Solution) -> list[float]:
         """The strains asked for that the solution has."""
-        reached = {round(s.nominal_strain, 9) for s in solution.snapshots}
-        strains = [e for e in self.case.experiment.strains if round(e, 9) in reached]
-        if not strains:
-            raise InputError(
-                f"expected snapshots at strains {list(self.case.experiment.strains)} in the "
-                f"solution, got {sorted(reached)}; simulation {solution.info.get('outcome', '')}"
-            )
-        return strains
+        have = sorted({s.nominal_strain for s in solution.snapshots})
+        reached = self._reached(solution.info, have, self._solution_path)
+        for strain in reached:
+            branch, wanted = solution.at(strain).branch, self.case.experiment.branches
+            if branch not in ("primary", *wanted):
+                raise InputError(
+                    f"expected branch {' or '.join(wanted)} at strain {strain:g}, got {branch} in "
+                    f"{self._solution_path}"
+                )
+        return reached
+
+    def _reached(
+        self, info: Mapping[str, Any], have: Sequence[float], where: object
+    ) -> list[float]:
+        """The strains asked for that there are; of one's own simulation that ended early, some."""
+        wanted = self.case.experiment.strains
+        found = [e for e in wanted if any(abs(e - other) < 1e-9 for other in have)]
+        is_early = self.solution is None and _outcome(info) != _COMPLETE
+        if len(found) == len(wanted) or (found and is_early):
+            return found
+        said = f" (simulation {_outcome(info)})" if _outcome(info) != _COMPLETE else ""
+        raise InputError(
+            f"expected snapshots at strains {', '.join(f'{e:g}' for e in wanted)}, got "
+            f"{', '.join(f'{e:g}' for e in have) or 'none'}{said} in {where}"
+        )
 
     def _result_path(self, strain: float) -> Path:
         return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
@@ -235,6 +288,27 @@ class Run:
             how.options(),
             self.progress,
         )
+
+
+def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, where: object) -> None:
+    """Raise InputError if a solution's ``info`` says that it is of another experiment.
+
+    That of another solver, read from its mesh, says nothing of it and is believed.
+    """
+    usual = Experiment().described()
+    for table, values in experiment.described().items():
+        for name, value in values.items() if table in info else ():
+            # What an older solution does not say was not to be chosen when it was made.
+            got = info[table].get(name, usual[table].get(name))
+            if got != value:
+                raise InputError(
+                    f"expected this case's {table}, {name} = {value}, got {got} in {where}"
+                )
+
+
+def _outcome(info: Mapping[str, Any]) -> str:
+    """How far a simulation went, in words."""
+    return str(info.get("outcome", _COMPLETE))
 
 
 def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:

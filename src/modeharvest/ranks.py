@@ -6,10 +6,13 @@ MPI is asked only where a launcher has left its marks, so that nothing else has 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 _MARKS = ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_SIZE", "PMI_RANK")
+
+T = TypeVar("T")
 
 
 @cache
@@ -34,7 +37,19 @@ def is_first() -> bool:
     return world is None or world.rank == 0
 
 
-def agreed(value: bool) -> bool:
-    """Rank 0's value, on every rank; the others wait for it."""
+def on_first(work: Callable[[], T]) -> T:
+    """Do work on rank 0 alone; every rank waits for it, and returns or raises what it did."""
     world = _world()
-    return value if world is None else bool(world.bcast(value))
+    if world is None:
+        return work()
+    done: tuple[Any, Exception | None] = (None, None)
+    if world.rank == 0:
+        try:
+            done = work(), None
+        except Exception as error:  # of any kind: the others would wait for ever
+            done = None, error
+    value, failure = world.bcast(done)
+    if failure is not None:
+        raise failure
+    found: T = value
+    return found

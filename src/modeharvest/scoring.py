@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,11 +20,11 @@ from rich.table import Table
 
 from modeharvest.case import Case, read_case
 from modeharvest.errors import InputError
-from modeharvest.fem.field import Solution
-from modeharvest.files import atomic, require_writable
+from modeharvest.files import copy_whole, require_writable
 from modeharvest.idic.fields.columns import ALL_ROLES
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, silent
+from modeharvest.stages import exclusive
 from modeharvest.validation.scoring.benchmark import (
     SOLUTION,
     BenchmarkTruth,
@@ -80,21 +79,20 @@ def make_benchmark(
     Raises
     ------
     InputError
-        If the case's images are distorted, or the truth would be in the public folder.
+        If the case's images are distorted, the truth would be in the public folder, the solution
+        is of another case, or another process works in one of the folders.
     """
     case, public = case if isinstance(case, Case) else read_case(case), Path(public)
     require_no_lens(case.imaging)
     truth = truth_folder(public) if truth is None else Path(truth)
     require_apart(public, truth)
-    require_writable(public)
-    if solution is not None:
-        Solution.read(solution)  # says what is wrong with it
-        with atomic(truth / SOLUTION) as part:
-            shutil.copyfile(solution, part)
-    run = Run(case, truth, progress)
-    if solution is None:
-        run.fem()
-    return publish(run.image(), case.experiment.specimen, public, truth)
+    with exclusive(public), exclusive(truth):
+        require_writable(public)
+        run = Run(case, truth, progress, None if solution is None else Path(solution))
+        run.solved()
+        if solution is not None:
+            copy_whole(solution, truth / SOLUTION)
+        return publish(run.image(), case.experiment.specimen, public, truth)
 
 
 def truth_folder(public: Path) -> Path:

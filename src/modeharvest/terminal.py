@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from modeharvest.fem.materials import material_in_words
 
 _ROWS = {
     "negative pivots of the tangent": "negative_pivots",
@@ -26,7 +29,8 @@ def print_experiment(summary: dict[str, Any], out: Path) -> None:
     console = Console(highlight=False)
     console.print(_snapshots(summary))
     console.print("rms: per component, over all material pixels")
-    console.print(critical_line(summary["critical_strain"]))
+    material = summary["case"]["experiment"]["material"]
+    console.print(escape(critical_line(summary["critical_strain"], material)), soft_wrap=True)
     for warning in summary["warnings"]:
         console.print(f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False)
     if summary["expected"]:
@@ -35,11 +39,12 @@ def print_experiment(summary: dict[str, Any], out: Path) -> None:
     console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def critical_line(strain: float | None) -> str:
-    """A sentence on the critical strain [-], None if the path has no bifurcation."""
-    if strain is None:
-        return "no bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
-    return f"critical strain {100 * strain:.4f} %"
+def critical_line(strain: float | None, material: Mapping[str, Any]) -> str:
+    """A sentence on the critical strain [-], None if the path has no bifurcation, and of what."""
+    said = "no bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
+    if strain is not None:
+        said = f"critical strain {100 * strain:.4f} %"
+    return f"{said}; {material_in_words(material)}"
 
 
 def _snapshots(summary: dict[str, Any]) -> Table:

@@ -213,8 +213,8 @@ class Harvest:
         Of photographs made by a simulation.
     command, toml
         That make this page again; the experiment's values are shown if ``toml`` is empty.
-    timings, versions
-        Stage to seconds [s]; software to version.
+    versions
+        Of software.
     """
 
     title: str
@@ -238,7 +238,6 @@ class Harvest:
     truth: HarvestTruth | None = None
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
-    timings: Mapping[str, float] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -45,8 +45,8 @@ images are in px, positions and fields in mm. rms is per component.
     Photographs not used (``name``, ``reason``); what was done and found, in words.
 ``truth``
     Rows ``quantity``, ``obtained``, ``expected``, ``unit``, ``ok``, where the truth is known.
-``timings_s``, ``versions``
-    What it took, with which software.
+``versions``
+    With which software; what it took is in ``timings.json``.
 """
 
 from __future__ import annotations
@@ -93,7 +93,6 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
         "sentences": harvest.sentences,
         "truth": [] if truth is None else [asdict(row) for row in truth.rows],
-        "timings_s": harvest.timings,
         "versions": harvest.versions,
     }  # fmt: skip
     plain: dict[str, Any] = _plain(summary)

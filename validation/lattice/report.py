@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from modeharvest.fem.materials import material_in_words
 from modeharvest.files import atomic
 from modeharvest.idic.families.lattice_spectrum import upward
 from modeharvest.progress import Progress, silent
@@ -61,7 +62,8 @@ def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress =
     for n, part in enumerate(parts):
         progress(n, len(parts), "report")
         content[part.__name__.removeprefix("_")] = part(run)
-    page = render(TEMPLATE, title=run.title, run=run, words=words, **content)
+    material = material_in_words(run.case["material"])
+    page = render(TEMPLATE, title=run.title, run=run, words=words, material=material, **content)
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
     progress(1, 1, "report")

@@ -159,8 +159,8 @@ class LatticeRun:
         Files beside the page, and what each holds.
     notes
         What a reader should know before trusting the numbers.
-    timings, versions
-        Stage to seconds [s]; software to version.
+    versions
+        Of software.
     """
 
     title: str
@@ -177,7 +177,6 @@ class LatticeRun:
     study: ModeStudy | None = None
     exports: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    timings: Mapping[str, float] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from modeharvest import __version__
 from modeharvest.errors import InputError
-from modeharvest.files import atomic, read_json, read_record, write_json
+from modeharvest.files import atomic, read_json, read_record, sha256_of, write_json
 from modeharvest.imaging.io import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle import SpeckleSpec
 from modeharvest.progress import Progress, silent
 from modeharvest.reading import reading
-from modeharvest.stages import digest, file_digest
+from modeharvest.stages import stage_key
 from modeharvest.typed import made
 from modeharvest.validation.resolution.star import Star, StarImages, fine_speckle
 from modeharvest.validation.resolution.star_words import readme
@@ -181,7 +181,7 @@ def _write_images(
     for name, image in images.items():
         write_image(folder / name, image)
     return {
-        name: {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)}
+        name: {"bytes": (folder / name).stat().st_size, "sha256": sha256_of(folder / name)}
         for name in images
     }
 
@@ -210,7 +210,7 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
 
 
 def _key(spec: StarSpec) -> str:
-    return digest([asdict(spec), __version__])
+    return stage_key(asdict(spec))
 
 
 def _is_whole(folder: Path, spec: StarSpec) -> bool:
@@ -219,8 +219,8 @@ def _is_whole(folder: Path, spec: StarSpec) -> bool:
         info = read_json(folder / SIDECAR)
         return bool(
             info["key"] == _key(spec)
-            and (folder / README).is_file()
-            and all(file_digest(folder / n) == f["sha256"] for n, f in info["files"].items())
+            and (folder / README).read_text("utf-8") == readme(info)
+            and all(sha256_of(folder / n) == f["sha256"] for n, f in info["files"].items())
         )
-    except (InputError, KeyError, TypeError):
+    except (InputError, OSError, ValueError, KeyError, TypeError):
         return False

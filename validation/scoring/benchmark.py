@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -28,7 +27,7 @@ from modeharvest import __version__
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.files import atomic, read_json, read_record, write_json
+from modeharvest.files import atomic, copy_whole, read_json, read_record, sha256_of, write_json
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, ImagingSpec
 from modeharvest.imaging.isoparametric import interpolate, locate
@@ -78,7 +77,7 @@ class BenchmarkTruth:
         with reading(folder / SIDECAR, what, remedy):
             known = cls(folder, read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy))
             _ = known.grid, known.specimen, known.strains, known.id
-            if _digest(folder / SOLUTION) != known.info["solution_sha256"]:
+            if sha256_of(folder / SOLUTION) != known.info["solution_sha256"]:
                 raise InputError(
                     f"expected in {folder / SOLUTION} the solution that benchmark {known.id} was "
                     "made of, got another one or none; make the benchmark again"
@@ -178,7 +177,8 @@ def publish(
     Raises
     ------
     InputError
-        If the images were seen through a lens that distorts, or the truth would be public.
+        If the images were seen through a lens that distorts or are not what was rendered, or the
+        truth would be public.
     """
     public, truth = Path(public), Path(truth)
     require_apart(public, truth)
@@ -194,10 +194,11 @@ def publish(
             "strains": list(images.strains),
             "grid": asdict(images.grid),
             "specimen": asdict(specimen),
-            "solution_sha256": _digest(truth / SOLUTION),
+            "solution_sha256": sha256_of(truth / SOLUTION),
         }
-        write_json(truth / SIDECAR, hidden)
-        write_json(public / SIDECAR, info)  # last: it says that all is there
+        write_json(public / SIDECAR, info)
+        hidden["public_sha256"] = {n: sha256_of(public / n) for n in (SIDECAR, README)}
+        write_json(truth / SIDECAR, hidden)  # last: it says that all is there
     content: dict[str, Any] = read_json(public / SIDECAR)
     return content
 
@@ -235,13 +236,15 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
         for s in images.info["snapshots"]
     ]  # fmt: skip
     kept = [*reference.values(), *(d[k] for d in deformed for k in ("image", "camera_image"))]
-    for name in kept:
-        with atomic(public / name) as part:
-            shutil.copyfile(images.folder / name, part)
-    files = {
-        name: {"bytes": (public / name).stat().st_size, "sha256": _digest(public / name)}
-        for name in kept
-    }
+    files = {name: dict(images.info["files"][name]) for name in kept}
+    for name, entry in files.items():
+        copy_whole(images.folder / name, public / name)
+        if sha256_of(public / name) != entry["sha256"]:
+            (public / name).unlink()
+            raise InputError(
+                f"expected the image that was rendered in {images.folder / name}, got another one; "
+                "make the images again with 'modeharvest image'"
+            )
     grid = images.grid
     info = {
         "format": FORMAT,
@@ -269,20 +272,15 @@ def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
     """Whether both folders hold these images and their truth, nothing missing or changed."""
     try:
         info, hidden = read_json(public / SIDECAR), read_json(truth / SIDECAR)
+        digests = {name: entry["sha256"] for name, entry in info["files"].items()}
         return bool(
             info["id"] == hidden["id"]
             and hidden["key"] == images.info["key"]
-            and hidden["solution_sha256"] == _digest(truth / SOLUTION)
-            and (public / README).is_file()
-            and all(_digest(public / n) == f["sha256"] for n, f in info["files"].items())
+            and hidden["solution_sha256"] == sha256_of(truth / SOLUTION)
+            and all(
+                sha256_of(public / name) == expected
+                for name, expected in (digests | hidden["public_sha256"]).items()
+            )
         )
     except (InputError, KeyError, TypeError):
         return False
-
-
-def _digest(path: Path) -> str:
-    """SHA-256, hexadecimal; empty if there is no such file."""
-    if not path.is_file():
-        return ""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -37,8 +37,8 @@ class StudyRun:
         What to keep in mind: failures, results of other versions.
     files
         What lies beside the report, and what each holds.
-    timings, versions
-        Seconds of each stage; libraries.
+    versions
+        Of libraries.
     """
 
     title: str
@@ -49,7 +49,6 @@ class StudyRun:
     case: Mapping[str, Any]
     notes: tuple[str, ...]
     files: Mapping[str, str]
-    timings: Mapping[str, float]
     versions: Mapping[str, str]
 
 

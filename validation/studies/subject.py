@@ -210,7 +210,9 @@ def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> I
     """The images of a pair, made if they are not there."""
     own = folder / "images" / described["images"]
     try:
-        return ImageSet.read(own)
+        images = ImageSet.read(own)
+        if images.is_whole():
+            return images
     except InputError:
         pass
     solution, strain = Solution.read(folder / "solution.h5"), float(described["strain"])

@@ -10,6 +10,7 @@ import typer
 from modeharvest.cli.arguments import CaseName, OutFolder, SolutionFile
 from modeharvest.cli.messages import UNUSABLE, bars, tell
 from modeharvest.errors import InputError
+from modeharvest.stages import exclusive
 
 
 def make(
@@ -73,7 +74,7 @@ def score(
     from modeharvest import scoring
 
     declared = scoring.declarations(fields, name, unit, y_axis, first_pixel, column)
-    with bars() as progress:
+    with bars() as progress, exclusive(out):
         done = scoring.grade(declared, truth, strain, out, progress=progress)
     scoring.print_grading(done, out)
     for why in done.refused.values():
@@ -103,7 +104,7 @@ def star(
 
     levels = tuple(noise) if noise else (0.01,)
     spec = StarSpec(Star(rows, cols), fine_speckle(seed), levels, bits, seed)
-    with bars() as progress:
+    with bars() as progress, exclusive(out):
         made = make_star_set(spec, out, progress)
     residual = made.info["law"]["residual_of_inversion_px"]
     print(f"star {made.id}: {len(made.info['files'])} images of {rows} x {cols} px in {out}")
@@ -146,6 +147,6 @@ def resolution(
 
     declared = declarations(fields, name, None, y_axis, first_pixel, column)
     quiet = declarations(still, name, None, y_axis, first_pixel, column) if still else {}
-    with bars() as progress:
+    with bars() as progress, exclusive(out):
         done = grade_star(declared, quiet, folder, out, progress)
     print_star_grading(done, out)

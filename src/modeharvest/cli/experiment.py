@@ -47,7 +47,8 @@ def fem(case: CaseName, out: OutFolder) -> None:
     with _stages(case, out) as stages:
         solution = stages.fem()
     critical = solution.info.get("critical")
-    print(critical_line(None if critical is None else critical["strain"]))
+    material = solution.info["material"]
+    print(critical_line(None if critical is None else critical["strain"], material))
     for s in solution.snapshots:
         print(f"{100 * s.nominal_strain:6.2f} %  {s.branch:9}  negative pivots {s.negative_pivots}")
     for warning in solution.info.get("warnings", []):

@@ -7,7 +7,7 @@
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
     report.html  summary.json           report      everything that was found
-    stages.json                                     which stages are finished, and what they took
+    stages.json timings.json                        which stages are finished, what they took
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from modeharvest import __version__
 from modeharvest.errors import InputError
-from modeharvest.files import read_json, require_writable, write_json
+from modeharvest.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.harvest.experiment import Experiment, read_experiment
 from modeharvest.harvest.geometry import Geometry, find_geometry
 from modeharvest.harvest.inputs import all_files, named_files, of_each_photograph, require_inputs
@@ -27,7 +26,7 @@ from modeharvest.harvest.local import local_field
 from modeharvest.harvest.measure import Measured, measure
 from modeharvest.harvest.optics import Optics, calibrate_lens, calibrated_lens
 from modeharvest.harvest.pair import Pair
-from modeharvest.harvest.prepare import RECORD, Prepared, prepare
+from modeharvest.harvest.prepare import Prepared, prepare
 from modeharvest.harvest.told import harvest_of
 from modeharvest.idic.fields.files import read_field, write_field
 from modeharvest.idic.fields.local_field import LocalField
@@ -35,7 +34,7 @@ from modeharvest.idic.pull_back import pulled_back
 from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.progress import Progress, silent
-from modeharvest.stages import Stages, digest, file_digest
+from modeharvest.stages import Stages, digest, exclusive, stage_key
 from modeharvest.typed import plain
 from modeharvest.validation.harvest.report import write_harvest_report
 from modeharvest.validation.harvest.run import Harvest, HarvestTruth
@@ -44,6 +43,8 @@ from modeharvest.versions import versions
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
+_CODE = ("fem", "imaging", "idic", "harvest")
+"""Folders of the package that they depend on; how they are shown is in others."""
 
 
 @dataclass(frozen=True)
@@ -84,25 +85,24 @@ class Harvesting:
         if not table.calibration:
             return Optics()
         files = named_files(self.base, table.calibration, unique=False)
-        key = digest([plain(table), [file_digest(path) for path in files], __version__])
-        self.stages.do(
-            "optics",
-            key,
-            lambda: calibrate_lens(table, self.base, self.folder, self.progress),
-            self.folder / "distortion.json",
-            self.folder / "calibration.json",
-        )
+
+        def work() -> tuple[Path, ...]:
+            calibrate_lens(table, self.base, self.folder, self.progress)
+            return self.folder / "distortion.json", self.folder / "calibration.json"
+
+        key = stage_key([plain(table), [sha256_of(path) for path in files]], *_CODE)
+        self.stages.do("optics", key, work)
         return calibrated_lens(self.folder)
 
     def prepared(self) -> Prepared:
         """Make the photographs ready; leaves ``prepared/``."""
         folder = self.folder / "prepared"
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             distortion = self.optics.distortion
-            prepare(self.experiment, self.base, folder, distortion, self.progress)
+            return prepare(self.experiment, self.base, folder, distortion, self.progress).files
 
-        self.stages.do("prepare", self._prepared_key(), work, folder / RECORD)
+        self.stages.do("prepare", self._prepared_key(), work)
         return Prepared.read(folder)
 
     @cached_property
@@ -142,8 +142,6 @@ class Harvesting:
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
-        names = ("optics", "prepare", *(f"correlate {name}" for name in self.prepared().names))
-        seconds = {name: float(self.stages.finished(name).get("seconds", 0.0)) for name in names}
         return harvest_of(
             self.experiment,
             self.prepared(),
@@ -154,19 +152,26 @@ class Harvesting:
             truth=truth,
             source=self.source,
             folder=self.folder,
-            timings=seconds,
             versions=versions(*_LIBRARIES),
             progress=self.progress,
         )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
-        """Do everything that is not finished; returns the content of ``summary.json``."""
-        require_writable(self.folder)
-        self.results()
-        harvest = self.harvest(truth)
-        summary = harvest_summary(harvest)
-        write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
-        write_json(self.folder / "summary.json", summary)
+        """Do everything that is not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If another process works in the folder, it can't be written to, or no photograph can
+            be measured.
+        """
+        with exclusive(self.folder):
+            require_writable(self.folder)
+            self.results()
+            harvest = self.harvest(truth)
+            summary = harvest_summary(harvest)
+            write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
+            write_json(self.folder / "summary.json", summary)
         return summary
 
     # -- parts --------------------------------------------------------------------------
@@ -178,7 +183,7 @@ class Harvesting:
         result, field, start = self._paths(name)
         before = next(reversed(found), None)
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             try:
                 measured = measure(
                     self._pair(prepared, name, before, found),
@@ -191,13 +196,14 @@ class Harvesting:
                 )
             except InputError as error:
                 write_json(start, {"failed": str(error)})
-                return
+                return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
             told = {"held": measured.held, "blur_px": measured.blur_px, "said": measured.sentences}
             write_json(start, {"failed": "", **told})
+            return result, field, start
 
-        self.stages.do(f"correlate {name}", key, work, start)
+        self.stages.do(f"correlate {name}", key, work)
 
     def _local(self, prepared: Prepared, name: str) -> LocalField | None:
         return local_field(self.experiment, self.base, prepared, name, self.optics.distortion)
@@ -234,7 +240,7 @@ class Harvesting:
     def _prepared_key(self) -> str:
         tables, files = self.experiment.plain(), all_files(self.experiment, self.base)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
-        return digest([wanted, [[path.name, file_digest(path)] for path in files], __version__])
+        return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *_CODE)
 
     def _how(self) -> list[Any]:
         tables = self.experiment.plain()
@@ -243,7 +249,7 @@ class Harvesting:
     def _local_digest(self, name: str) -> str:
         files = self.experiment.local.files
         path = of_each_photograph(self.experiment, self.base, files, "local.files").get(name)
-        return "" if path is None else file_digest(path)
+        return "" if path is None else sha256_of(path)
 
 
 def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:

@@ -79,6 +79,12 @@ class Prepared:
         """The ideal pixels; the physical origin is the middle of the image."""
         return PixelGrid(**self.info["grid"])
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file, the record last."""
+        stems = (f"{name}{kind}" for name in ("reference", *self.names) for kind in ("", "_mask"))
+        return (*(self.folder / f"{stem}.tif" for stem in stems), self.folder / RECORD)
+
     def image(self, name: str = "reference") -> FloatImage:
         """(rows, cols) grey levels."""
         return read_image(self.folder / f"{name}.tif")

@@ -55,7 +55,6 @@ def harvest_of(
     truth: HarvestTruth | None = None,
     source: str,
     folder: Path,
-    timings: Mapping[str, float],
     versions: Mapping[str, str],
     progress: Progress = silent,
 ) -> Harvest:
@@ -71,7 +70,7 @@ def harvest_of(
         Of photographs made by a simulation.
     source, folder
         The experiment's file and the folder of the harvest, for the command to make it again.
-    timings, versions
+    versions
         For the record.
     progress
         Listener.
@@ -105,7 +104,6 @@ def harvest_of(
         truth=truth,
         command=f"modeharvest harvest {source} --out {folder}",
         toml=path.read_text("utf-8") if path.is_file() else "",
-        timings=timings,
         versions=versions,
     )
 

@@ -10,12 +10,12 @@
         solution.h5         what the finite elements found
         images/             noise-free images, masks and truth (modeharvest.imaging.imageset)
         distortion.json     of the lens
-        twin.json           where the stage really went; written last
+        twin.json           where the stage really went
+    stages.json             whether all that is finished
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 from modeharvest.case import TwinCase
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import atomic, read_json, write_json
+from modeharvest.files import atomic, copy_whole, read_json, write_json
 from modeharvest.imaging.calibration_target import photograph_target
 from modeharvest.imaging.distorted import seen_points
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
-from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
+from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.io import write_image
 from modeharvest.progress import Progress, silent
-from modeharvest.stages import digest
+from modeharvest.stages import Stages, stage_key
 from modeharvest.typed import plain
 
 FloatArray = NDArray[np.float64]
@@ -111,65 +111,45 @@ def make_twin(
     if spec.distortion is None:
         raise InputError("twin: expected an [imaging.distortion] to calibrate, got none")
     truth, photographs = twin.folder / "truth", twin.experiment.parent
-    key = digest([image_key(solution, strains, spec), plain(case.calibration)])
-    if _is_finished(twin, key):
-        return twin
-    _discard(twin)
-    solution.write(truth / "solution.h5")
-    images = make_images(solution, strains, spec, truth / "images", progress)
-    _copy_photographs(images, photographs)
-    lens = spec.lens(images.grid.shape)
-    assert lens is not None
-    write_distortion(truth / "distortion.json", lens)
-    target, seen = case.calibration, seen_points(lens, images.grid.shape)
-    shots = photograph_target(target, spec.speckle, seen, spec.sensor, spec.bits)
-    for k, (name, levels) in enumerate(shots):
-        progress(k, len(target.shifts_px), "images: calibration")
-        write_image(photographs / f"{name}.tif", levels)
-    with atomic(twin.experiment) as temporary:
-        temporary.write_text(_experiment_text(case, images), "utf-8")
-    write_json(
-        truth / _SIDECAR,
-        {
-            "key": key,
-            "stage_shifts_row_col_px": target.true_shifts.tolist(),
-            "photographs": {p.name: p.stat().st_size for p in sorted(photographs.glob("*.tif"))},
-        },
-    )
+    key = stage_key([image_key(solution, strains, spec), plain(case.calibration), case.title])
+
+    def work() -> list[Path]:
+        solution.write(truth / "solution.h5")
+        images = make_images(solution, strains, spec, truth / "images", progress)
+        taken = _copy_photographs(images, photographs)
+        lens = spec.lens(images.grid.shape)
+        assert lens is not None
+        write_distortion(truth / "distortion.json", lens)
+        target, seen = case.calibration, seen_points(lens, images.grid.shape)
+        shots = photograph_target(target, spec.speckle, seen, spec.sensor, spec.bits)
+        for k, (name, levels) in enumerate(shots):
+            progress(k, len(target.shifts_px), "images: calibration")
+            taken.append(photographs / f"{name}.tif")
+            write_image(taken[-1], levels)
+        with atomic(twin.experiment) as temporary:
+            temporary.write_text(_experiment_text(case, images), "utf-8")
+        shifts = {"stage_shifts_row_col_px": target.true_shifts.tolist()}
+        write_json(truth / _SIDECAR, shifts)
+        own = (truth / name for name in ("solution.h5", "distortion.json", _SIDECAR))
+        return [*images.files, *taken, *own, twin.experiment]
+
+    Stages(twin.folder).do("twin", key, work)
     return twin
 
 
-def _is_finished(twin: Twin, key: str) -> bool:
-    """Whether all is there, of the listed sizes, and of that key."""
-    try:
-        info, images = twin.info, twin.folder / "truth" / "images"
-        sizes: dict[str, int] = info["photographs"]
-        whole = all((twin.experiment.parent / n).stat().st_size == s for n, s in sizes.items())
-        whole = whole and is_complete(images, ImageSet.read(images).info["key"])
-        return whole and bool(info["key"] == key) and twin.experiment.is_file()
-    except (InputError, OSError, KeyError, TypeError):
-        return False
-
-
-def _discard(twin: Twin) -> None:
-    """Take away an older or an unfinished twin's photographs, the mark of completeness first."""
-    (twin.folder / "truth" / _SIDECAR).unlink(missing_ok=True)
-    for pattern in ("reference*.tif", "deformed_*.tif", "calibration_*.tif"):
-        for path in twin.experiment.parent.glob(pattern):
-            path.unlink()
-
-
-def _copy_photographs(images: ImageSet, folder: Path) -> None:
+def _copy_photographs(images: ImageSet, folder: Path) -> list[Path]:
     """Leave the exposures, and a second one of the reference, from which noise is measured."""
-    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
     for name, source in _exposures(images):
-        shutil.copyfile(images.folder / source, folder / f"{name}.tif")
+        paths.append(folder / f"{name}.tif")
+        copy_whole(images.folder / source, paths[-1])
     spec, again = images.spec, "reference_2"
     sensor = spec.sensor
     light = sensor.light(again) / sensor.light("reference")
     irradiance = light * (images.reference() - sensor.offset) / sensor.gain
     levels = sensor.expose(irradiance.astype(np.float32), spec.bits, again)
     write_image(folder / f"{again}.tif", levels)
+    return [*paths, folder / f"{again}.tif"]
 
 
 def _exposures(images: ImageSet) -> Iterator[tuple[str, str]]:

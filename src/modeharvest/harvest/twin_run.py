@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.case import TwinCase
-from modeharvest.fem.field import Solution
 from modeharvest.harvest.experiment import read_experiment
 from modeharvest.harvest.measure import Measured
 from modeharvest.harvest.pipeline import Harvesting
@@ -31,6 +30,7 @@ from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, silent
+from modeharvest.stages import exclusive
 from modeharvest.validation.harvest.run import FrameTruth, HarvestTruth, TruthRow
 
 FloatArray = NDArray[np.float64]
@@ -63,8 +63,7 @@ class TwinRun:
 
     def twin(self) -> Twin:
         """Make the photographs and their truth, unless they are there."""
-        run = Run(self.case, self.folder, self.progress, self.solution)
-        solution = run.fem() if self.solution is None else Solution.read(self.solution)
+        solution = Run(self.case, self.folder, self.progress, self.solution).solved()
         return make_twin(self.case, solution, self.folder / "twin", self.progress)
 
     def harvesting(self, twin: Twin) -> Harvesting:
@@ -76,11 +75,12 @@ class TwinRun:
 
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``."""
-        twin = self.twin()
-        harvesting = self.harvesting(twin)
-        results = harvesting.results()
-        truth = compare(twin, harvesting, results, self.progress)
-        return harvesting.all(truth)
+        with exclusive(self.folder):
+            twin = self.twin()
+            harvesting = self.harvesting(twin)
+            results = harvesting.results()
+            truth = compare(twin, harvesting, results, self.progress)
+            return harvesting.all(truth)
 
 
 def compare(

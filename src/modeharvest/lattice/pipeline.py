@@ -8,13 +8,14 @@
     family_*.json families.json     families    their spectra and mode families
     study.csv                       study       how the pattern depends on d/l and more
     report.html summary.json        report      everything of it that is there
-    stages.json                                 which stages are finished, and what they took
+    stages.json timings.json                    which stages are finished, and what they took
 
 ``modeharvest bloch`` is the first two, ``modeharvest modes`` all of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,7 +42,7 @@ from modeharvest.lattice.patterns import (
 )
 from modeharvest.lattice.summary import exports_in, summary_of
 from modeharvest.progress import Progress, silent
-from modeharvest.stages import Stages, digest
+from modeharvest.stages import Stages, exclusive, stage_key
 from modeharvest.validation.lattice.mode_study import ModeStudy
 from modeharvest.validation.lattice.report import write_lattice_report
 from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
@@ -85,11 +86,12 @@ class LatticeAnalysis:
         """
         path = self.folder / "critical.json"
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             found = find_critical(self._model.path(), self.case.search, self.progress)
             write_critical(path, self.case.loading.name, found)
+            return (path,)
 
-        self.stages.do("critical", self._keys["critical"], work, path)
+        self.stages.do("critical", self._keys["critical"], work)
         return read_critical(path)
 
     def dispersion(self) -> Dispersion:
@@ -98,7 +100,7 @@ class LatticeAnalysis:
         path = self.folder / "dispersion.h5"
         table = path.with_suffix(".csv")
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
             cell_path, zone = self._model.path(max(loads)), list[ZoneMap]()
             tour = plan.tour(self.case.lattice, self.case.loading)
@@ -108,8 +110,9 @@ class LatticeAnalysis:
                 zone.append(zone_map(cell_path, critical.load, divisions, self.progress))
             replace(found, zone=tuple(zone)).write(path)
             found.write_csv(table)
+            return path, table
 
-        self.stages.do("dispersion", self._keys["dispersion"], work, path, table)
+        self.stages.do("dispersion", self._keys["dispersion"], work)
         return Dispersion.read(path)
 
     def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
@@ -126,7 +129,7 @@ class LatticeAnalysis:
         path = self.folder / "modes.h5"
         others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             cell_path = self._model.path(max(plan.load, critical.load))
             step = self.case.search.largest_step
             how = (self.case.material, critical, plan, step, self._info(critical))
@@ -134,8 +137,9 @@ class LatticeAnalysis:
             write_modes(path, *found)
             for write, other in others.items():
                 write(other, *found)
+            return path, *others.values()
 
-        self.stages.do("modes", self._keys["modes"], work, path, *others.values())
+        self.stages.do("modes", self._keys["modes"], work)
         return read_modes(path)
 
     def families(self) -> None:
@@ -143,16 +147,15 @@ class LatticeAnalysis:
         self.modes()
         index = self.folder / "families.json"
 
-        def work() -> None:
-            for path in self.folder.glob("family_*.json"):  # perhaps of other modes
-                path.unlink()
+        def work() -> list[Path]:
             for k, pattern in enumerate(self._patterns):
                 self.progress(k, len(self._patterns), "mode families")
                 find_family(pattern, self.case.lattice.pitch, self.folder)
             self.progress(1, 1, "mode families")
             write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
+            return [index, *(self.folder / pattern.file for pattern in self._patterns)]
 
-        self.stages.do("families", self._keys["families"], work, index)
+        self.stages.do("families", self._keys["families"], work)
 
     def study(self) -> None:
         """Do the study, if the case has one; leaves ``study.csv``."""
@@ -161,13 +164,14 @@ class LatticeAnalysis:
         path, key = self.folder / "study.csv", self._keys["study"]
         rows = self.folder / f"study-{key[:8]}.csv"  # of this very study, to go on from
 
-        def work() -> None:
+        def work() -> tuple[Path, ...]:
             self.case.run_study(rows, self.progress)
             rows.replace(path)
             for other in self.folder.glob("study-*.csv"):  # of studies given up
                 other.unlink()
+            return (path,)
 
-        self.stages.do("study", key, work, path)
+        self.stages.do("study", key, work)
 
     def report(self) -> dict[str, Any]:
         """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
@@ -175,21 +179,30 @@ class LatticeAnalysis:
         Whatever was computed in this folder for this very case is in it.
         """
         path, page = self.folder / "summary.json", self.folder / "report.html"
+        done = self._finished()
 
-        def work() -> None:
-            run = self._run()
+        def work() -> tuple[Path, ...]:
+            run = self._run(done)
             write_lattice_report(page, run, self.progress)
-            write_json(path, summary_of(run, self.case, self._found_patterns()))
+            found = self._found_patterns() if "families" in done else []
+            write_json(path, summary_of(run, self.case, found))
+            return path, page
 
-        key = digest([self._finished, self.case.title, self.source, __version__])
-        self.stages.do("report", key, work, path, page)
+        self.stages.do("report", stage_key([done, self.case.title, self.source]), work)
         content: dict[str, Any] = read_json(path)
         return content
 
     def bloch(self) -> dict[str, Any]:
-        """Stability against all waves, and dispersion; returns the content of ``summary.json``."""
-        self.dispersion()
-        return self.report()
+        """Stability against all waves, and dispersion; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If another process works in the folder.
+        """
+        with exclusive(self.folder):
+            self.dispersion()
+            return self.report()
 
     def all(self) -> dict[str, Any]:
         """All stages that are not finished; returns the content of ``summary.json``.
@@ -197,16 +210,18 @@ class LatticeAnalysis:
         Raises
         ------
         InputError
-            If modes can't be had; what there is is reported before.
+            If another process works in the folder, or modes can't be had; what there is is
+            reported before.
         """
-        self.dispersion()
-        try:
-            self.families()
-            self.study()
-        except InputError:
-            self.report()
-            raise
-        return self.report()
+        with exclusive(self.folder):
+            self.dispersion()
+            try:
+                self.families()
+                self.study()
+            except InputError:
+                self.report()
+                raise
+            return self.report()
 
     # -- parts --------------------------------------------------------------------------
 
@@ -228,15 +243,13 @@ class LatticeAnalysis:
         return patterns(self._model.path(load), load, *self.modes(), self._info(critical))
 
     def _found_patterns(self) -> list[FoundPattern]:
-        if "families" not in self._finished:
-            return []
         return [found_pattern(pattern, self.folder) for pattern in self._patterns]
 
-    def _run(self) -> LatticeRun:
+    def _run(self, done: Collection[str]) -> LatticeRun:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
 
-        unit, done, critical = self._model.unit, self._finished, self.critical()
+        unit, critical = self._model.unit, self.critical()
         modes, branches = self.modes() if "modes" in done else (None, ())
         command = "modes" if "families" in done else "bloch"
         return LatticeRun(
@@ -250,17 +263,14 @@ class LatticeAnalysis:
             dispersion=self.dispersion() if "dispersion" in done else None,
             modes=modes,
             branches=branches,
-            patterns=self._shown(modes) if modes else (),
+            patterns=self._shown(modes) if modes and "families" in done else (),
             study=self._study() if "study" in done else None,
             notes=[note for note in (why_no_modes(critical, self.case.modes),) if note],
             exports=exports_in(self.folder),
-            timings={name: self.stages.finished(name)["seconds"] for name in done},
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )
 
     def _shown(self, modes: ModeSet) -> list[FoundPattern]:
-        if "families" not in self._finished:
-            return []
         return to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
 
     def _study(self) -> ModeStudy | None:
@@ -271,7 +281,6 @@ class LatticeAnalysis:
     def _keys(self) -> dict[str, str]:
         return stage_keys(self.case)
 
-    @property
     def _finished(self) -> dict[str, str]:
         """The keys of the stages that are finished for this very case."""
         return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}

@@ -40,8 +40,8 @@ density [N/mm^4]:
     What a reader should know.
 ``files``
     Names of the files beside this one, and what they hold.
-``timings_s``, ``versions``
-    What it took, and with which software.
+``versions``
+    With which software; what it took is in ``timings.json``.
 """
 
 from __future__ import annotations
@@ -95,7 +95,6 @@ def summary_of(
         "study": None if run.study is None else _study(run.study),
         "notes": list(run.notes),
         "files": dict(run.exports),
-        "timings_s": dict(run.timings),
         "versions": dict(run.versions),
     }
 

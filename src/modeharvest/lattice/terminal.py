@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from modeharvest.fem.materials import material_in_words
 from modeharvest.validation.lattice.plots_branches import combination_name
 
 
@@ -18,7 +19,8 @@ def print_lattice(summary: dict[str, Any], out: Path) -> None:
     """Print what was found, the file of the report last."""
     console = Console(highlight=False)
     console.print(f"[bold]{escape(summary['title'])}[/bold]")
-    for line in _critical(summary["critical"], summary["outcome"]):
+    material = material_in_words(summary["case"]["material"])
+    for line in (*_critical(summary["critical"], summary["outcome"]), material):
         console.print(escape(line), soft_wrap=True)
     console.print(_dispersion(summary))
     for part in summary["zone"]:

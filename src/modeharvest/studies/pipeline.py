@@ -7,6 +7,7 @@
     subjects/ images/        pairs of images, and how they are correlated
     cases/KEY.json           one file for each case, written when it is done
     table.csv                one row for each case
+    timings.json             what it took; all else is the same after every run
     *.csv                    the report's tables
     summary.json report.html what it tells
 """
@@ -14,6 +15,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +30,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.files import atomic, read_json, require_writable, write_json
 from modeharvest.pipeline import Run
 from modeharvest.progress import Progress, named, silent
+from modeharvest.stages import Stages, exclusive
 from modeharvest.studies.case import StudyCase, read_study
 from modeharvest.validation.campaign import Campaign, Workers
 from modeharvest.validation.studies.report import StudyRun, slug, write_study_report
@@ -68,10 +72,9 @@ class StudyPipeline:
 
     def _solution(self) -> Solution:
         """The exact displacements, simulated or read from a file; leaves ``solution.h5``."""
-        if self.solution is None:
-            return Run(self.case, self.folder, self.progress).fem()
-        solution = Solution.read(self.solution)
-        solution.write(self.folder / "solution.h5")
+        solution = Run(self.case, self.folder, self.progress, self.solution).solved()
+        if self.solution is not None:
+            solution.write(self.folder / "solution.h5")
         return solution
 
     def all(self) -> dict[str, Any]:
@@ -80,37 +83,45 @@ class StudyPipeline:
         Raises
         ------
         InputError
-            If no case succeeded, the folder can't be written to or holds anything else, a
-            scheduler is not there, or its workers can't do the work.
+            If no case succeeded, the folder can't be written to, holds anything else or is
+            another process's, a scheduler is not there, or its workers can't do the work.
         """
         folder, study = self.folder.resolve(), self.case.study
-        require_writable(folder)
-        _claim(folder, self.case.kind)
-        self.workers.require_ready(study.function, folder)
-        clock = _Clock()
-        cases = study.prepare(self.subject(), folder, self.progress)
-        clock.lap("solution and images")
-        campaign = Campaign(study.function, cases, folder)
-        table = campaign.run(self.workers, named(self.progress, f"study: {len(cases)} cases"))
-        clock.lap("cases")
-        if (table["error"] != "").all():
-            raise InputError(f"all {len(table)} cases failed; the first: {table['error'].iloc[0]}")
-        findings = study.findings(table, folder)
-        clock.lap("findings")
-        return self._tell(campaign, table, findings, clock.laps)
+        with exclusive(folder):
+            require_writable(folder)
+            _claim(folder, self.case.kind)
+            self.workers.require_ready(study.function, folder)
+            with self._timed("solution and images"):
+                cases = study.prepare(self.subject(), folder, self.progress)
+            campaign = Campaign(study.function, cases, folder)
+            with self._timed("cases"):
+                listener = named(self.progress, f"study: {len(cases)} cases")
+                table = campaign.run(self.workers, listener)
+            if (table["error"] != "").all():
+                first = table["error"].iloc[0]
+                raise InputError(f"all {len(table)} cases failed; the first: {first}")
+            with self._timed("findings"):
+                findings = study.findings(table, folder)
+            return self._tell(campaign, table, findings)
 
-    def _tell(
-        self, campaign: Campaign, table: pd.DataFrame, findings: Findings, laps: dict[str, float]
-    ) -> dict[str, Any]:
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        """Take down what a stage takes."""
+        begin = time.perf_counter()
+        yield
+        Stages(self.folder).took(stage, time.perf_counter() - begin)
+
+    def _tell(self, campaign: Campaign, table: pd.DataFrame, findings: Findings) -> dict[str, Any]:
         """Leave tables, ``summary.json`` and ``report.html``."""
-        files = {"table.csv": "every case: its values, seconds, error, result"}
+        files = {"table.csv": "every case: its values, error, result"}
         for title, part in {**findings.tables, **findings.attachments}.items():
             name = f"{slug(title)}.csv"
             files[name] = title
             with atomic(self.folder / name) as temporary:
                 part.to_csv(temporary, index=False)
         files["summary.json"] = "the findings' numbers and sentences, and the failures"
-        summary = self._summary(campaign, table, findings, laps)
+        files["timings.json"] = "what the stages took [s]"
+        summary = self._summary(campaign, table, findings)
         write_json(self.folder / "summary.json", summary)
         study: Study = self.case.study
         run = StudyRun(
@@ -122,14 +133,13 @@ class StudyPipeline:
             case=summary["case"],
             notes=_notes(summary),
             files=files,
-            timings=laps,
             versions=summary["versions"],
         )
         write_study_report(self.folder / "report.html", run)
         return summary
 
     def _summary(
-        self, campaign: Campaign, table: pd.DataFrame, findings: Findings, laps: dict[str, float]
+        self, campaign: Campaign, table: pd.DataFrame, findings: Findings
     ) -> dict[str, Any]:
         """The content of ``summary.json``; docs/studies.md tells its keys."""
         failed = table[table["error"] != ""]
@@ -141,13 +151,11 @@ class StudyPipeline:
             "sentences": list(findings.sentences),
             "numbers": _plain(dict(findings.numbers)),
             "cases": len(table),
-            "seconds_of_all_cases": float(table["seconds"].sum()),
             "failed": [
                 {"file": campaign.path(campaign.cases[k]).name, "error": failed["error"][k]}
                 for k in failed.index
             ],
             "other_results_by_version": campaign.of_other_versions(),
-            "timings_s": laps,
             "versions": _versions(),
             "case": self.case.plain(),
         }
@@ -185,7 +193,7 @@ def _claim(folder: Path, kind: str) -> None:
     """Take a folder for a kind of study; InputError if it holds anything else."""
     path, holds = folder / "study.json", f"a {kind} study"
     if path.is_file():
-        holds = f"a {read_json(path)['kind']} study"
+        holds = f"a {_kind_in(path, kind)} study"
     elif (folder / "summary.json").exists():
         holds = "something that is no study (it has a summary.json, but no study.json)"
     if holds != f"a {kind} study":
@@ -194,6 +202,14 @@ def _claim(folder: Path, kind: str) -> None:
             f"{holds}; take another with --out"
         )
     write_json(path, {"kind": kind})
+
+
+def _kind_in(path: Path, kind: str) -> str:
+    """The kind that a folder's ``study.json`` says; the one asked for if that is damaged."""
+    try:
+        return str(read_json(path)["kind"])
+    except (InputError, KeyError, TypeError):
+        return kind
 
 
 def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
@@ -229,16 +245,3 @@ def _plain(value: Any) -> Any:
 def _versions() -> dict[str, str]:
     libraries = ("numpy", "scipy", "numba", "distributed")
     return {"modeharvest": __version__} | {name: version(name) for name in libraries}
-
-
-class _Clock:
-    """Wall-clock seconds of one stage after another."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.laps[stage] = now - self._last
-        self._last = now

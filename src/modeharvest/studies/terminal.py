@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from modeharvest.errors import InputError
 from modeharvest.progress import Progress
+from modeharvest.stages import Stages
 from modeharvest.studies.case import read_study
 from modeharvest.studies.pipeline import StudyPipeline
 from modeharvest.validation.campaign import Workers
@@ -57,9 +58,6 @@ def print_study(summary: dict[str, Any], out: Path) -> None:
             f"[yellow]failed:[/yellow] cases/{failure['file']}: {escape(str(failure['error']))}",
             soft_wrap=True,
         )
-    seconds = summary["timings_s"]
-    console.print(
-        f"{summary['cases']} cases, {summary['seconds_of_all_cases']:.0f} s of work; this run "
-        f"took {sum(seconds.values()):.0f} s"
-    )
+    took = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in Stages(out).timings.items())
+    console.print(f"{summary['cases']} cases; {took}", soft_wrap=True, markup=False)
     console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)

@@ -40,7 +40,7 @@ def findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:
     seen = measured(ran)
     sizes = _of_sizes(seen).sort_values("ratio")
     return Findings(
-        numbers={"specimens": ran.drop(columns=["error", "seconds"]).to_dict("records")},
+        numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
         sentences=tuple(_sentences(ran, seen)),
         keys=_keys(seen, sizes),
         plots=tuple(_plots(seen, sizes, folder, seeds)),

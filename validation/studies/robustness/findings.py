@@ -85,7 +85,6 @@ def numbers(asked: pd.DataFrame, radius: float) -> dict[str, Any]:
         "largest_start_distance_px": float(asked["start_distance_px"].max()),
         "elsewhere_but_called_converged": int((others["outcome"] == "converged").sum()),
         "failed": int((asked["error"] != "").sum()),
-        "mean_seconds": float(asked["seconds"].mean()),
         "paper": PAPER,
     }
 

@@ -1,0 +1,143 @@
+"""A command run again and again, disturbed each time, until it succeeds.
+
+::
+
+    python disturbed.py OUT kill SEED COMMAND...         killed while it writes a file
+    python disturbed.py OUT disk BYTES STEP COMMAND...   on a disk of BYTES, and STEP more each time
+
+``OUT`` is what the command leaves. Prints a JSON object for each attempt: ``code``, its exit code
+or minus the signal that ended it, ``said``, what it wrote to stderr, and ``files``, the digests of
+what is there afterwards.
+
+Each attempt is a fork of this process, which has imported what takes long and computed nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+NO_DISK = 77
+_MODULES = ("pipeline", "harvest.pipeline", "validation.harvest.report", "studies.pipeline", "cli")
+_NEW_USER, _NEW_MOUNTS, _REMOUNT = 0x10000000, 0x00020000, 0x20
+_ATTEMPTS = 60
+
+
+def deadly(seed: int, most: int) -> None:
+    """Let this process be killed at one of its next writes: amid it, before or after the rename."""
+    rng, replace = random.Random(seed), os.replace
+    left, moment = rng.randint(1, most), rng.choice(("amid", "before", "after"))
+
+    def killing(source: Any, target: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left == 0 and moment == "amid":
+            os.truncate(source, os.path.getsize(source) // 2)
+        if left == 0 and moment != "after":
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(source, target)
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    os.replace = killing  # type: ignore[assignment]
+
+
+class Disk:
+    """A file system in memory that nobody else sees, over a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._folder = folder
+        user, group = os.getuid(), os.getgid()
+        self._require(self._libc.unshare(_NEW_USER | _NEW_MOUNTS))
+        Path("/proc/self/uid_map").write_text(f"0 {user} 1")
+        Path("/proc/self/setgroups").write_text("deny")
+        Path("/proc/self/gid_map").write_text(f"0 {group} 1")
+        folder.mkdir(parents=True)
+        self._mount(4096, 0)
+
+    def resize(self, size: int) -> None:
+        self._mount(size, _REMOUNT)
+
+    def _mount(self, size: int, flags: int) -> None:
+        options = f"size={size}".encode()
+        where = os.fsencode(self._folder)
+        self._require(self._libc.mount(b"none", where, b"tmpfs", flags, options))
+
+    def _require(self, answer: int) -> None:
+        if answer:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
+    """Run the command once in a fork, and print what became of it."""
+    from modeharvest.cli import main
+
+    with tempfile.TemporaryFile() as said:
+        child = os.fork()
+        if child == 0:
+            os.dup2(said.fileno(), 2)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            sys.argv = ["modeharvest", *command]
+            prepare()
+            try:
+                main()
+            except SystemExit as end:
+                sys.stderr.flush()
+                os._exit(int(end.code or 0))
+            except BaseException:
+                sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+            os._exit(1)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said.seek(0)
+        text = said.read().decode()
+    print(json.dumps({"code": code, "said": text, "files": digests(out)}), flush=True)
+    return code
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file in a folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
+
+
+def main() -> None:
+    out, way, first, *rest = sys.argv[1:]
+    for module in _MODULES:
+        importlib.import_module(f"modeharvest.{module}")
+    assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
+    disk = None
+    if way == "disk":
+        step, *rest = rest
+        try:
+            disk = Disk(Path(out))
+        except OSError as error:
+            print(error)
+            sys.exit(NO_DISK)
+    for number in range(_ATTEMPTS):
+        prepare: Callable[[], None] = int  # does nothing
+        if disk is not None:
+            disk.resize(int(first) + number * int(step))
+        elif int(first):  # later each time, so that even a long stage ends
+            prepare = partial(deadly, 1000 * int(first) + number, 4 + 2 * number)
+        if attempt(rest, Path(out), prepare) == 0:
+            return
+    sys.exit("it never succeeded")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""Runs that are killed, run out of disk or meet another process end like undisturbed ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import disturbed
+import pytest
+import synthetic_benchmark
+
+from modeharvest.case import shipped_solution
+from modeharvest.fem.field import Solution
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.spec import ImagingSpec
+
+TIMINGS = "timings.json"
+"""The one file that two runs leave different."""
+CASE = f"""{synthetic_benchmark.CASE}
+[correlation]
+v0_degree = 3
+v_degree = 2
+"""
+HARVEST = """
+title = "A test"
+[images]
+reference = "reference.tif"
+deformed = ["frame_1.tif"]
+[scale]
+pixel_size = 0.05
+[specimen]
+cell_size = 1.9
+"""
+LATTICE = """
+[lattice]
+kind = "square"
+pitch = 1.0
+diameter = 0.8696
+mesh_size = 0.2
+[loading]
+kind = "equibiaxial"
+[search]
+divisions = 4
+[dispersion]
+points = 6
+map_divisions = 0
+"""
+FEM = """
+[experiment]
+strains = [0.02]
+mesh_size = 0.9
+[experiment.specimen]
+holes_x = 2
+holes_y = 2
+"""
+STUDY = """
+[study]
+kind = "robustness"
+starts = 2
+radii = []
+strain_errors = []
+[imaging]
+pixel_size = 0.07
+"""
+
+
+def write_case(folder: Path) -> None:
+    (folder / "case.toml").write_text(CASE, "utf-8")
+    synthetic_benchmark.solution().write(folder / "given.h5")
+
+
+def write_photographs(folder: Path) -> None:
+    path = shipped_solution("paper-virtual")
+    assert path is not None
+    spec = ImagingSpec(pixel_size=0.05, background=0.1, sensor=Sensor(read_noise=0.01))
+    made = make_images(Solution.read(path), (0.128,), spec, folder / "made")
+    shutil.copy(made.folder / "reference_8bit.tif", folder / "reference.tif")
+    shutil.copy(made.folder / "deformed_1280_8bit.tif", folder / "frame_1.tif")
+    (folder / "test.toml").write_text(HARVEST, "utf-8")
+
+
+def write_study(folder: Path) -> None:
+    path = shipped_solution("paper-virtual")
+    assert path is not None
+    shutil.copy(path, folder / "given.h5")
+    (folder / "study.toml").write_text(STUDY, "utf-8")
+
+
+def write_fem(folder: Path) -> None:
+    (folder / "fem.toml").write_text(FEM, "utf-8")
+
+
+def write_lattice(folder: Path) -> None:
+    (folder / "cell.toml").write_text(LATTICE, "utf-8")
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A command, what it needs beside it, and bytes of disk: where to begin, how much more."""
+
+    command: str
+    write_inputs: Callable[[Path], None]
+    disk: tuple[int, int]
+
+
+GIVEN = "--solution given.h5"
+PIPELINES = {
+    "run": Pipeline(f"run case.toml {GIVEN}", write_case, (40_000, 400_000)),
+    "make": Pipeline(f"benchmark make case.toml {GIVEN}", write_case, (40_000, 250_000)),
+    "harvest": Pipeline("harvest test.toml", write_photographs, (40_000, 500_000)),
+    "study": Pipeline(f"study study.toml {GIVEN} --workers 1", write_study, (40_000, 600_000)),
+    "fem": Pipeline("fem fem.toml", write_fem, (8_192, 40_000)),
+    "bloch": Pipeline("bloch cell.toml", write_lattice, (8_192, 200_000)),
+}
+NEEDS_DOLFINX = ("fem", "bloch")
+every_pipeline = pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.dolfinx] * (n in NEEDS_DOLFINX)) for n in PIPELINES],
+)
+
+
+def attempts(folder: Path, pipeline: Pipeline, *way: object) -> list[dict[str, Any]]:
+    """Every attempt at a command with its output in ``folder/disk``, the last a success."""
+    folder.mkdir()
+    pipeline.write_inputs(folder)
+    where = "disk/set" if "make" in pipeline.command else "disk/out"
+    command = [*pipeline.command.split(), "--out", where]
+    done = subprocess.run(
+        [sys.executable, disturbed.__file__, folder / "disk", *map(str, way), *command],
+        capture_output=True, text=True, timeout=900, cwd=folder,
+    )  # fmt: skip
+    if done.returncode == disturbed.NO_DISK:
+        pytest.skip(f"no disk of one's own can be had here: {done.stdout}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Digests of what a pipeline leaves, by its name."""
+    found: dict[str, dict[str, str]] = {}
+
+    def of(name: str) -> dict[str, str]:
+        if name not in found:
+            folder = tmp_path_factory.mktemp(name) / "plain"
+            (only,) = attempts(folder, PIPELINES[name], "kill", 0)
+            found[name] = lasting(only["files"])
+        return found[name]
+
+    return of
+
+
+def lasting(files: Mapping[str, str]) -> dict[str, str]:
+    return {name: digest for name, digest in files.items() if Path(name).name != TIMINGS}
+
+
+@every_pipeline
+def test_killed_at_random_it_ends_like_an_undisturbed_run(
+    name: str, undisturbed: Any, tmp_path: Path
+) -> None:
+    every = attempts(tmp_path / "killed", PIPELINES[name], "kill", 1)
+    assert [a["code"] for a in every] == [-9] * (len(every) - 1) + [0]
+    assert len(every) > 2
+    assert lasting(every[-1]["files"]) == undisturbed(name)
+
+
+@every_pipeline
+def test_a_full_disk_is_told_in_one_line_and_leaves_whole_files_to_go_on_from(
+    name: str, undisturbed: Any, tmp_path: Path
+) -> None:
+    expected = undisturbed(name)
+    every = attempts(tmp_path / "full", PIPELINES[name], "disk", *PIPELINES[name].disk)
+    assert [a["code"] for a in every] == [2] * (len(every) - 1) + [0]
+    assert len(every) > 2
+    for failed in every[:-1]:
+        (line,) = [row for row in failed["said"].splitlines() if "error:" in row]
+        assert "No space left on device" in line
+        assert "Traceback" not in failed["said"]
+        for path, digest in lasting(failed["files"]).items():
+            if Path(path).name != "stages.json":
+                assert digest == expected[path], path
+    assert lasting(every[-1]["files"]) == expected
