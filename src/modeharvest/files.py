@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,14 +18,17 @@ import h5py
 from modeharvest.errors import InputError
 from modeharvest.reading import reading
 
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.part(\.[^.]*)?")
+"""Names that :func:`atomic` gives, with the process in them."""
+
 
 @contextmanager
 def atomic(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds.
 
     Whatever ends the block early (an exception, a full disk, Ctrl-C) removes the temporary
-    file, so a reader never sees half a file; what a killed process left of it is removed by the
-    next that writes ``path``. File and folder reach the disk before the block ends, so that a
+    file, so a reader never sees half a file; what a killed process left is removed by the next
+    that writes in the same folder. File and folder reach the disk before the block ends, so that a
     power cut leaves no empty file under a finished name. The suffix is kept, because libraries
     choose formats by it.
 
@@ -37,7 +41,7 @@ def atomic(path: Path | str) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_orphans(path)
+        remove_orphans(path.parent)
         yield temporary
         _flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
@@ -59,14 +63,12 @@ def _flush(path: Path, mode: int) -> None:
         os.close(descriptor)
 
 
-def _remove_orphans(path: Path) -> None:
-    """Remove temporary files of ``path`` whose process is no more."""
-    before, after = f".{path.stem}.", f".part{path.suffix}"
-    for name in os.listdir(path.parent):
-        if name.startswith(before) and name.endswith(after):
-            number = name[len(before) : len(name) - len(after)]
-            if number.isdecimal() and not may_be_alive(int(number)):
-                path.with_name(name).unlink(missing_ok=True)
+def remove_orphans(folder: Path | str) -> None:
+    """Remove temporary files in a folder whose process is no more."""
+    for name in os.listdir(folder):
+        orphan = _TEMPORARY.fullmatch(name)
+        if orphan and not may_be_alive(int(orphan[1])):
+            Path(folder, name).unlink(missing_ok=True)
 
 
 def may_be_alive(process: int) -> bool:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest.errors import InputError
-from modeharvest.files import may_be_alive, read_json, sha256_of, write_json
+from modeharvest.files import may_be_alive, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.ranks import on_first
 from modeharvest.versions import source_digest
 
@@ -227,6 +227,7 @@ class _Lock:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             while self._file is None:
                 self._file = self._locked()
+            remove_orphans(self._path.parent)
         except OSError as error:
             if error.errno not in _READ_ONLY:
                 reason = error.strerror or error
