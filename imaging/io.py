@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -132,8 +133,11 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
         image = image.astype(np.float32)
     elif image.dtype not in (np.float32, np.uint8, np.uint16):
         raise InputError(f"expected float32, uint8 or uint16 for {path}, got {image.dtype}")
+    # In memory first: on a full disk it would say how many values it could not write, not why.
+    memory = io.BytesIO()
+    tifffile.imwrite(memory, image, photometric="minisblack")
     with atomic(path) as temporary:
-        tifffile.imwrite(temporary, image, photometric="minisblack")
+        temporary.write_bytes(memory.getbuffer())
 
 
 def _read(path: Path) -> NDArray[Any]:

@@ -49,13 +49,15 @@ kind = "equibiaxial"
 [search]
 divisions = 4
 [dispersion]
-points = 6
+points = 8
 map_divisions = 0
+[modes]
+branch_loads = [0.012]
 """
 FEM = """
 [experiment]
 strains = [0.02]
-mesh_size = 0.9
+mesh_size = 0.5
 [experiment.specimen]
 holes_x = 2
 holes_y = 2
@@ -117,9 +119,9 @@ PIPELINES = {
     "harvest": Pipeline("harvest test.toml", write_photographs, (40_000, 500_000)),
     "study": Pipeline(f"study study.toml {GIVEN} --workers 1", write_study, (40_000, 600_000)),
     "fem": Pipeline("fem fem.toml", write_fem, (8_192, 40_000)),
-    "bloch": Pipeline("bloch cell.toml", write_lattice, (8_192, 200_000)),
+    "modes": Pipeline("modes cell.toml", write_lattice, (8_192, 150_000)),
 }
-NEEDS_DOLFINX = ("fem", "bloch")
+NEEDS_DOLFINX = ("fem", "modes")
 every_pipeline = pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.dolfinx] * (n in NEEDS_DOLFINX)) for n in PIPELINES],
