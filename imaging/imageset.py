@@ -93,8 +93,8 @@ class ImageSet:
             states = [images._snapshot(strain)["truth"] for strain in images.strains]
             for entry in (images.info["reference"], *map(images._snapshot, images.strains)):
                 states += [entry[name] for name in ("image", "camera_image", "mask")]
-            if not all(isinstance(name, str) for name in states):
-                raise InputError(f"expected names of files, got {states}")
+            if not set(states) <= set(images.digests):
+                raise InputError(f"expected digests of {states}, got {list(images.digests)}")
             return images
 
     @property
@@ -146,18 +146,18 @@ class ImageSet:
         return read_truth(self._whole(self._snapshot(strain)["truth"]))
 
     @property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of every file but the sidecar, by their names."""
+        return {name: str(entry["sha256"]) for name, entry in self.info["files"].items()}
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """Every file of the set, the sidecar last."""
-        return (*(self.folder / name for name in self.info["files"]), self.folder / SIDECAR)
+        return (*(self.folder / name for name in self.digests), self.folder / SIDECAR)
 
     def is_whole(self) -> bool:
         """Whether every file is what was written, by its SHA-256."""
-        try:
-            for name in self.info["files"]:
-                self._whole(name)
-        except (InputError, KeyError, TypeError):
-            return False
-        return True
+        return all(sha256_of(self.folder / name) == s for name, s in self.digests.items())
 
     def displacement(self, strain: float) -> FloatArray:
         """(rows, cols, 2) true displacement [mm] at the reference image's pixels, NaN off it."""
@@ -173,7 +173,7 @@ class ImageSet:
     def _whole(self, name: str) -> Path:
         """The path of a file; InputError unless its SHA-256 is the one it was written with."""
         path = self.folder / name
-        if sha256_of(path) != self.info["files"][name]["sha256"]:
+        if sha256_of(path) != self.digests[name]:
             raise InputError(
                 f"expected {path} as {SIDECAR} has its SHA-256, got another file or none; make it "
                 "again with 'modeharvest image'"
