@@ -32,25 +32,40 @@ NO_DISK = 77
 _MODULES = ("pipeline", "harvest.pipeline", "validation.harvest.report", "studies.pipeline", "cli")
 _NEW_USER, _NEW_MOUNTS, _REMOUNT = 0x10000000, 0x00020000, 0x20
 _ATTEMPTS = 60
+_DANGER = 0.3
+"""Probability to be killed at a write."""
 
 
-def deadly(seed: int, most: int) -> None:
-    """Let this process be killed at one of its next writes: amid it, before or after the rename."""
+def deadly(seed: int, is_armed: bool) -> None:
+    """Let this process be killed amid a write, before or after the rename, within a stage.
+
+    That is the first it works on if it ``is_armed``, or else the one after the first that it
+    finishes. It never gets as far as to take down that it is finished.
+    """
     rng, replace = random.Random(seed), os.replace
-    left, moment = rng.randint(1, most), rng.choice(("amid", "before", "after"))
 
     def killing(source: Any, target: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left == 0 and moment == "amid":
+        nonlocal is_armed
+        is_end = Path(target).name in ("stages.json", "timings.json") and keys(source) > keys(
+            target
+        )
+        if not is_armed or not (is_end or rng.random() < _DANGER):
+            replace(source, target)
+            is_armed = is_armed or (is_end and Path(target).name == "timings.json")
+            return
+        moment = rng.choice(("amid", "before") if is_end else ("amid", "before", "after"))
+        if moment == "amid":
             os.truncate(source, os.path.getsize(source) // 2)
-        if left == 0 and moment != "after":
-            os.kill(os.getpid(), signal.SIGKILL)
-        replace(source, target)
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+        elif moment == "after":
+            replace(source, target)
+        os.kill(os.getpid(), signal.SIGKILL)
 
     os.replace = killing  # type: ignore[assignment]
+
+
+def keys(path: Any) -> set[str]:
+    """Of a JSON object; none of no file."""
+    return set(json.loads(Path(path).read_text())) if Path(path).exists() else set()
 
 
 class Disk:
@@ -132,8 +147,8 @@ def main() -> None:
         prepare: Callable[[], None] = int  # does nothing
         if disk is not None:
             disk.resize(int(first) + number * int(step))
-        elif int(first):  # later each time, so that even a long stage ends
-            prepare = partial(deadly, 1000 * int(first) + number, 4 + 2 * number)
+        elif int(first):
+            prepare = partial(deadly, 1000 * int(first) + number, number == 0)
         code = attempt(rest, Path(out), prepare)
         if code != (-signal.SIGKILL if disk is None else 2):
             return
