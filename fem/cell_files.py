@@ -6,6 +6,8 @@ Lengths are millimetres. What the copies of a cell must do to fit together is ch
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from modeharvest.fem.field import Mesh, read_any_mesh
 from modeharvest.fem.lattices import UnitCell
 from modeharvest.fem.meshing import gmsh_options, quiet_gmsh, require_size
 from modeharvest.fem.triangles import sound_t6
-from modeharvest.reading import require_file
+from modeharvest.reading import reading, require_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -27,6 +29,15 @@ Cells = dict[str, IntArray]  # by meshio's names of the elements
 GEOMETRY = (".geo", ".geo_unrolled", ".step", ".stp", ".brep", ".iges", ".igs")
 """Suffixes of the files that gmsh meshes."""
 
+_PROBE = """
+import gmsh, sys
+gmsh.initialize(interruptible=False)
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.merge(sys.argv[1])
+"""
+_PROBE_SECONDS = 300.0
+_FARTHEST = 1e9
+"""From the origin [mm]; a damaged file's nodes are anywhere."""
 _LOWER = ("vertex", "line")  # what meshes hold besides their elements
 
 
@@ -63,6 +74,7 @@ def read_cell(
             f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not for meshes"
         )
     if is_geometry or path.suffix.lower() == ".msh":
+        _require_readable(path)
         with quiet_gmsh():
             _merge(path)
             return _from_model(lattice, size, is_geometry, str(path))
@@ -90,6 +102,15 @@ def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) 
     with gmsh_options({"General.Terminal": 0, "Mesh.MeshSizeMax": 1e22}):
         to_mesh = not gmsh.model.mesh.getElementTypes(2).size
         return _from_model(lattice, size, to_mesh, "gmsh model")
+
+
+def _require_readable(path: Path) -> None:
+    """Let a child read the file first: gmsh aborts the process on some damaged ones."""
+    with reading(path, "a file that gmsh reads", "export it again"):
+        command = [sys.executable, "-P", "-c", _PROBE, str(path)]
+        done = subprocess.run(command, capture_output=True, timeout=_PROBE_SECONDS, check=False)
+        if done.returncode < 0:
+            raise ValueError(f"a file that makes gmsh crash (signal {-done.returncode})")
 
 
 def _merge(path: Path) -> None:
@@ -234,6 +255,8 @@ def _unit_cell(
             f"{source}: expected triangles of three or of six nodes and nothing else, got "
             f"{' and '.join(kinds) or 'no elements'}"
         )
+    if not np.abs(points).max(initial=0.0) < _FARTHEST:
+        raise InputError(f"{source}: expected finite nodes less than {_FARTHEST:g} mm from 0")
     try:
         mesh = sound_t6(points, cells[kinds[0]])
         if lattice is None:

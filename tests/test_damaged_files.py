@@ -7,13 +7,14 @@ variants are the same in every run.
 from __future__ import annotations
 
 import faulthandler
+import json
 import re
 import shutil
 import subprocess
 import sys
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from modeharvest.fem.field import Solution, read_any_mesh, read_meshio
 from modeharvest.fem.mode_file import read_modes, write_modes
 from modeharvest.harvest.example import EXAMPLE
 from modeharvest.harvest.experiment import read_experiment
+from modeharvest.harvest.prepare import Prepared
 from modeharvest.idic.families.automatic import mode_family
 from modeharvest.idic.families.equivalents import square_mode
 from modeharvest.idic.families.files import read_family, read_spectrum, write_family
@@ -130,6 +132,12 @@ def _sets(folder: Path) -> dict[str, Subject]:
         StarSpec(Star(rows=41, cols=120), SpeckleSpec(blur_px=1.0)), folder / "star"
     )
 
+    prepared = {
+        "names": ["a", "b"], "skipped": [["c", "blank"]], "noise": {"sd": 1.5, "source": "repeats"},
+        "grid": asdict(GRID),
+    }  # fmt: skip
+    (folder / "prepared.json").write_text(json.dumps(prepared, indent=2), "utf-8")
+
     def images(path: Path) -> object:
         read = ImageSet.read(_beside(path, truth / "images"))
         strain = read.strains[0]
@@ -143,6 +151,7 @@ def _sets(folder: Path) -> dict[str, Subject]:
         "images": Subject(truth / "images" / "images.json", images),
         "truth": Subject(next((truth / "images").glob("truth_*.h5")), read_truth),
         "benchmark": Subject(truth / "benchmark.json", benchmark),
+        "prepared": Subject(folder / "prepared.json", lambda p: Prepared.read(p.parent)),
         "star": Subject(star.folder / "star.json", lambda p: StarSet.read(p.parent)),
     }
 
@@ -358,7 +367,7 @@ NAMES = (
     "lens", "images", "truth", "benchmark", "star", "vtu", "vtk", "msh", "inp", "xdmf", "med",
     "vtu field", "field.csv", "field.npz", "packed.npz", "field.h5", "field.mat", "packed.mat",
     "lens.yml", "lens.xml", "dice.xml", "plain.tif", "packed.tif", "grey.png", "grey.bmp",
-    "grey.jpg", "colour.png",
+    "grey.jpg", "colour.png", "prepared",
 )  # fmt: skip
 
 

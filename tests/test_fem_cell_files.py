@@ -291,3 +291,12 @@ def test_the_recipes_work_as_printed(
     assert area(space["again"]) == pytest.approx(area(space["oval"]), rel=1e-12)
     assert area(space["oval"]) == pytest.approx(3.2 - math.pi * 0.4, rel=1e-3)
     assert area(space["slotted"]) == pytest.approx(3.2 - 0.48 + (4 - math.pi) * 0.15**2, rel=1e-3)
+
+
+def test_a_file_that_crashes_gmsh_is_told_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("modeharvest.fem.cell_files._PROBE", "import os; os.abort()")
+    (tmp_path / "cell.msh").write_text("$MeshFormat\n")
+    with pytest.raises(InputError, match=r"cell\.msh, got: a file that makes gmsh crash"):
+        read_cell(tmp_path / "cell.msh")

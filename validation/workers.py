@@ -33,6 +33,8 @@ _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
 this stands in the parent's own environment for a while, where numba must not change its mind."""
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
+_MOST_WORKERS = 1000
+"""On one machine."""
 _NEVER = "1000 days"
 LOCAL: dict[str, object] = {
     # Forks of one server process, which has imported dask: quicker than new processes.
@@ -76,10 +78,13 @@ class Workers:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise InputError(f"expected at least 1 worker, got {self.count}")
+        if self.count > _MOST_WORKERS:
+            raise InputError(f"expected at most {_MOST_WORKERS} workers, got {self.count}")
         from dask.utils import parse_bytes
 
         try:
-            parse_bytes(self.memory)
+            if not 0 < parse_bytes(self.memory) < 2**60:
+                raise ValueError("nothing, or more than there is anywhere")
         except (ValueError, TypeError) as error:
             raise InputError(
                 f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}"

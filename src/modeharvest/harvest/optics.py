@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.harvest.experiment import DistortionTable
 from modeharvest.harvest.inputs import named_files
@@ -18,6 +19,7 @@ from modeharvest.imaging.distortion.mapping import Distortion
 from modeharvest.imaging.distortion.undistort import PolynomialDistortion
 from modeharvest.imaging.photographs.photograph import read_photograph
 from modeharvest.progress import Progress, silent
+from modeharvest.reading import reading
 
 _ARRAYS = ("shifts", "shifts_sd", "angles", "angles_sd", "matches", "covariance")
 
@@ -60,15 +62,17 @@ def calibrate_lens(
 
 def calibrated_lens(folder: Path) -> Optics:
     """What :func:`calibrate_lens` left."""
-    distortion = read_distortion(folder / "distortion.json")
-    assert isinstance(distortion, PolynomialDistortion)  # that is what is calibrated
-    content = read_json(folder / "calibration.json")
-    calibration = Calibration(
-        distortion=distortion,
-        trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
-        noise_sd=float(content["noise_sd"]),
-        fixed=int(content["fixed"]),
-        sentences=tuple(content["sentences"]),
-        **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
-    )
-    return Optics(distortion, calibration)
+    path = folder / "calibration.json"
+    with reading(path, "a calibration", "remove it, and harvest again"):
+        distortion, content = read_distortion(folder / "distortion.json"), read_json(path)
+        if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
+            raise InputError("expected a polynomial in distortion.json beside it, got another kind")
+        calibration = Calibration(
+            distortion=distortion,
+            trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
+            noise_sd=float(content["noise_sd"]),
+            fixed=int(content["fixed"]),
+            sentences=tuple(map(str, content["sentences"])),
+            **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
+        )
+        return Optics(distortion, calibration)

@@ -32,6 +32,8 @@ from modeharvest.imaging.io import read_image, read_mask, require_same_shape, wr
 from modeharvest.imaging.photographs.photograph import Photograph
 from modeharvest.imaging.photographs.series import read_frame, read_reference
 from modeharvest.progress import Progress, silent
+from modeharvest.reading import reading
+from modeharvest.typed import made
 
 FloatImage = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -57,12 +59,16 @@ class Prepared:
     @classmethod
     def read(cls, folder: Path) -> Prepared:
         """Open a finished folder; raises InputError if it isn't one."""
-        return cls(folder, read_json(folder / RECORD))
+        path = folder / RECORD
+        with reading(path, "prepared photographs", "remove it, and harvest again"):
+            found = cls(folder, dict(read_json(path)))
+            _ = found.names, found.skipped, found.noise, found.grid
+            return found
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the deformed images that can be used, in the order of the test."""
-        return tuple(self.info["names"])
+        return tuple(map(str, self.info["names"]))
 
     @property
     def skipped(self) -> tuple[tuple[str, str], ...]:
@@ -72,12 +78,12 @@ class Prepared:
     @property
     def noise(self) -> Noise:
         """The camera's."""
-        return Noise(**self.info["noise"])
+        return made(Noise, self.info["noise"])
 
     @property
     def grid(self) -> PixelGrid:
         """The ideal pixels; the physical origin is the middle of the image."""
-        return PixelGrid(**self.info["grid"])
+        return made(PixelGrid, self.info["grid"])
 
     @property
     def files(self) -> tuple[Path, ...]:

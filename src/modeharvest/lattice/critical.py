@@ -10,10 +10,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from modeharvest.errors import InputError
 from modeharvest.files import read_json, write_json
 from modeharvest.lattice.options import Search
 from modeharvest.progress import Progress, named, silent
+from modeharvest.reading import reading
 from modeharvest.validation.lattice.run import CriticalPoint
 
 if TYPE_CHECKING:  # their modules need dolfinx
@@ -44,15 +44,11 @@ def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
 
 def read_critical(path: Path) -> CriticalPoint:
     """Read the point in ``critical.json``; InputError if it is damaged."""
-    try:
+    with reading(path, "a critical point", "remove it"):
         content = read_json(path)["point"]
         waves = {name: tuple(map(tuple, content[name])) for name in ("waves", "earlier")}
         signs = {name: tuple(content[name]) for name in ("below", "above")}
         return CriticalPoint(**{**content, **waves, **signs})
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"expected a critical point in {path}, got a damaged file; remove it"
-        ) from error
 
 
 def _in_order(point: CriticalPoint) -> CriticalPoint:
