@@ -18,9 +18,9 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from modeharvest.pipeline import STAGES
 from modeharvest.stages import Stages
 
+STAGES = ("fem", "image", "correlate", "validate")
 COMMAND = [sys.executable, "-m", "modeharvest"]
 
 
