@@ -10,7 +10,6 @@ import typer
 from modeharvest.cli.arguments import CaseName, OutFolder, SolutionFile
 from modeharvest.cli.messages import UNUSABLE, bars, tell
 from modeharvest.errors import InputError
-from modeharvest.stages import exclusive
 
 
 def make(
@@ -72,6 +71,7 @@ def score(
     the end, and the exit code is then 2.
     """
     from modeharvest import scoring
+    from modeharvest.stages import exclusive
 
     declared = scoring.declarations(fields, name, unit, y_axis, first_pixel, column)
     with bars() as progress, exclusive(out):
@@ -99,6 +99,7 @@ def star(
     Exact ones, and for each level of noise three as a camera's: before, the same without motion,
     after. Its displacement is a formula, in README.md and star.json beside them.
     """
+    from modeharvest.stages import exclusive
     from modeharvest.validation.resolution.star import Star, fine_speckle
     from modeharvest.validation.resolution.star_set import StarSpec, make_star_set
 
@@ -143,6 +144,7 @@ def resolution(
     its --still has the same. Leaves report.html, resolution.json and resolution.csv in DIR.
     """
     from modeharvest.scoring import declarations
+    from modeharvest.stages import exclusive
     from modeharvest.validation.resolution.graded import grade_star, print_star_grading
 
     declared = declarations(fields, name, None, y_axis, first_pixel, column)
