@@ -241,7 +241,7 @@ def softness(
     return found
 
 
-_ENOUGH_PX, _STEP_PX = 800_000, 0.002
+_ENOUGH_PX, _STEP_PX = 400_000, 0.002
 
 
 _SMALL = np.float32(0.05)

@@ -15,8 +15,9 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
     ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
     ``mode_standard_error`` (by noise) and ``mode_model_error`` (by what the ansatz can't
-    describe), ``mode_deviation_percent``, ``mode_best_fit``, ``iterations`` (on
-    the full image), ``iterations_all_levels``, ``outcome``, ``outcome_why``,
+    describe; empty where the mode is not observable), ``mode_deviation_percent``,
+    ``mode_best_fit``, ``iterations`` (on the full image), ``iterations_all_levels``,
+    ``outcome``, ``outcome_why``,
     ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
     ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
     ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
@@ -202,7 +203,7 @@ def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> d
         "rms_best_fit_px": px["best_fit"]["rms_per_component"],
         "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
         "rms_residual": result.residual_rms,
-        **_mode(comparison, measured),
+        **_mode(comparison, measured, 0 not in seen.unobservable),
         **_brightness(comparison),
         "mode_observable": not seen.unobservable,
         "leftover_estimate_px": seen.leftover_px,
@@ -256,7 +257,7 @@ def _brightness(comparison: Comparison) -> dict[str, float]:
     return found
 
 
-def _mode(comparison: Comparison, measured: Measured) -> dict[str, Any]:
+def _mode(comparison: Comparison, measured: Measured, is_seen: bool) -> dict[str, Any]:
     """The mode's parameters against the ideal ones; nothing where the mode was held."""
     result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
     phi = result.ansatz.phi_slice(0)
@@ -268,7 +269,7 @@ def _mode(comparison: Comparison, measured: Measured) -> dict[str, Any]:
         "mode": mode_equivalent(found, pitch, ideal)[0].tolist(),
         "mode_ideal": ideal.tolist(),
         "mode_standard_error": _plain(result.standard_errors()[phi]),
-        "mode_model_error": _model_errors(comparison, measured)[phi.start : phi.stop],
+        "mode_model_error": _model_errors(comparison, measured)[phi] if is_seen else [],
         "mode_deviation_percent": mode_deviation(found, pitch, ideal).tolist(),
         "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
     }

@@ -213,7 +213,7 @@ def _worst(snapshot: Snapshot) -> float:
 
 
 def _item(values: Sequence[float | None] | None, k: int) -> float | None:
-    return None if values is None else values[k]
+    return values[k] if values else None
 
 
 def _key(name: str, value: float | None, unit: str, remark: str, digits: int) -> dict[str, str]:
