@@ -284,7 +284,7 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
 
     summary = {
         "title": "[/bold] [red]", "snapshots": [], "critical_strain": None,
-        "warnings": ["[/x]"], "expected": [],
+        "warnings": ["[/x]"], "expected": [], "case": read_case("paper-virtual").plain(),
     }  # fmt: skip
     print_experiment(summary, Path("out[/bold]"))
     text = capsys.readouterr().out

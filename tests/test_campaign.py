@@ -265,3 +265,21 @@ def test_a_run_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     (tmp_path / "go").touch()
     assert campaign.run()["error"].eq("").all()
     assert all(path.read_bytes() == content for path, content in finished.items())
+
+
+def test_an_event_loop_that_is_slow_to_begin_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As dask does it on a machine where a thread takes more than 10 s to run."""
+    import distributed
+
+    real, calls = distributed.LocalCluster, []
+
+    def slow(*arguments: object, **options: object) -> object:
+        calls.append(1)
+        assert len(calls) > 2
+        return real(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(distributed, "LocalCluster", slow)
+    assert list(squares(tmp_path, x=[2, 3]).run(Workers(1))["square"]) == [4, 9]
+    assert len(calls) == 3

@@ -235,8 +235,8 @@ def test_info_tells_how_it_came_about() -> None:
     assert info["specimen"]["holes_y"] == 6
     assert info["material"] == {
         "kind": "Ogden",
-        "moduli": (1.2,),
-        "exponents": (3.0,),
+        "moduli": [1.2],
+        "exponents": [3.0],
         "kappa": 5.4,
     }
     curve = info["path"]["primary"]

@@ -176,11 +176,11 @@ def test_refuses_to_write_what_it_could_not_read(
 def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_image(tmp_path / "a.tif", RAMP)
 
-    def full_disk(path: Path, *_: object, **__: object) -> None:
-        path.write_bytes(b"II*")
+    def full_disk(path: Path, content: memoryview) -> None:
+        path.write_text("II*")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(tifffile, "imwrite", full_disk)
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(InputError, match="No space left on device"):
         write_image(tmp_path / "a.tif", RAMP[::-1])
     assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]

@@ -11,7 +11,7 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -25,6 +25,8 @@ from modeharvest.files import require_writable
 from modeharvest.validation.case_run import named
 from modeharvest.versions import source_digest
 
+_ATTEMPTS = 5
+"""To begin an event loop."""
 _PATIENCE_S = 30.0
 """How long to wait for a scheduler that does not answer: it may be on a busy machine."""
 _LIBRARIES = ("OMP", "MKL", "OPENBLAS")
@@ -168,19 +170,33 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
         stack.enter_context(_environment_kept())
         stack.enter_context(dask.config.set(LOCAL))
         with _interrupts_held():
-            cluster = stack.enter_context(
-                LocalCluster(  # type: ignore[no-untyped-call]
-                    n_workers=count,
-                    threads_per_worker=1,
-                    memory_limit=memory,
-                    host=_LOOPBACK,
-                    # A free port, as campaigns may run side by side; None would take 8787.
-                    dashboard_address=f"{_LOOPBACK}:0",
-                    scheduler_kwargs={"dashboard": False},
-                    silence_logs=logging.CRITICAL,
-                )
+            cluster = _begun(
+                LocalCluster,
+                n_workers=count,
+                threads_per_worker=1,
+                memory_limit=memory,
+                host=_LOOPBACK,
+                # A free port, as campaigns may run side by side; None would take 8787.
+                dashboard_address=f"{_LOOPBACK}:0",
+                scheduler_kwargs={"dashboard": False},
+                silence_logs=logging.CRITICAL,
             )
-        yield stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
+            stack.enter_context(cluster)
+        yield stack.enter_context(_begun(Client, cluster))
+
+
+def _begun(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Make a cluster or a client; again if its event loop is slow to begin.
+
+    Dask asserts that the loop's thread runs within 10 s, before anything else is begun; on a
+    machine that is busy enough it does not.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return make(*arguments, **options)
+        except AssertionError:
+            continue
+    return make(*arguments, **options)
 
 
 @contextmanager
@@ -191,7 +207,7 @@ def _client_of(scheduler: str) -> Iterator[Any]:
     for logger in ("distributed", "distributed.client"):  # what fails is said in one line
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
-        client = Client(scheduler, timeout=_PATIENCE_S)  # type: ignore[no-untyped-call]
+        client = _begun(Client, scheduler, timeout=_PATIENCE_S)
     except Exception as error:  # anything, where another kind of server answers
         raise InputError(
             f"expected a dask scheduler at {scheduler}, got no answer that is one's; start one "

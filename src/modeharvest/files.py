@@ -107,8 +107,9 @@ def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         yield file
-    with atomic(path) as temporary:
-        temporary.write_bytes(memory.getbuffer())
+    # The view is let go of: memory that is lent can't be freed after an error.
+    with atomic(path) as temporary, memory.getbuffer() as content:
+        temporary.write_bytes(content)
 
 
 def copy_whole(source: Path | str, path: Path | str) -> None:
