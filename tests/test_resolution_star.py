@@ -362,3 +362,16 @@ def test_without_a_crossing_nothing_is_extrapolated() -> None:
 def test_stars_that_can_t_be(options: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Star(**options)  # type: ignore[arg-type]
+
+
+def test_one_bad_field_does_not_keep_the_good_ones_from_being_graded(
+    star_set: StarSet, tmp_path: Path
+) -> None:
+    row, col = np.indices((SMALL.rows, SMALL.cols))
+    good = write(tmp_path / "good.csv", star_set, SMALL.down(row, col))
+    bad = tmp_path / "bad.csv"
+    bad.write_text("not a field\n", "utf-8")
+    done = grade_star({bad: Declared(), good: Declared()}, {}, star_set.folder, tmp_path / "out")
+    assert [grade.name for grade in done.grades] == ["good"]
+    assert list(done.refused) == [str(bad)]
+    assert done.notes[0].startswith("not graded: ")

@@ -48,10 +48,16 @@ def grade_star(
     progress
         Listener.
 
+    Returns
+    -------
+    StarGrading
+        Of the fields that can be graded; those that can't be read, are of another set, in
+        millimetres or don't hold the wave are in its ``refused``, each with the reason.
+
     Raises
     ------
     InputError
-        If a field can't be read, is of another set, in millimetres, or doesn't hold the wave.
+        If no field can be graded, or two have one name.
     """
     if stills and len(stills) != len(fields):
         raise InputError(
@@ -61,17 +67,25 @@ def grade_star(
     require_writable(out)
     still_of = dict(zip(fields, stills.items(), strict=bool(stills)))
     grades: list[StarGrade] = []
+    refused: dict[str, str] = {}
     for n, (path, declared) in enumerate(fields.items()):
         progress(n, len(fields) + 1, f"resolution: {path.name}")
-        moved = _read(path, declared, star_set)
-        if any(moved.source == grade.name for grade in grades):
+        try:
+            moved = _read(path, declared, star_set)
+            still = _read(*still_of[path], star_set) if stills else None
+            grade = StarGrade(star_set.spec.star, moved, still)
+        except InputError as error:
+            refused[str(path)] = str(error)
+            continue
+        if any(grade.name == other.name for other in grades):
             raise InputError(
-                f"expected fields of different names, got {moved.source} twice; give --name"
+                f"expected fields of different names, got {grade.name} twice; give --name"
             )
-        still = _read(*still_of[path], star_set) if stills else None
-        grades.append(StarGrade(star_set.spec.star, moved, still))
+        grades.append(grade)
+    if not grades:
+        raise InputError("; ".join(refused.values()))
     progress(len(fields), len(fields) + 1, "resolution: report")
-    grading = StarGrading(star_set, tuple(ranked(grades)))
+    grading = StarGrading(star_set, tuple(ranked(grades)), refused)
     write_star_grading(out, grading)
     progress(1, 1, "resolution")
     return grading

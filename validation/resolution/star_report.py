@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,15 +44,17 @@ COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class StarGrading:
-    """Codes graded on a star set, the best first."""
+    """Codes graded on a star set, the best first; and why others were not."""
 
     star_set: StarSet
     grades: tuple[StarGrade, ...]
+    refused: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def notes(self) -> list[str]:
         """What a reader has to know, in sentences."""
-        return [note for grade in self.grades for note in grade.notes]
+        told = [f"not graded: {why}" for why in self.refused.values()]
+        return [*told, *(note for grade in self.grades for note in grade.notes)]
 
 
 def numbers(grade: StarGrade) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -77,9 +78,14 @@ def score(
     with bars() as progress, exclusive(out):
         done = scoring.grade(declared, truth, strain, out, progress=progress)
     scoring.print_grading(done, out)
-    for why in done.refused.values():
+    _refuse(done.refused)
+
+
+def _refuse(reasons: Mapping[str, str]) -> None:
+    """Name the fields that were not graded; the exit code is then 2."""
+    for why in reasons.values():
         tell(InputError(why))
-    if done.refused:
+    if reasons:
         raise typer.Exit(UNUSABLE)
 
 
@@ -152,3 +158,4 @@ def resolution(
     with bars() as progress, exclusive(out):
         done = grade_star(declared, quiet, folder, out, progress)
     print_star_grading(done, out)
+    _refuse(done.refused)
