@@ -136,9 +136,9 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
     # In memory first: on a full disk it would say how many values it could not write, not why.
     memory = io.BytesIO()
     tifffile.imwrite(memory, image, photometric="minisblack")
-    # The view is let go of: memory that is lent can't be freed after an error.
-    with atomic(path) as temporary, memory.getbuffer() as content:
-        temporary.write_bytes(content)
+    with atomic(path) as temporary:
+        # Not its buffer: memory that is lent to a failed write can't be freed.
+        temporary.write_bytes(memory.getvalue())
 
 
 def _read(path: Path) -> NDArray[Any]:

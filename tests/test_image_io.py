@@ -176,7 +176,7 @@ def test_refuses_to_write_what_it_could_not_read(
 def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_image(tmp_path / "a.tif", RAMP)
 
-    def full_disk(path: Path, content: memoryview) -> None:
+    def full_disk(path: Path, content: bytes) -> None:
         path.write_text("II*")
         raise OSError(28, "No space left on device")
 

@@ -107,9 +107,9 @@ def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         yield file
-    # The view is let go of: memory that is lent can't be freed after an error.
-    with atomic(path) as temporary, memory.getbuffer() as content:
-        temporary.write_bytes(content)
+    with atomic(path) as temporary:
+        # Not its buffer: memory that is lent to a failed write can't be freed.
+        temporary.write_bytes(memory.getvalue())
 
 
 def copy_whole(source: Path | str, path: Path | str) -> None:
