@@ -46,6 +46,7 @@ EVERY = 8
 PAPER_PX = 12.0
 """Width of the default speckle."""
 LEAST_SQUARES = {"gradient": "deformed", "gradient_blur_px": 0.0, "order": 5}
+BLURRED = {"gradient": "deformed", "order": 5}
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ class Row:
     def name(self) -> str:
         """For the table."""
         where = "both" if self.in_f and self.in_g else "f" if self.in_f else "g"
-        how = ", least squares" if self.options else ""
+        blurred = ", deformed image's gradient, blurred" if self.options else ""
+        how = ", least squares" if self.options == LEAST_SQUARES else blurred
         noise = 100 * max(self.in_f, self.in_g)
         return f"{noise:g} % in {where}, {self.width_px:g} px, degree {self.degree}{how}"
 
@@ -88,6 +90,7 @@ ROWS = (
     *(Row(s, s, options=LEAST_SQUARES) for s in (0.002, 0.01, 0.04)),
     Row(0.0, 0.01, options=LEAST_SQUARES),
     *(Row(0.01, 0.01, width, options=LEAST_SQUARES) for width in (3.0, 6.0)),
+    *(Row(in_f, 0.01, options=BLURRED) for in_f in (0.01, 0.0)),
 )
 
 
