@@ -25,7 +25,7 @@ from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wa
 from modeharvest.validation.lattice.mode_table import ModeRow
 from modeharvest.validation.studies.modes import specimen as modes_specimen
 from modeharvest.validation.studies.modes.description import Description
-from modeharvest.validation.studies.modes.findings import findings
+from modeharvest.validation.studies.modes.findings import findings, report_modes
 from modeharvest.validation.studies.modes.lattice import LatticeMode
 from modeharvest.validation.studies.modes.pattern import PatternCells, buckle
 from modeharvest.validation.studies.modes.specimen import likeness, one_specimen
@@ -187,7 +187,7 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     row = table[table["varied"] == "d/l"].iloc[0]
     assert (row["first"], row["ratio"]) == ("none", 0.6)
     assert math.isnan(row["a1"])
-    found = study.findings(table, folder)
+    found = report_modes(study, table, folder)
     assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.sentences)
     assert len(found.tables["How they buckle"]) == 3
     assert list(found.tables["Parameters"]["level"]) == ["", "3.8 mm"]

@@ -27,12 +27,14 @@ from modeharvest.studies.pipeline import StudyPipeline
 from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.case_run import run_case, store
 from modeharvest.validation.studies.noise import causes as noise_causes
+from modeharvest.validation.studies.noise.findings import report_noise
 from modeharvest.validation.studies.noise.statistics import Pairs
 from modeharvest.validation.studies.noise.study import Noise, one_realisation
 from modeharvest.validation.studies.robustness import findings as told
 from modeharvest.validation.studies.robustness.study import Robustness, one_start
 from modeharvest.validation.studies.subject import Scene, Subject
 from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
+from modeharvest.validation.studies.systematic.findings import report_systematic
 from modeharvest.validation.studies.systematic.study import Systematic, one_level
 from modeharvest.versions import source_digest
 
@@ -226,7 +228,7 @@ def test_noise_study_on_tiny_images(
     assert len(cases) == 5
     rows = [{**case, "error": "", **one_realisation(case, folder)}
             for case in cases]  # fmt: skip
-    found = study.findings(pd.DataFrame(rows), folder)
+    found = report_noise(study, pd.DataFrame(rows), folder)
     summary = found.attachments["Noise levels"].set_index("quantity")
     # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
     assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
@@ -238,7 +240,7 @@ def test_noise_study_on_tiny_images(
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
     assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)
     with pytest.raises(InputError, match="two whole pairs"):
-        study.findings(pd.DataFrame(rows[:4]), folder)
+        report_noise(study, pd.DataFrame(rows[:4]), folder)
 
 
 # -- systematic errors --------------------------------------------------------------------
@@ -257,7 +259,7 @@ def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None
     kept = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if c["keep"]}
     gone = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if not c["keep"]}
     assert (kept, gone) == ({True}, {False})
-    found = study.findings(pd.DataFrame(rows), folder)
+    found = report_systematic(study, pd.DataFrame(rows), folder)
     levels = found.tables["Every level"].set_index(["name", "level"])
     moved = levels["moved from the base [px]"]
     assert moved["order", 5] == 0.0

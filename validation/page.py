@@ -10,8 +10,8 @@ import jinja2
 
 
 def render(template: str, **content: Any) -> str:
-    """Fill a template of this folder; a value that it needs and does not get is an error."""
-    folder = str(resources.files("modeharvest") / "validation")
+    """Fill one of the templates; a value that it needs and does not get is an error."""
+    folder = str(resources.files(__package__) / "templates")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,

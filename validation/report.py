@@ -23,7 +23,7 @@ from modeharvest.validation.plots_path import draw_convergence, draw_eigenvalues
 from modeharvest.validation.style import to_svg
 from modeharvest.validation.truth import Comparison
 
-TEMPLATE = "report.html"
+TEMPLATE = "experiment.html"
 SECTIONS = (
     ("images", "The image and its pattern", ("image", "Sxx", "Syy")),
     ("found", "What was measured", ("v0x", "v0y", "v1", "phi1", "flucx", "flucy")),

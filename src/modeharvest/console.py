@@ -8,14 +8,8 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
 
 _NOT_KEPT = (
     "every time: neither the package's folder nor the home folder can be written to; "
@@ -27,7 +21,7 @@ class ProgressBars:
     """A progress listener that draws bars while it is open; use it in a ``with`` block."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = Progress(
+        self._bars = RichProgress(
             TextColumn("{task.description:<28}", markup=False),  # it may name a user's file
             BarColumn(),
             TimeElapsedColumn(),

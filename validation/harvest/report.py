@@ -30,7 +30,19 @@ from modeharvest.validation.style import to_svg
 
 __all__ = ["Harvest", "HarvestedFrame", "harvest_summary", "write_harvest_report"]
 
-TEMPLATE = "harvest/report.html"
+TEMPLATE = "photographs.html"
+WORDS = {
+    "FRAME_COLUMNS": words.FRAME_COLUMNS,
+    "frame_rows": words.frame_rows,
+    "mode_tables": words.mode_tables,
+    "error_text": words.error_text,
+    "wave_rows": words.wave_rows,
+    "percent": words.percent,
+    "key_numbers": words.key_numbers,
+    "notes": words.notes,
+    "label": words.label,
+}
+"""What the template calls by name."""
 
 
 def write_harvest_report(
@@ -62,7 +74,7 @@ def write_harvest_report(
         title=harvest.title,
         harvest=harvest,
         summary=told,
-        words=words,
+        words=WORDS,
         shown=shown,
         labels=labels,
         hero=to_svg(draw_hero(atlas), "hero", "The last photograph and its pattern"),

@@ -38,7 +38,18 @@ from modeharvest.validation.style import to_svg
 
 __all__ = ["CriticalPoint", "FoundPattern", "LatticeRun", "write_lattice_report"]
 
-TEMPLATE = "lattice/report.html"
+TEMPLATE = "lattice.html"
+WORDS = {
+    "percent": words.percent,
+    "key_numbers": words.key_numbers,
+    "branch_rows": words.branch_rows,
+    "study_sentences": words.study_sentences,
+    "study_rows": words.study_rows,
+    "notes": words.notes,
+    "waves_in_words": words.waves_in_words,
+    "proof": words.proof,
+}
+"""What the template calls by name."""
 CELLS = 4
 """Unit cells along the side of a picture's window."""
 VISIBLE = 0.12
@@ -63,7 +74,7 @@ def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress =
         progress(n, len(parts), "report")
         content[part.__name__.removeprefix("_")] = part(run)
     material = material_in_words(run.case["material"])
-    page = render(TEMPLATE, title=run.title, run=run, words=words, material=material, **content)
+    page = render(TEMPLATE, title=run.title, run=run, words=WORDS, material=material, **content)
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
     progress(1, 1, "report")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,23 @@ from modeharvest.validation.resolution.degrees import (
     degrees_of,
     subset_indicator,
 )
-from modeharvest.validation.resolution.measure import Subject
+from modeharvest.validation.resolution.measure import MOTIONS, Subject
 from modeharvest.validation.resolution.plots_study import (
     draw_indicators,
     draw_passband,
     draw_transfer,
 )
+from modeharvest.validation.resolution.study import Resolution
 from modeharvest.validation.resolution.study_words import Answers
 from modeharvest.validation.studies.study import Findings, KeyNumber
 
 FloatArray = NDArray[np.float64]
 
-MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 held"}
+
+def report_resolution(study: Resolution, table: pd.DataFrame, folder: Path) -> Findings:
+    """Transfer, noise floors and indicators by degree."""
+    subject = Subject.read(folder, table["subject"].iloc[0])
+    return findings(table, subject, Curves.of(subject, study.degrees), study.seeds)
 
 
 def findings(table: pd.DataFrame, subject: Subject, curves: Curves, seeds: str) -> Findings:

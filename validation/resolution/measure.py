@@ -28,6 +28,7 @@ from modeharvest.validation.resolution.tangent import share
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
+MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 held"}
 SPACING = 0.2
 """Of the points at which fields are compared [mm]."""
 _SPARSE = 2

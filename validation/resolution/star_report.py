@@ -25,7 +25,7 @@ from modeharvest.validation.resolution.star_set import StarSet
 from modeharvest.validation.style import to_svg
 
 FORMAT = "modeharvest-resolution-1"
-TEMPLATE = "resolution/star_report.html"
+TEMPLATE = "star.html"
 COLUMNS = {
     "l10 [px]": "finest_px",
     "± l10 [px]": "finest_se_px",

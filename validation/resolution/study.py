@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import pandas as pd
 
 from modeharvest.errors import InputError
 from modeharvest.idic.setup import Identification
@@ -15,9 +14,8 @@ from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case, grid
 from modeharvest.validation.resolution.buckled import Buckled
 from modeharvest.validation.resolution.curves import AXES, WAVED, Curves
-from modeharvest.validation.resolution.findings import MOTIONS, findings
-from modeharvest.validation.resolution.measure import Subject
-from modeharvest.validation.studies.study import MOST, Findings, require_different, require_mode
+from modeharvest.validation.resolution.measure import MOTIONS, Subject, one_case
+from modeharvest.validation.studies.study import MOST, require_different, require_mode
 from modeharvest.validation.studies.subject import Subject as Experiment
 
 
@@ -93,7 +91,7 @@ class Resolution:
     @property
     def function(self) -> str:
         """The "package.module:name" of what runs one case."""
-        return "modeharvest.validation.resolution.measure:one_case"
+        return f"{one_case.__module__}:{one_case.__name__}"
 
     @property
     def seeds(self) -> str:
@@ -145,8 +143,3 @@ class Resolution:
             for phase in (0.0, 0.5 * np.pi)
         ]  # fmt: skip
         return (*waves, *noise, *floors)
-
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """Transfer, noise floors and indicators by degree."""
-        subject = Subject.read(folder, table["subject"].iloc[0])
-        return findings(table, subject, Curves.of(subject, self.degrees), self.seeds)

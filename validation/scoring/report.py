@@ -33,7 +33,7 @@ from modeharvest.validation.style import to_svg
 BoolArray = NDArray[np.bool_]
 
 FORMAT = "modeharvest-scores-1"
-TEMPLATE = "scoring/report.html"
+TEMPLATE = "scores.html"
 EVERYWHERE, COMMON = "everywhere", "where all measure"
 """Rows of the table beside the regions."""
 

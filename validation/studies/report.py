@@ -16,7 +16,7 @@ from modeharvest.validation.report import Picture
 from modeharvest.validation.studies.study import Findings, Plot
 from modeharvest.validation.style import to_svg
 
-TEMPLATE = "studies/report.html"
+TEMPLATE = "study.html"
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,9 +120,6 @@ class Study(Protocol):
         The random choices of a case follow from a seed that it holds.
         """
 
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """Read the table of all cases; those that failed have an ``error``, and no result."""
-
 
 def require_mode(correlation: Identification) -> None:
     """Raise InputError where the mode is held: nothing of it would be measured."""

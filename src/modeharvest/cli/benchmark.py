@@ -71,13 +71,13 @@ def score(
     Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
     the end, and the exit code is then 2.
     """
-    from modeharvest import scoring
+    from modeharvest.scoring import declarations, grade, print_grading
     from modeharvest.stages import exclusive
 
-    declared = scoring.declarations(fields, name, unit, y_axis, first_pixel, column)
+    declared = declarations(fields, name, unit, y_axis, first_pixel, column)
     with bars() as progress, exclusive(out):
-        done = scoring.grade(declared, truth, strain, out, progress=progress)
-    scoring.print_grading(done, out)
+        done = grade(declared, truth, strain, out, progress=progress)
+    print_grading(done, out)
     _refuse(done.refused)
 
 

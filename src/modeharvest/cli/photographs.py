@@ -41,8 +41,9 @@ def harvest(
     experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
     again after an interruption: finished photographs are not measured again.
     """
-    from modeharvest.harvest import pipeline, terminal
+    from modeharvest.harvest.pipeline import harvest as harvest_photographs
+    from modeharvest.harvest.terminal import print_harvest
 
     with bars() as progress:
-        summary = pipeline.harvest(experiment, out, progress)
-    terminal.print_harvest(summary, out)
+        summary = harvest_photographs(experiment, out, progress)
+    print_harvest(summary, out)

@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from modeharvest import __version__
-from modeharvest.cli import benchmark, cases, experiment, lattice, messages, photographs, study
+from modeharvest.cli import messages
+from modeharvest.cli.benchmark import make, resolution, score, star
+from modeharvest.cli.cases import cases
+from modeharvest.cli.experiment import correlate, fem, image, run, validate
+from modeharvest.cli.lattice import bloch, modes
+from modeharvest.cli.photographs import harvest
+from modeharvest.cli.study import study
 from modeharvest.ranks import is_first
 
 if TYPE_CHECKING:
@@ -42,17 +48,11 @@ benchmark_app = typer.Typer(
 )
 
 _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
-    "A virtual experiment": (
-        experiment.run,
-        experiment.fem,
-        experiment.image,
-        experiment.correlate,
-        experiment.validate,
-    ),
-    "An infinite lattice": (lattice.bloch, lattice.modes),
-    "Photographs of a test": (photographs.harvest,),
-    "How good a measurement is": (study.study, benchmark.score),
-    "To begin with": (cases.cases,),
+    "A virtual experiment": (run, fem, image, correlate, validate),
+    "An infinite lattice": (bloch, modes),
+    "Photographs of a test": (harvest,),
+    "How good a measurement is": (study, score),
+    "To begin with": (cases,),
 }
 
 
@@ -60,20 +60,20 @@ def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
     """The command, whose interruptions the command-line library leaves to us."""
 
     @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
+    def run_command(*arguments: Any, **options: Any) -> None:
         try:
             command(*arguments, **options)
             messages.end_if_interrupted()
         except KeyboardInterrupt as error:
             raise messages.InterruptionError from error
 
-    return run
+    return run_command
 
 
 for family, commands in _FAMILIES.items():
     for command in commands:
         app.command(rich_help_panel=family)(_interruptible(command))
-for command in (benchmark.make, benchmark.star, benchmark.resolution):
+for command in (make, star, resolution):
     benchmark_app.command()(_interruptible(command))
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 

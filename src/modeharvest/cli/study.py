@@ -42,8 +42,8 @@ def study(
     Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
     interruption: finished cases are not repeated.
     """
-    from modeharvest.studies import terminal
+    from modeharvest.studies.terminal import print_study, run
 
     with bars() as progress:
-        summary = terminal.run(name, out, workers, memory, scheduler, quick, solution, progress)
-    terminal.print_study(summary, out)
+        summary = run(name, out, workers, memory, scheduler, quick, solution, progress)
+    print_study(summary, out)

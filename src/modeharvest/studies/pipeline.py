@@ -15,7 +15,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -33,9 +33,28 @@ from modeharvest.progress import Progress, named, silent
 from modeharvest.stages import Stages, exclusive
 from modeharvest.studies.case import StudyCase, read_study
 from modeharvest.validation.campaign import Campaign, Workers
+from modeharvest.validation.resolution.findings import report_resolution
+from modeharvest.validation.resolution.study import Resolution
+from modeharvest.validation.studies.modes.findings import report_modes
+from modeharvest.validation.studies.modes.study import Modes
+from modeharvest.validation.studies.noise.findings import report_noise
+from modeharvest.validation.studies.noise.study import Noise
 from modeharvest.validation.studies.report import StudyRun, slug, write_study_report
+from modeharvest.validation.studies.robustness.findings import report_robustness
+from modeharvest.validation.studies.robustness.study import Robustness
 from modeharvest.validation.studies.study import Findings, Study
 from modeharvest.validation.studies.subject import Subject
+from modeharvest.validation.studies.systematic.findings import report_systematic
+from modeharvest.validation.studies.systematic.study import Systematic
+
+FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
+    Robustness: report_robustness,
+    Noise: report_noise,
+    Systematic: report_systematic,
+    Resolution: report_resolution,
+    Modes: report_modes,
+}
+"""For each kind of study what reads its table: failed cases have an ``error``, and no result."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +120,7 @@ class StudyPipeline:
                 first = table["error"].iloc[0]
                 raise InputError(f"all {len(table)} cases failed; the first: {first}")
             with self._timed("findings"):
-                findings = study.findings(table, folder)
+                findings = FINDINGS[type(study)](study, table, folder)
             return self._tell(campaign, table, findings)
 
     @contextmanager

@@ -11,6 +11,7 @@ import pandas as pd
 from modeharvest.validation.page import short
 from modeharvest.validation.studies.modes import plots
 from modeharvest.validation.studies.modes.description import folder_of
+from modeharvest.validation.studies.modes.study import Modes
 from modeharvest.validation.studies.modes.tables import (
     WAVES,
     alike,
@@ -21,6 +22,11 @@ from modeharvest.validation.studies.modes.tables import (
     summed_up,
 )
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
+
+
+def report_modes(study: Modes, table: pd.DataFrame, folder: Path) -> Findings:
+    """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
+    return findings(table, folder, study.seeds)
 
 
 def findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:

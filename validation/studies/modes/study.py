@@ -7,18 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-import pandas as pd
-
 from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.lattice.independence import MATERIALS
-from modeharvest.validation.studies.modes import findings as told
 from modeharvest.validation.studies.modes.description import Description
 from modeharvest.validation.studies.modes.specimen import one_specimen
-from modeharvest.validation.studies.study import Findings, require_different, require_mode
+from modeharvest.validation.studies.study import require_different, require_mode
 from modeharvest.validation.studies.subject import Subject
 
 __all__ = ["Modes", "one_specimen"]
@@ -154,7 +151,3 @@ class Modes:
             yield "graded along the load", f"{along:g}", base.changed(grading_x=along)
         for across in self.gradings_y:
             yield "graded across the load", f"{across:g}", base.changed(grading_y=across)
-
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
-        return told.findings(table, folder, self.seeds)

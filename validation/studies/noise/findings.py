@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 import pandas as pd
 
@@ -22,6 +23,7 @@ from modeharvest.validation.studies.noise.plots import (
     draw_maps,
     draw_unknowns,
 )
+from modeharvest.validation.studies.noise.study import Noise
 from modeharvest.validation.studies.noise.tables import (
     WORDS,
     causes_table,
@@ -32,6 +34,11 @@ from modeharvest.validation.studies.noise.tables import (
 )
 from modeharvest.validation.studies.study import Findings, KeyNumber
 from modeharvest.validation.studies.subject import Scene
+
+
+def report_noise(study: Noise, table: pd.DataFrame, folder: Path) -> Findings:
+    """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
+    return findings(table, Scene.open(folder, table["subject"].iloc[0]), study.seeds)
 
 
 def findings(table: pd.DataFrame, scene: Scene, seeds: str) -> Findings:

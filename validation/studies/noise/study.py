@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
@@ -18,10 +17,9 @@ from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.noise import findings as told
 from modeharvest.validation.studies.noise.causes import LADDER, compared, covariances
 from modeharvest.validation.studies.noise.fields import PARTS, Points
-from modeharvest.validation.studies.study import MOST, Findings, require_different
+from modeharvest.validation.studies.study import MOST, require_different
 from modeharvest.validation.studies.subject import Images, Scene, Subject
 
 FloatArray = NDArray[np.float64]
@@ -111,11 +109,6 @@ class Noise:
             for sign in (1, -1)
         ]
         return (base, *noisy)
-
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
-        scene = Scene.open(folder, table["subject"].iloc[0])
-        return told.findings(table, scene, self.seeds)
 
 
 def one_realisation(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -18,7 +19,13 @@ from modeharvest.validation.studies.robustness.plots import (
     draw_epsilons,
     draw_starts_of_v0,
 )
+from modeharvest.validation.studies.robustness.study import Robustness
 from modeharvest.validation.studies.study import Findings, KeyNumber
+
+
+def report_robustness(study: Robustness, table: pd.DataFrame, folder: Path) -> Findings:
+    """Success, epsilon and the honest distance, and the basin's picture."""
+    return findings(table, study.radius, study.seeds)
 
 
 def findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:

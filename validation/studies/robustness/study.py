@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
 from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
-from modeharvest.validation.studies.robustness import findings as told
-from modeharvest.validation.studies.study import MOST, Findings, require_different, require_mode
+from modeharvest.validation.studies.study import MOST, require_different, require_mode
 from modeharvest.validation.studies.subject import Scene, Subject
 
 FloatArray = NDArray[np.float64]
@@ -117,10 +115,6 @@ class Robustness:
             cases += [{**base, "radius": radius, "start": k} for k in range(self.per_radius)]
         cases += [{**base, "radius": 0.0, "strain_error": e} for e in self.strain_errors]
         return tuple(cases)
-
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """Success, epsilon and the honest distance, and the basin's picture."""
-        return told.findings(table, self.radius, self.seeds)
 
 
 def one_start(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:

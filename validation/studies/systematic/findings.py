@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from matplotlib.ticker import NullLocator
 
 from modeharvest.validation.page import short
 from modeharvest.validation.studies.study import Findings, KeyNumber, Plot
-from modeharvest.validation.studies.systematic.factors import FACTORS
+from modeharvest.validation.studies.subject import Scene
+from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
+from modeharvest.validation.studies.systematic.study import Systematic
 from modeharvest.validation.style import BLUE, GOLD, GREEN, MUTED, figure, style
 
 ERRORS = {
@@ -29,6 +32,14 @@ _CURVES: dict[str, dict[str, Any]] = {
     MOVED: {"color": GOLD, "marker": "^"},
 }
 _COLUMNS = 3
+
+
+def report_systematic(study: Systematic, table: pd.DataFrame, folder: Path) -> Findings:
+    """Errors against each factor, as curves and tables."""
+    scene = Scene.open(folder, table["subject"].iloc[0])
+    base = Setting(scene.images.spec, scene.how, scene.taper)
+    bases = {name: FACTORS[name].base(base) for name in study.factors}
+    return findings(table, bases, base.imaging.pixel_size, study.seeds)
 
 
 def findings(

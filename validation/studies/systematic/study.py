@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from modeharvest.errors import InputError
@@ -17,9 +16,8 @@ from modeharvest.idic.setup import Identification
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.campaign import Case
 from modeharvest.validation.studies.against_truth import against_truth
-from modeharvest.validation.studies.study import Findings, require_different
+from modeharvest.validation.studies.study import require_different
 from modeharvest.validation.studies.subject import Scene, Subject
-from modeharvest.validation.studies.systematic import findings as told
 from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
 
 FloatArray = NDArray[np.float64]
@@ -136,13 +134,6 @@ class Systematic:
                         cases.append({"factor": name, "level": float(level), "seed": seed,
                                       "subject": described, "keep": shared})  # fmt: skip
         return tuple(cases)
-
-    def findings(self, table: pd.DataFrame, folder: Path) -> Findings:
-        """Errors against each factor, as curves and tables."""
-        scene = Scene.open(folder, table["subject"].iloc[0])
-        base = Setting(scene.images.spec, scene.how, scene.taper)
-        bases = {name: FACTORS[name].base(base) for name in self.factors}
-        return told.findings(table, bases, base.imaging.pixel_size, self.seeds)
 
     def _levels(self, name: str) -> tuple[float, ...]:
         factor = FACTORS[name]
