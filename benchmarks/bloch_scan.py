@@ -18,15 +18,20 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from modeharvest.fem.bloch import BlochWaves, scan
-from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
-from modeharvest.fem.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattices import SQUARE_ZONE, UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.bloch.critical import critical_at, first_critical
+from modeharvest.fem.bloch.eigen import BlochWaves, scan
+from modeharvest.fem.bloch.zone import zone_path
+from modeharvest.fem.lattice.bloch_map import factorise
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import SQUARE_ZONE, UnitCell, hexagonal, refined_cell, square
+from modeharvest.fem.lattice.options import (
+    CriticalSearch,
+    MacroLoading,
+    equibiaxial,
+    uniaxial,
+    uniaxial_strain,
+)
 from modeharvest.fem.materials import Material, TwoTermI1
-from modeharvest.fem.reduction import factorise
-from modeharvest.fem.refinement import refined_cell
-from modeharvest.fem.zone import zone_path
 
 POINTS = 60
 TURNS = 7

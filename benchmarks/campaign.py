@@ -25,8 +25,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from modeharvest.validation.campaign import Campaign, Case, Workers, grid
-from modeharvest.validation.workers import LOCAL
+from modeharvest.validation.campaign import Campaign, grid
+from modeharvest.validation.workers import LOCAL, Case, Workers
 
 SLEEP_S = 1.0
 
@@ -84,17 +84,17 @@ def alone(
 
 def speedup(starts: int, pixel: float, folder: Path) -> None:
     """One worker against two."""
-    from modeharvest.case import shipped_solution  # here: workers import this file, too
     from modeharvest.fem.field import Solution
-    from modeharvest.studies.case import StudyCase
-    from modeharvest.validation.studies.robustness.study import Robustness
-    from modeharvest.validation.studies.subject import Subject
+    from modeharvest.runs.case import shipped_solution  # here: workers import this file, too
+    from modeharvest.runs.study import StudyCase
+    from modeharvest.validation.studies.robustness import RobustnessStudy
+    from modeharvest.validation.studies.study import ImagePairSpec
 
     path, case = shipped_solution("paper-virtual"), StudyCase()
     assert path is not None, "the case ships its solution"
     imaging = replace(case.imaging, pixel_size=pixel)
-    subject = Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
-    study = Robustness(starts=starts, radii=(), strain_errors=())
+    subject = ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(path))
+    study = RobustnessStudy(starts=starts, radii=(), strain_errors=())
     found = {}
     for workers in (1, 2, 2, 1):  # so that a drift of the machine hits both alike
         own = folder / f"{workers}-{len(found)}-{time.perf_counter_ns()}"

@@ -27,15 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.blur import blurred
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.gauss_newton import GaussNewtonOptions
-from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import residual
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.assembly import Assembly, residual
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
+from modeharvest.idic.solver.pyramid import blurred
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
 
 HEIGHT_MM, ASPECT, STRAIN = 22.07, 0.8, 0.05
 OFF_PX, NOISE, LAPS = 1.0, 0.5, 3

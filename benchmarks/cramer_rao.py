@@ -24,12 +24,13 @@ import numpy as np
 from known_truth import GRID, PIXEL, STRAIN, Truth
 from numpy.typing import NDArray
 
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.noise_transfer import ImageNoise
-from modeharvest.idic.pyramid import FULL
+from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
-from modeharvest.validation.studies.noise.statistics import Pairs, Share
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.idic.uncertainty.noise import ImageNoise
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.validation.studies.noise_statistics import Estimate, PairedErrors
 
 FloatArray = NDArray[np.float64]
 
@@ -166,21 +167,21 @@ def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Real
     return Realisation(truth.bound(speckle, noise.in_f, noise.in_g), (plus, minus))
 
 
-def judge(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> Pairs:
+def judge(quantity: Quantity, truth: Truth, noise: Noise, made: list[Realisation]) -> PairedErrors:
     """Errors, what each result tells of them, and the bound."""
     true = quantity.of(truth.a)
 
     def of_all(value: Callable[[Result], FloatArray]) -> FloatArray:
         return np.array([[value(r) for r in one.found] for one in made])
 
-    return Pairs(
+    return PairedErrors(
         of_all(lambda r: quantity.of(r.unknowns) - true),
         of_all(lambda r: quantity.sd(r.covariance(noise.known))),
         np.sqrt(np.mean([quantity.sd(one.bound) ** 2 for one in made], axis=0)),
     )
 
 
-def chi_square(truth: Truth, made: list[Realisation]) -> Share:
+def chi_square(truth: Truth, made: list[Realisation]) -> Estimate:
     """Mean square of the unknowns' errors, standardised by the bound with its correlations."""
     n = truth.ansatz.size
     distance = []
@@ -188,7 +189,7 @@ def chi_square(truth: Truth, made: list[Realisation]) -> Share:
         errors = np.array([r.unknowns - truth.a for r in one.found])
         weighted = np.linalg.solve(one.bound, errors.T).T
         distance.append((errors * weighted).sum() / len(errors) / n)
-    return Share(float(np.mean(distance)), float(np.std(distance, ddof=1) / np.sqrt(len(made))))
+    return Estimate(float(np.mean(distance)), float(np.std(distance, ddof=1) / np.sqrt(len(made))))
 
 
 def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
@@ -235,16 +236,16 @@ def tell(found: dict[str, Any]) -> None:
         print(f"| {heading} | bound of u, rms [px] | u | v0 | v1 | v1 phi1 |")
         print("|---|---|---|---|---|---|")
         for noise, row in found["noises"].items():
-            cells = " | ".join(str(Share(**f[key])) for f in row["fields"].values())
+            cells = " | ".join(str(Estimate(**f[key])) for f in row["fields"].values())
             print(f"| {noise} | {row['bound_px']:.2e} | {cells} |")
         print()
     print("| noise | blur of the gradient [px] | chi squared of the unknowns | each unknown's rms "
           "error / bound | told standard error / rms error | share in 95 % intervals | chi "
           "squared of the residual |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for noise, row in found["noises"].items():
-        print(f"| {noise} | {row['blur_px']:.2f} | {Share(**row['chi_square'])} | "
+        print(f"| {noise} | {row['blur_px']:.2f} | {Estimate(**row['chi_square'])} | "
               f"{row['ratios'][0]:.2f} – {row['ratios'][1]:.2f} | {row['told_over_error']:.3f} | "
-              f"{Share(**row['coverage'])} | "
+              f"{Estimate(**row['coverage'])} | "
               f"{row['chi_square_of_residual']:.3f} |")  # fmt: skip
         if row["not_converged"]:
             print(f"{noise}: {row['not_converged']} correlations did not converge")

@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from modeharvest.stages import Stages
+from modeharvest.util.stages import Stages
 
 STAGES = ("fem", "image", "correlate", "validate")
 COMMAND = [sys.executable, "-m", "modeharvest"]

@@ -18,19 +18,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.idic.calibration.calibrate import Calibration, CalibrationOptions, calibrate
-from modeharvest.idic.calibration.camera import recover_camera
-from modeharvest.idic.calibration.gauge import affine_aside
+from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
+from modeharvest.imaging.distortion.calibration.pair import recover_camera
+from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.files import read_distortion
-from modeharvest.imaging.distortion.mapping import Distortion
-from modeharvest.imaging.distortion.undistort import (
-    CameraDistortion,
-    PolynomialDistortion,
-    undistorted,
-    undistorted_mask,
-)
-from modeharvest.imaging.io import quantise, read_image
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
+from modeharvest.imaging.distortion.undistort import affine_aside, undistorted, undistorted_mask
+from modeharvest.imaging.photographs.files import read_image
+from modeharvest.imaging.sensor import quantise
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 

@@ -10,10 +10,11 @@ import tempfile
 
 import numpy as np
 
-from modeharvest.case import Case, shipped_solution
 from modeharvest.fem.field import Solution
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
+from modeharvest.idic.correlate import correlate, fit_displacement
+from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.imaging.imageset import make_images
+from modeharvest.runs.case import Case, shipped_solution
 
 STRAIN = 0.128
 

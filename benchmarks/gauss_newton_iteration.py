@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.gauss_newton import GaussNewtonOptions
-from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.scaled_eigen import ScaledEigen
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.assembly import Assembly
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage, sample_points
+from modeharvest.imaging.spline import SplineImage, sample_points
+from modeharvest.util.scaled_eigen import ScaledEigen
 
 REPEATS = 7
 GRID = PixelGrid.centred(2207, 1651, 0.01)

@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.case import read_case, shipped_solution
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
-from modeharvest.idic.pyramid import FULL, eroded
+from modeharvest.idic.correlate import correlate, fit_displacement
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.pyramid import FULL, eroded
 from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.util.errors import InputError
 
 STRAIN, PIXEL = 0.128, 0.04
 NOISES = (0.0, 0.01, 0.02, 0.04, 0.08)

@@ -25,13 +25,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
-from modeharvest.imaging.isoparametric import interpolate, locate, map_back
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate, map_back
 from modeharvest.imaging.render import render_image
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.runs.case import shipped_solution
 
 STRAIN = 0.128
 ROUNDS = 7

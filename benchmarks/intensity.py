@@ -27,14 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Mesh, Solution
-from modeharvest.imaging.aperture import Aperture
+from modeharvest.imaging.camera import ImagedState, integrate, near_edges
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.integrate import Scene, integrate, near_edges
-from modeharvest.imaging.isoparametric import locate
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.render import render_deformed
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.sensor import Aperture
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.runs.case import shipped_solution
 
 STRAIN = 0.128
 WINDOW = PixelGrid(200, 200, 0.01, -1.0, 1.0)  # about one cell of 190 px, with its holes
@@ -104,7 +104,7 @@ def square_rule(aperture: Aperture, side: int) -> tuple[FloatArray, FloatArray]:
 
 
 def aperture_errors(
-    scene: Scene, aperture: Aperture, fine: int = 16, finest: int = 1597
+    scene: ImagedState, aperture: Aperture, fine: int = 16, finest: int = 1597
 ) -> tuple[int, dict[str, FloatArray]]:
     """Points a pixel, and the errors of single pixels, by where these lie.
 
@@ -153,7 +153,7 @@ def main() -> None:
     print(f"| points, {POINTS} random pixels | largest difference [of full scale] |\n|---|---|")
     for what, error in point_errors(mesh, u, WINDOW, speckle, POINTS).items():
         print(f"| {what} | {error:.1e} |")
-    scene = Scene(mesh, u, WINDOW, speckle, 0.0)
+    scene = ImagedState(mesh, u, WINDOW, speckle, 0.0)
     print("\n| averages over pixels | points/px | where | pixels | rms error | largest |")
     print("|---|---|---|---|---|---|")
     for aperture in (Aperture(1.0), Aperture(0.8, 0.5)):

@@ -15,16 +15,17 @@ from functools import partial
 
 import numpy as np
 
-from modeharvest.case import shipped_solution
-from modeharvest.errors import MissingDependencyError
 from modeharvest.fem.field import Solution
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.fields.subsets import SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.photograph.initial_guess import InitialGuess, initial_guess
 from modeharvest.idic.result import Result
-from modeharvest.idic.start.automatic import Start, automatic_start
-from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
+from modeharvest.idic.slow_fields import Box
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.case import shipped_solution
+from modeharvest.util.errors import MissingDependencyError
 
 CELL, CELLULAR = 1.9, Box.centred(11.4, 19.0)
 
@@ -49,7 +50,9 @@ def local(images: ImageSet, strain: float, subsets: SubsetOptions) -> LocalField
     return field
 
 
-def tell(images: ImageSet, strain: float, field: LocalField, start: Start, found: Result) -> None:
+def tell(
+    images: ImageSet, strain: float, field: LocalField, start: InitialGuess, found: Result
+) -> None:
     """One block of numbers, all in px and per component."""
     truth, grid, mask = images.truth(strain).displacement, images.grid, images.mask()
     x, y, u = field.valid_points()
@@ -93,7 +96,7 @@ def main() -> None:
             masks = images.mask(), images.deformed_mask(strain)
             measured = local(images, strain, subsets)
             for field in (None,) if measured is None else (None, measured):
-                start = automatic_start(f, g, images.grid, CELL, CELLULAR, *masks, local=field)
+                start = initial_guess(f, g, images.grid, CELL, CELLULAR, *masks, local=field)
                 found = correlate(f, g, images.grid, start.ansatz, start.unknowns, *masks)
                 tell(images, strain, start.local, start, found)
 

@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
-from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Solution
-from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
-from modeharvest.idic.specimen.hole_motion import HoleMotion, match
-from modeharvest.idic.specimen.material import find_material
-from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
+from modeharvest.idic.photograph.holes import find_hole_lattice
+from modeharvest.idic.photograph.matching import HoleMotion, match
+from modeharvest.idic.photograph.material import find_material
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.render import read_truth
 from modeharvest.imaging.sensor import Sensor
-from modeharvest.imaging.truth import read_truth
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.case import shipped_solution
 
 BoolArray = NDArray[np.bool_]
 

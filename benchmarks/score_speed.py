@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.case import read_case, shipped_solution
-from modeharvest.scoring import grade, make_benchmark, truth_folder
+from modeharvest.runs.benchmark import grade, make_benchmark, truth_folder
+from modeharvest.runs.case import read_case, shipped_solution
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
 STRAIN, NOISE_PX = 0.128, 0.05

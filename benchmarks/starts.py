@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.case import Case, shipped_solution
 from modeharvest.fem.field import Solution
-from modeharvest.files import atomic, read_json, write_json
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, make_images
-from modeharvest.validation.style import BLUE, GREEN, RED, figure
+from modeharvest.report.figures.style import BLUE, GREEN, RED, figure
+from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.util.files import atomic, read_json, write_json
 
 FloatArray = NDArray[np.float64]
 

@@ -24,18 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from modeharvest.idic.chebyshev import orders
-from modeharvest.idic.fields.files import write_field
-from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.fields.subsets import SubsetOptions, subset_field
-from modeharvest.imaging.io import read_image
-from modeharvest.imaging.speckle import Speckle
+from modeharvest.idic.local.field import LocalField, write_field
+from modeharvest.idic.local.subsets import SubsetOptions, subset_field
+from modeharvest.idic.slow_fields import orders
+from modeharvest.imaging.photographs.files import read_image
+from modeharvest.imaging.speckle.pattern import Speckle
+from modeharvest.report.grades import write_star_grading
+from modeharvest.report.terminal import print_star_grading
 from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.graded import print_star_grading
-from modeharvest.validation.resolution.grading import StarGrade, ranked
-from modeharvest.validation.resolution.star import Star
-from modeharvest.validation.resolution.star_report import StarGrading, write_star_grading
-from modeharvest.validation.resolution.star_set import (
+from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
+from modeharvest.validation.resolution.star import (
+    Star,
     StarSet,
     StarSpec,
     image_name,
@@ -70,7 +69,7 @@ def main() -> None:
             for shape in options.shapes
             for width in options.widths
         }
-        grading = StarGrading(star_set, tuple(ranked(list(grades.values()))))
+        grading = StarGrading(star_set, tuple(ranked_grades(list(grades.values()))))
         write_star_grading(out / "graded", grading)
         print_star_grading(grading, out / "graded")
     expected = ["theory", "this speckle"]

@@ -11,11 +11,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from modeharvest.case import TwinCase, read_case, shipped_solution
-from modeharvest.harvest.twin_run import TwinRun
-from modeharvest.validation.campaign import Campaign, Workers, grid
+from modeharvest.runs.case import TwinCase, read_case, shipped_solution
+from modeharvest.runs.twin import TwinRun
+from modeharvest.validation.campaign import Campaign, grid
+from modeharvest.validation.workers import Workers
 
-FUNCTION = "modeharvest.harvest.coverage:one_seed"
+FUNCTION = "modeharvest.runs.twin:one_seed"
 
 
 def main() -> None:

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.calibration.noise import undistorted_noise
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.pyramid import Level
-from modeharvest.imaging.distortion.undistort import CameraDistortion, undistorted
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.pyramid import Level
+from modeharvest.imaging.distortion.calibration.result import undistorted_noise
+from modeharvest.imaging.distortion.lens import CameraDistortion
+from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from modeharvest.fem.bloch_critical import first_critical
-from modeharvest.fem.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattice_modes import real_modes
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial
+from modeharvest.fem.bloch.critical import first_critical
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.fem.postbuckling import follow
 
 FACTORS = (1.05, 1.2, 1.5)
 

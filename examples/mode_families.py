@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from modeharvest.fem.bloch_critical import first_critical
-from modeharvest.fem.cell import CellPath, PeriodicCell
-from modeharvest.fem.chiral import chiral
-from modeharvest.fem.lattice_modes import real_modes
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.bloch.critical import first_critical
+from modeharvest.fem.bloch.real_modes import real_modes
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, chiral, hexagonal, square
+from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.idic.families.automatic import mode_family
+from modeharvest.idic.spectra.mode_family import mode_family
 
 
 def show(name: str, cell: UnitCell, loading: MacroLoading, *, combined: bool = False) -> None:

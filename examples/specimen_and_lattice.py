@@ -7,14 +7,14 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.bloch_critical import CriticalSearch, critical_at
-from modeharvest.fem.cell import CellPath, PeriodicCell
+from modeharvest.fem.bloch.critical import critical_at
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.lattice_modes import real_modes
-from modeharvest.fem.lattices import square
-from modeharvest.fem.macroscopic import MacroLoading
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import square
+from modeharvest.fem.lattice.options import CriticalSearch, MacroLoading
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.fem.postbuckling import follow
 from modeharvest.fem.simulate import simulate
 
 PITCH, DIAMETER, SIZE, STRAIN = 1.9, 1.5, 0.2, 0.128

@@ -5,8 +5,9 @@ import numpy as np
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.simulate import simulate
 from modeharvest.idic.correlate import correlate, fit_displacement
-from modeharvest.idic.setup import Identification
-from modeharvest.imaging.imageset import ImagingSpec, make_images
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.spec import ImagingSpec
 
 EXPERIMENT = Experiment(strains=(0.078, 0.128), mesh_size=0.2)
 IMAGING = ImagingSpec(pixel_size=0.01)
@@ -17,7 +18,7 @@ def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
     solution = simulate(experiment)
     print("critical strain", solution.info["critical"]["strain"])
     images = make_images(solution, experiment.strains, imaging, folder)
-    how, grid, mask = Identification(), images.grid, images.mask()
+    how, grid, mask = SquareLatticeOptions(), images.grid, images.mask()
     ansatz = how.ansatz(experiment.specimen)
 
     errors = {}

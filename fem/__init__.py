@@ -1,7 +1,12 @@
-"""Finite elements: specimen, mesh, material, equilibrium, stability, the path through buckling.
+"""Finite elements: specimens and lattices, their equilibrium, stability and buckled branches.
 
-``field`` and ``specimen`` are plain numpy; everything else needs dolfinx. The whole of it::
+``field``, ``specimen``, ``materials`` and ``experiment`` are plain numpy; everything else needs
+dolfinx. The whole of it for a specimen::
 
-    from modeharvest.fem.simulate import Experiment, simulate
+    from modeharvest.fem.experiment import Experiment
+    from modeharvest.fem.simulate import simulate
     solution = simulate(Experiment(strains=(0.078, 0.128)))
+
+``path`` follows a specimen through buckling, ``lattice`` holds periodic cells of infinite
+lattices, ``bloch`` their waves of any length.
 """

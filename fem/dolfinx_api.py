@@ -14,8 +14,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from modeharvest.errors import MissingDependencyError
 from modeharvest.fem.field import Mesh
+from modeharvest.util.errors import MissingDependencyError
 
 VERSION = version("fenics-dolfinx")
 if tuple(int(v) for v in VERSION.split(".")[:2]) < (0, 9):

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
 
-from modeharvest.errors import InputError
-from modeharvest.fem.imperfection import Imperfection
 from modeharvest.fem.materials import Material, Ogden
-from modeharvest.fem.specimen import Specimen
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.util.errors import InputError
 
 EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")

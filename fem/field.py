@@ -21,14 +21,10 @@ from typing import Any
 import h5py
 import meshio
 import numpy as np
-from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.files import atomic, atomic_hdf5
-from modeharvest.reading import open_hdf5, read_in_child, reading
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 
 FORMAT = "modeharvest-solution-1"
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}

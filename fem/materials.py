@@ -12,15 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from modeharvest.errors import InputError
-
-
-@runtime_checkable
-class Material(Protocol):
-    """Anything that has a strain energy density."""
-
-    def energy(self, F: Any) -> Any:
-        """Strain energy density W [MPa] as a UFL expression of F (2 x 2) [-]."""
+from modeharvest.util.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -108,7 +100,18 @@ class TwoTermI1:
         )
 
 
-def material_in_words(table: Mapping[str, Any]) -> str:
+MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
+
+
+@runtime_checkable
+class Material(Protocol):
+    """Anything that has a strain energy density."""
+
+    def energy(self, F: Any) -> Any:
+        """Strain energy density W [MPa] as a UFL expression of F (2 x 2) [-]."""
+
+
+def material_text(table: Mapping[str, Any]) -> str:
     """A material's kind and constants, and whether they are this project's default.
 
     Parameters

@@ -15,18 +15,53 @@ from dataclasses import dataclass
 
 import gmsh
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.specimen import Specimen
-from modeharvest.memory import require_memory
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.machine import require_memory
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+
+def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
+    """Move the mesh so that every hole has its own centre and diameter.
+
+    Hole edges stay circles; the motion fades out towards the cell's boundary, so cells do
+    not disturb each other and the outer edges stay straight.
+
+    Raises
+    ------
+    InputError
+        If the scatter could close the thinnest ligament: four standard deviations beyond half of
+        it.
+    """
+    ligament = specimen.pitch - specimen.diameters.max()
+    reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
+    if reach > 0.5 * ligament:
+        raise InputError(
+            f"imperfection: expected 4 (position_sd + diameter_sd / 2) <= {0.5 * ligament:.3g} mm, "
+            f"half a ligament, got {reach:.3g} mm; make the scatter smaller"
+        )
+    random = np.random.default_rng(imperfection.seed)
+    centres = specimen.hole_centres
+    shift = random.normal(0.0, 1.0, centres.shape) * imperfection.position_sd
+    growth = random.normal(0.0, 1.0, len(centres)) * 0.5 * imperfection.diameter_sd
+
+    nodes = mesh.nodes.copy()
+    radii, outer = 0.5 * specimen.diameters, 0.5 * specimen.pitch
+    for centre, radius, move, grow in zip(centres, radii, shift, growth, strict=True):
+        arm = mesh.nodes - centre
+        distance = np.linalg.norm(arm, axis=1)
+        near = distance < outer
+        fade = np.clip((distance[near] - radius) / (outer - radius), 0.0, 1.0)
+        weight = np.cos(0.5 * np.pi * fade)[:, None] ** 2
+        outwards = arm[near] / distance[near][:, None]
+        nodes[near] += weight * (move + grow * outwards)
+    return Mesh(nodes, mesh.cells, mesh.element)
+
 
 # Reflecting a T6 element turns it inside out; this reorders its nodes counter-clockwise.
 REVERSED_T6 = [0, 2, 1, 5, 4, 3]
@@ -36,24 +71,24 @@ _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
 @dataclass(frozen=True)
-class Block:
+class MeshBlock:
     """A small T6 mesh to be placed many times: nodes (n, 2) [mm], cells (m, 6)."""
 
     nodes: FloatArray
     cells: IntArray
 
-    def placed(self, sign: tuple[float, float], origin: tuple[float, float]) -> Block:
+    def placed(self, sign: tuple[float, float], origin: tuple[float, float]) -> MeshBlock:
         """The block reflected about its own axes by ``sign`` and moved to ``origin`` [mm]."""
         cells = self.cells if sign[0] * sign[1] > 0 else self.cells[:, REVERSED_T6]
-        return Block(np.asarray(origin) + np.asarray(sign) * self.nodes, cells)
+        return MeshBlock(np.asarray(origin) + np.asarray(sign) * self.nodes, cells)
 
-    def turned(self, angle: float) -> Block:
+    def turned(self, angle: float) -> MeshBlock:
         """The block turned counter-clockwise about the origin by ``angle`` [rad]."""
         c, s = math.cos(angle), math.sin(angle)
-        return Block(self.nodes @ np.array([[c, s], [-s, c]]), self.cells)
+        return MeshBlock(self.nodes @ np.array([[c, s], [-s, c]]), self.cells)
 
 
-def quarter_cell(pitch: float, diameter: float, size: float) -> Block:
+def quarter_cell(pitch: float, diameter: float, size: float) -> MeshBlock:
     """A quarter of the square unit cell, [0, l/2]^2, with the hole's centre at the origin.
 
     Raises
@@ -74,7 +109,7 @@ def quarter_cell(pitch: float, diameter: float, size: float) -> Block:
     return mesh_block(corners, [ligament, side, side, ligament, on_arc], arcs=[4])
 
 
-def rectangle(width: float, height: float, n_width: int, n_height: int) -> Block:
+def rectangle(width: float, height: float, n_width: int, n_height: int) -> MeshBlock:
     """The block [0, width] x [0, height] with the given numbers of elements on its sides."""
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
     return mesh_block(corners, [n_width, n_height, n_width, n_height])
@@ -126,7 +161,7 @@ def require_size(size: float, area: float) -> None:
     )
 
 
-def join(blocks: list[Block], tolerance: float) -> Mesh:
+def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
     """One T6 mesh of blocks whose shared sides are divided alike.
 
     Parameters
@@ -156,7 +191,7 @@ def divisions_of(length: float, size: float) -> int:
     return max(1, math.ceil(length / size - 1e-9))
 
 
-def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
+def _tiles(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
     half = 0.5 * specimen.pitch
     a, b = specimen.cellular_half_size
     n_half = divisions_of(half, size)
@@ -183,7 +218,7 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[Block]:
 
 def mesh_block(
     corners: list[tuple[float, float]], divisions: list[int], arcs: Collection[int] = ()
-) -> Block:
+) -> MeshBlock:
     """Let gmsh mesh a polygon with T6 elements.
 
     Parameters
@@ -244,11 +279,11 @@ def gmsh_options(numbers: Mapping[str, float]) -> Iterator[None]:
             gmsh.option.setNumber(name, value)
 
 
-def _current_block() -> Block:
+def _current_block() -> MeshBlock:
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     _, connectivity = gmsh.model.mesh.getElementsByType(9)  # 9: the six-node triangle
     cells = connectivity.reshape(-1, 6)
     used = np.unique(cells)
     position = dict(zip(tags, coordinates.reshape(-1, 3)[:, :2], strict=True))
     nodes = np.array([position[tag] for tag in used])
-    return Block(nodes, np.searchsorted(used, cells).astype(np.int64))
+    return MeshBlock(nodes, np.searchsorted(used, cells).astype(np.int64))

@@ -14,17 +14,16 @@ from petsc4py import PETSc
 
 from modeharvest import __version__
 from modeharvest.fem import dolfinx_api
-from modeharvest.fem.branching import follow_branch
-from modeharvest.fem.continuation import State, Walker
-from modeharvest.fem.critical import Critical, locate_critical
-from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.imperfection import perturb
-from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.meshing import mesh_specimen, perturb
+from modeharvest.fem.path.branching import follow_branch
+from modeharvest.fem.path.continuation import PathFollower, State
+from modeharvest.fem.path.critical import Critical, locate_critical
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.path.stability import Mode
 from modeharvest.fem.specimen import Specimen
-from modeharvest.fem.stability import Mode
-from modeharvest.progress import Progress, silent
+from modeharvest.util.progress import Progress, silent
 
 
 def simulate(
@@ -54,16 +53,18 @@ def simulate(
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
     pins = spec.mid_junctions if experiment.guided else ()
-    loading = Loading(spec.half_size[0], spec.length, experiment.edges, experiment.tilt, pins)
+    loading = EdgeCompression(
+        spec.half_size[0], spec.length, experiment.edges, experiment.tilt, pins
+    )
     structure = Structure(mesh, experiment.material, loading, comm)
-    return _Run(experiment, mesh, Walker(structure, experiment.path, progress)).solution()
+    return _Run(experiment, mesh, PathFollower(structure, experiment.path, progress)).solution()
 
 
 @dataclass(eq=False)
 class _Run:
     experiment: Experiment
     mesh: Mesh
-    walker: Walker
+    walker: PathFollower
 
     def solution(self) -> Solution:
         """Walk the path and put together what it gave."""

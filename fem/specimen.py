@@ -1,4 +1,4 @@
-"""The finite specimen: holes on a square lattice inside a rectangle with bulk edges."""
+"""The finite specimen: holes on a square lattice in a rectangle with bulk edges; their scatter."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
+from modeharvest.util.errors import InputError
 
 MOST_HOLES = 1000
 """In a direction."""
@@ -116,3 +116,33 @@ class Specimen:
         x = np.pi * (points[:, 0] + a) / self.pitch
         y = np.pi * (points[:, 1] + b) / self.pitch
         return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Imperfection:
+    """Independent normal scatter of every hole.
+
+    Parameters
+    ----------
+    position_sd
+        Standard deviation of each coordinate of a hole's centre [mm].
+    diameter_sd
+        Standard deviation of a hole's diameter [mm].
+    seed
+        Seed of the random generator.
+    """
+
+    position_sd: float = 0.0
+    diameter_sd: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.position_sd >= 0 and self.diameter_sd >= 0):
+            raise InputError(f"imperfection: expected standard deviations >= 0 mm, got {self}")
+        if self.seed < 0:
+            raise InputError(f"imperfection: expected a seed of 0 or more, got {self.seed}")
+
+    @property
+    def is_none(self) -> bool:
+        """Whether there is no scatter at all: the specimen keeps its symmetries."""
+        return self.position_sd == 0.0 and self.diameter_sd == 0.0

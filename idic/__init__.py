@@ -1,10 +1,8 @@
-"""Micromorphic integrated digital image correlation.
+"""Integrated digital image correlation: the displacement of a pair of images as v0 + sum v_i phi_i.
 
-What is made of what, from the bottom up::
+Data flow one way:
 
-    chebyshev, support, fourier -> ansatz        u = v0 + sum_i v_i phi_i and its unknowns
-    moments -> normal_equations                  J'J and J'r of an ansatz, without J
-    normal_equations -> gauss_newton             the iteration and its outcome
-    pyramid, gauss_newton -> correlate -> result two images in, unknowns with covariance out
-    spectrum -> waves -> pattern                 which mode family, and where to start
+    pair, ansatz --> solver --> correlate --> result --> uncertainty
+    local, spectra --> modes and an initial guess
+    photograph: what photographs show, and all of the above on them
 """

@@ -1,99 +1,59 @@
-"""Integrated digital image correlation: two images in, the unknowns of an ansatz out."""
+"""Integrated digital image correlation; and the best fit of an ansatz to a known field."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.brightness import Brightness
-from modeharvest.idic.estimating_equation import instrument
-from modeharvest.idic.gauss_newton import (
+from modeharvest.idic.pair import CheckedImages, checked_mask, location_of
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Brightness
+from modeharvest.idic.solver.assembly import Assembly, residual
+from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.solver.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
+    Minimum,
     Outcome,
     minimise,
 )
-from modeharvest.idic.inputs import CheckedImages, checked_mask, where
-from modeharvest.idic.judged import WITHOUT_RESULT, ended, judged, weighting_for
-from modeharvest.idic.level_search import LevelSearch, step_length
-from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.pyramid import COARSE_TO_FINE, FULL, Level, prepare
-from modeharvest.idic.result import Result
-from modeharvest.idic.speckle_width import speckle_width
-from modeharvest.idic.weighting import Gradient
+from modeharvest.idic.solver.level_search import LevelSearch, step_length
+from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, level_pair
+from modeharvest.idic.solver.weighting import (
+    LEAST_BLUR_PX,
+    Gradient,
+    Propagation,
+    Weighting,
+    best_blur,
+    instrument,
+)
+from modeharvest.idic.uncertainty.noise import NoiseTransfer
+from modeharvest.idic.uncertainty.residual_test import (
+    LOCAL_MINIMUM,
+    autocorrelation,
+    decorrelated_fraction,
+    lags_for,
+)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import ORDERS
-from modeharvest.progress import Progress, silent
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.scaled_eigen import ScaledEigen
 
 _FINE_PX = 6.5
 """Speckles narrower than this want a spline of order 11."""
-_LEAST = 1e-3
+_EIGENVALUE_CUTOFF = 1e-3
 """On coarse levels, directions with an eigenvalue below this share of the largest one wait for
 the finest level: what a blur does to the images would send them into other valleys."""
 
-_WIDEST_PX = 100
 """Blur of a gradient, rim of the material: wider than any ligament that speckle is seen on."""
-
-
-@dataclass(frozen=True)
-class CorrelationOptions:
-    """How to correlate.
-
-    Parameters
-    ----------
-    levels
-        From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l)
-        or leave fewer than 32 px across are skipped; the last one never is.
-    edge_px
-        Pixels of the reference closer than this to the edge of a hole are left out on the
-        finest level [px].
-    order
-        Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where
-        speckles are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px.
-    gauss_newton
-        Tolerances and limits.
-    gradient
-        What weighs the residual in the end, see :mod:`modeharvest.idic.weighting`: the gradient
-        of the "deformed" image at x + u (the least-squares minimum), or that of the "reference"
-        at x. By default the reference's where the residual is noise, else the deformed image's.
-    gradient_blur_px
-        Blur of the image that this gradient is taken of, on the finest level [px]. By default
-        none, unless the residual is noise: then the blur that makes the unknowns' variance
-        smallest.
-    """
-
-    levels: tuple[Level, ...] = COARSE_TO_FINE
-    edge_px: int = 2
-    order: int | None = None
-    gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
-    gradient: str | None = None
-    gradient_blur_px: float | None = None
-
-    def __post_init__(self) -> None:
-        known = [gradient.value for gradient in Gradient]
-        blur = self.gradient_blur_px or 0.0
-        if self.gradient not in (None, *known) or not 0.0 <= blur <= _WIDEST_PX:
-            raise InputError(
-                f"expected a gradient among {known} and a blur of it of 0 to {_WIDEST_PX} px, got "
-                f"{self.gradient!r} and {self.gradient_blur_px}"
-            )
-        if not self.levels:
-            raise InputError("expected at least one level from coarse to fine, got none")
-        if not 0 <= self.edge_px <= _WIDEST_PX or self.order not in (None, *ORDERS):
-            raise InputError(
-                f"expected edge_px from 0 to {_WIDEST_PX} and order 3, 5 or 11, got "
-                f"{self.edge_px} and {self.order}"
-            )
 
 
 def correlate(
@@ -138,9 +98,9 @@ def correlate(
     options = options or CorrelationOptions()
     clock = _Clock()
     images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
-    width_px = speckle_width(images.f, images.f_mask)
+    width_px = speckle_size(images.f, images.f_mask)
     order = options.order or (5 if width_px >= _FINE_PX else 11)
-    a = before = _lit_alike(ansatz, ansatz.checked(start), *images.grey)
+    a = before = _initial_gain_and_offset(ansatz, ansatz.checked(start), *images.grey)
     clock.lap("check")
     levels = _useful(options.levels, ansatz, grid)
     history: tuple[Iteration, ...] = ()
@@ -156,7 +116,7 @@ def correlate(
         a = np.append(found.unknowns, a[n:])
         if found.outcome in WITHOUT_RESULT:
             break
-    result = judged(search.ansatz, search.pair, found, assembly, width_px)
+    result = assess(search.ansatz, search.pair, found, assembly, width_px)
     clock.lap("judge the residual")
     gradient = None if options.gradient is None else Gradient(options.gradient)
     weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
@@ -166,7 +126,7 @@ def correlate(
         found, how = search.reweighed(found, assembly, weights)
         history += found.history
         weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
-        result = judged(search.ansatz, search.pair, found, assembly, width_px, *weighted)
+        result = assess(search.ansatz, search.pair, found, assembly, width_px, *weighted)
         clock.lap("weigh anew")
     progress(len(levels), len(levels), "correlate")
     return replace(result, history=history, timings_s=clock.laps)
@@ -223,7 +183,7 @@ def fit_displacement(
     inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
     bad = inside & ~np.isfinite(target).all(axis=-1)
     if bad.any():
-        raise InputError(f"expected a finite displacement inside the mask, got {where(bad)}")
+        raise InputError(f"expected a finite displacement inside the mask, got {location_of(bad)}")
     assembly = Assembly(ansatz, grid, inside)
     found = minimise(
         lambda a, with_matrix: assembly.displacement(a, target, with_matrix),
@@ -234,7 +194,7 @@ def fit_displacement(
         on_iteration=_reporter(progress, 0, 1, options),
     )
     clock.lap("iterate")
-    return replace(ended(ansatz, grid, found), history=found.history, timings_s=clock.laps)
+    return replace(make_result(ansatz, grid, found), history=found.history, timings_s=clock.laps)
 
 
 def _level_search(
@@ -252,7 +212,7 @@ def _level_search(
     of the blurred speckle itself.
     """
     levelled = ansatz.brightness.size > 0 and not finest
-    pair = prepare(
+    pair = level_pair(
         images.f, images.g, images.grid, images.f_mask, images.g_mask, level, options.edge_px,
         order if level == FULL else min(order, 5), levelled,
     )  # fmt: skip
@@ -261,7 +221,7 @@ def _level_search(
         pair,
         ansatz if finest else replace(ansatz, brightness=Brightness()),
         level.factor,
-        0.0 if finest else _LEAST,
+        0.0 if finest else _EIGENVALUE_CUTOFF,
         options.gauss_newton.tolerance_px if finest else coarse_px,
         coarse_px,
         options.gauss_newton,
@@ -290,7 +250,9 @@ def _reporter(
     return report
 
 
-def _lit_alike(ansatz: Ansatz, start: FloatArray, f: NDArray[Any], g: NDArray[Any]) -> FloatArray:
+def _initial_gain_and_offset(
+    ansatz: Ansatz, start: FloatArray, f: NDArray[Any], g: NDArray[Any]
+) -> FloatArray:
     """Start with a gain and an offset that give both images one mean and one contrast.
 
     Far from the solution, where the images don't match yet, a fit would sooner wipe out the
@@ -321,3 +283,102 @@ class _Clock:
         now = time.perf_counter()
         self.laps[stage] = now - self._last
         self._last = now
+
+
+WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
+"""Outcomes with nothing to judge."""
+
+
+def make_result(
+    ansatz: Ansatz, grid: PixelGrid, found: Minimum, how: Propagation | None = None
+) -> Result:
+    """Make a result of a minimum, or of a root; of the residual it knows its size alone."""
+    matrix = found.equations.matrix
+    eigen = ScaledEigen.of(matrix if how is None else how.slope)
+    inverse, weight = eigen.inverse(), matrix if how is None else how.weight
+    if how is not None:
+        lost = np.isinf(np.diag(inverse))
+        known = np.where(lost[:, None] | lost[None, :], 0.0, inverse)
+        inverse = known @ weight @ known
+        inverse[lost, lost] = np.inf
+    constants = [ansatz.v0_slice(c).start for c in (0, 1)]
+    per_px = grid.pixel_size**2 / max(1, found.equations.pixels)
+    return Result(
+        ansatz=ansatz,
+        grid=grid,
+        unknowns=found.unknowns.copy(),
+        inverse=inverse,
+        slope_square=float(np.mean(np.diag(matrix)[constants])) * per_px,
+        weight_square=float(np.mean(np.diag(weight)[constants])) * per_px,
+        residual_rms=float(np.sqrt(found.equations.mean_square)),
+        pixels=found.equations.pixels,
+        left_image=found.equations.left_image,
+        outcome=found.outcome,
+        condition_number=eigen.condition_number,
+    )
+
+
+def assess(
+    ansatz: Ansatz,
+    pair: LevelPair,
+    found: Minimum,
+    used: Assembly,
+    width_px: float,
+    weighting: Weighting | None = None,
+    how: Propagation | None = None,
+) -> Result:
+    """Make a result of a minimum of a pair of images, and judge its residual.
+
+    Parameters
+    ----------
+    ansatz, pair, found, used
+        Kinematics and images of a level, where the iteration ended there, and its pixels.
+    width_px
+        Of the speckle [px].
+    weighting, how
+        What weighed the residual, and how its noise propagates; least squares by default.
+    """
+    left = residual(used, found.unknowns, pair.reference, pair.deformed)
+    lost, lags_px = decorrelated_fraction(pair.reference, left), lags_for(width_px)
+    if lost > LOCAL_MINIMUM and found.outcome not in WITHOUT_RESULT:
+        found = replace(found, outcome=Outcome.TRAPPED)
+    order = pair.deformed.order
+    return replace(
+        make_result(ansatz, pair.grid, found, how),
+        noise_transfer=NoiseTransfer.of(ansatz, found.unknowns, pair.grid, used.mask, order),
+        order=order,
+        residual_correlation=autocorrelation(left, lags_px),
+        residual_lags_px=lags_px,
+        unmatched=lost,
+        weighting=weighting or Weighting(width_px=width_px),
+    )
+
+
+def weighting_for(
+    result: Result, width_px: float, gradient: Gradient | None, blur_px: float | None
+) -> Weighting:
+    """Choose what is to weigh the residual.
+
+    Parameters
+    ----------
+    result
+        The least-squares minimum.
+    width_px
+        Of the speckle [px].
+    gradient, blur_px
+        As specified; None is as the noise asks for, if the residual is noise, and otherwise the
+        deformed image's gradient, and no blur.
+    """
+    is_noise = result.agreement().is_white
+    if gradient is None:
+        gradient = Gradient.REFERENCE if is_noise else Gradient.DEFORMED
+    if blur_px is None:
+        blur_px = best_blur(result.noise_to_slope, width_px, result.order) if is_noise else 0.0
+        if is_noise and width_px < _FINEST_PX:
+            blur_px = max(blur_px, LEAST_BLUR_PX)
+    return Weighting(gradient, blur_px, width_px)
+
+
+_FINEST_PX = 4.0
+"""Pixels that sample finer speckles than this fold some of their waves back; a blur keeps those
+out of what weighs the residual."""

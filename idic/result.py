@@ -1,4 +1,7 @@
-"""What a correlation found, how sure it is, and how it got there."""
+"""The result of a correlation: unknowns, covariance, fields on demand, outcome; written as JSON.
+
+Null is infinity, or NaN.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.files import read_record, write_json
-from modeharvest.idic.agreement import LAGS_PX, Agreement
-from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.noise_transfer import ImageNoise, NoiseTransfer, slope_noise
-from modeharvest.idic.serialise import result_fields, result_to_dict
-from modeharvest.idic.weighting import Gradient, Weighting
+from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.solver.weighting import Gradient, Weighting
+from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer, slope_noise
+from modeharvest.idic.uncertainty.residual_test import LAGS_PX, ResidualTest
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
-from modeharvest.reading import reading
-
-FloatArray = NDArray[np.float64]
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_record, reading, write_json
 
 FORMAT = "modeharvest-result-4"
 
@@ -196,7 +196,7 @@ class Result:
         in_g = self.noise_transfer.value * known.deformed**2
         return float(np.sqrt(known.reference**2 + in_g))
 
-    def agreement(self, noise: ImageNoise | float | None = None) -> Agreement:
+    def agreement(self, noise: ImageNoise | float | None = None) -> ResidualTest:
         """Whether the residual is noise: what the standard errors rest on.
 
         Parameters
@@ -205,7 +205,7 @@ class Result:
             Of the images, or the standard deviation of both [grey levels], if known; then chi
             squared is given, too.
         """
-        return Agreement.of(
+        return ResidualTest.of(
             self.residual_rms,
             self.residual_correlation,
             self.pixels,
@@ -310,3 +310,72 @@ class Result:
 
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
     return grid.x, grid.y
+
+
+def result_to_dict(result: Result) -> dict[str, Any]:
+    """Everything a result holds, and what it means in words."""
+    weighting = result.weighting
+    return {
+        "outcome": result.outcome.value,
+        "explanation": result.outcome.explanation,
+        "unknowns": dict(zip(result.names, map(float, result.unknowns), strict=True)),
+        "units": list(result.ansatz.units),
+        "residual_rms": _finite(result.residual_rms),
+        "pixels": result.pixels,
+        "left_image": result.left_image,
+        "condition_number": _finite(result.condition_number),
+        "history": [{k: _finite(v) for k, v in vars(s).items()} for s in result.history],
+        "residual_correlation": _finite(result.residual_correlation),
+        "residual_lags_px": list(result.residual_lags_px),
+        "unmatched": _finite(result.unmatched),
+        "weighting": {
+            "gradient": weighting.gradient.value,
+            "blur_px": weighting.blur_px,
+            "width_px": _finite(weighting.width_px),
+            "explanation": weighting.sentence,
+        },
+        "slope_square": _finite(result.slope_square),
+        "weight_square": _finite(result.weight_square),
+        "noise_transfer": vars(result.noise_transfer),
+        "order": result.order,
+        "grid": vars(result.grid),
+        "ansatz": ansatz_to_dict(result.ansatz),
+        "inverse": [[_finite(float(v)) for v in row] for row in result.inverse],
+    }
+
+
+def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the arguments of the result that :func:`result_to_dict` described."""
+    weighting = content["weighting"]
+    plain = ("pixels", "left_image", "order")
+    steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
+    return {
+        **{name: content[name] for name in plain},
+        "ansatz": ansatz_from_dict(content["ansatz"]),
+        "grid": PixelGrid(**content["grid"]),
+        "unknowns": np.array(list(content["unknowns"].values())),
+        "inverse": np.array([[_or(np.inf, v) for v in row] for row in content["inverse"]]),
+        "residual_rms": _or(np.inf, content["residual_rms"]),
+        "outcome": Outcome(content["outcome"]),
+        "condition_number": _or(np.inf, content["condition_number"]),
+        "history": tuple(Iteration(**step) for step in steps),
+        "residual_correlation": _or(np.nan, content["residual_correlation"]),
+        "residual_lags_px": tuple(content["residual_lags_px"]),
+        "unmatched": _or(np.nan, content["unmatched"]),
+        "slope_square": _or(np.inf, content["slope_square"]),
+        "weight_square": _or(np.inf, content["weight_square"]),
+        "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
+        "weighting": Weighting(
+            Gradient(weighting["gradient"]),
+            weighting["blur_px"],
+            _or(np.inf, weighting["width_px"]),
+        ),
+    }
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _or(missing: float, value: Any) -> Any:
+    return missing if value is None else value

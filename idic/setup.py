@@ -1,26 +1,138 @@
-"""How a specimen's images are correlated: degrees, start, options; from a specimen to an ansatz."""
+"""Options of a measurement: degrees and brightness of the ansatz, how to correlate, the start."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz, require_degrees
-from modeharvest.idic.brightness import Brightness
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions
-from modeharvest.idic.fourier import FourierMode, square_family
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper, square_family
+from modeharvest.idic.slow_fields import Box, Brightness
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
+from modeharvest.idic.solver.pyramid import COARSE_TO_FINE, Level
+from modeharvest.idic.solver.weighting import Gradient
+from modeharvest.imaging.spline import ORDERS
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.typed import nearest
 
-FloatArray = NDArray[np.float64]
+_WIDEST_PX = 100
 
 
 @dataclass(frozen=True)
-class Identification:
+class CorrelationOptions:
+    """How to correlate.
+
+    Parameters
+    ----------
+    levels
+        From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l)
+        or leave fewer than 32 px across are skipped; the last one never is.
+    edge_px
+        Pixels of the reference closer than this to the edge of a hole are left out on the
+        finest level [px].
+    order
+        Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where
+        speckles are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px.
+    gauss_newton
+        Tolerances and limits.
+    gradient
+        What weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`: the gradient
+        of the "deformed" image at x + u (the least-squares minimum), or that of the "reference"
+        at x. By default the reference's where the residual is noise, else the deformed image's.
+    gradient_blur_px
+        Blur of the image that this gradient is taken of, on the finest level [px]. By default
+        none, unless the residual is noise: then the blur that makes the unknowns' variance
+        smallest.
+    """
+
+    levels: tuple[Level, ...] = COARSE_TO_FINE
+    edge_px: int = 2
+    order: int | None = None
+    gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
+    gradient: str | None = None
+    gradient_blur_px: float | None = None
+
+    def __post_init__(self) -> None:
+        known = [gradient.value for gradient in Gradient]
+        blur = self.gradient_blur_px or 0.0
+        if self.gradient not in (None, *known) or not 0.0 <= blur <= _WIDEST_PX:
+            raise InputError(
+                f"expected a gradient among {known} and a blur of it of 0 to {_WIDEST_PX} px, got "
+                f"{self.gradient!r} and {self.gradient_blur_px}"
+            )
+        if not self.levels:
+            raise InputError("expected at least one level from coarse to fine, got none")
+        if not 0 <= self.edge_px <= _WIDEST_PX or self.order not in (None, *ORDERS):
+            raise InputError(
+                f"expected edge_px from 0 to {_WIDEST_PX} and order 3, 5 or 11, got "
+                f"{self.edge_px} and {self.order}"
+            )
+
+
+FORMULATIONS = ("total", "updated")
+
+
+@dataclass(frozen=True)
+class PhotographOptions:
+    """The ansatz and how to correlate; the paper's by default.
+
+    Parameters
+    ----------
+    v0_degree, v_degree
+        Total degrees of the polynomials.
+    family
+        "auto" reads the modes off the spectrum; "square" is the paper's Eq. (mode).
+    hold_mode
+        Hold phi1 where it starts; "auto" holds it where the pattern can't be seen.
+    gain_degree, offset_degree
+        Of gain and offset between the images' grey levels; "none" is written by leaving out.
+    edge_px, order
+        As in a correlation.
+    formulation
+        "total": every image against the reference. "updated": against the one before, brought
+        back to the reference's frame; for speckles that change on the way.
+    """
+
+    v0_degree: int = 5
+    v_degree: int = 6
+    family: str = "auto"
+    hold_mode: bool | str = "auto"
+    gain_degree: int | None = None
+    offset_degree: int | None = None
+    edge_px: int = 3
+    order: int | None = None
+    formulation: str = "total"
+
+    def __post_init__(self) -> None:
+        require_degrees(self.v0_degree, self.v_degree)
+        if self.family not in ("auto", "square"):
+            raise InputError(
+                f"correlation: expected family 'auto' or 'square', got {self.family!r}"
+            )
+        if self.formulation not in FORMULATIONS:
+            raise InputError(
+                f"correlation: unknown formulation {self.formulation!r}"
+                f"{nearest(self.formulation, list(FORMULATIONS))}"
+            )
+        if isinstance(self.hold_mode, str) and self.hold_mode != "auto":
+            raise InputError(
+                f"correlation: expected hold_mode true, false or 'auto', got {self.hold_mode!r}"
+            )
+        self.options()
+        self.brightness()
+
+    def options(self) -> CorrelationOptions:
+        """The options of :func:`modeharvest.idic.correlate.correlate`."""
+        return CorrelationOptions(edge_px=self.edge_px, order=self.order)
+
+    def brightness(self) -> Brightness:
+        """Which of gain and offset are unknowns."""
+        return Brightness(self.gain_degree, self.offset_degree)
+
+
+@dataclass(frozen=True)
+class SquareLatticeOptions:
     """The paper's choices (section "Virtual Experiments"), for a square stacking of holes.
 
     Parameters

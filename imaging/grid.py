@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from modeharvest.errors import InputError
-
-FloatArray = NDArray[np.float64]
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -10,24 +10,27 @@ The number in a file's name is the nominal strain in hundredths of a percent (07
 The plain images are noise-free averages over the pixels in float32; those with the bits in
 their name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says
 how the set was made and is written last: without it, the set isn't finished. Files are compared
-with the sizes and SHA-256 in it when they are read. It also holds what makes the set anew, and:
+with the sizes and SHA-256 in it when they are read. It also holds what makes the set anew (a set
+with the same key need not be made), and:
 
 ``noise``
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
     full scale, squared].
 ``reference``, ``snapshots``
-    Of each image what :mod:`modeharvest.imaging.exposure` tells.
+    Of each image the entry that :mod:`modeharvest.imaging.camera` describes.
 ``warnings``
     Sentences about what makes the images other than what a camera would show.
 
 With a distortion of the lens, images and masks are as the lens shows them, and the truth is on the
 ideal grid: what a measurement finds in images that were undistorted.
 
-For the contents of the truth files see :mod:`modeharvest.imaging.truth`.
+For the contents of the truth files see :mod:`modeharvest.imaging.render`.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -36,28 +39,62 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_record, sha256_of, write_json
-from modeharvest.imaging.exposure import Camera
+from modeharvest.imaging.camera import Camera, ImagedState
+from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.integrate import Scene
-from modeharvest.imaging.io import read_image, read_mask
-from modeharvest.imaging.isoparametric import Located, locate
-from modeharvest.imaging.render import Truth, render_deformed, render_reference
-from modeharvest.imaging.set_key import FORMAT, image_key
+from modeharvest.imaging.mapping.isoparametric import Located, locate
+from modeharvest.imaging.photographs.files import read_image, read_mask
+from modeharvest.imaging.render import (
+    Truth,
+    read_displacement,
+    read_truth,
+    render_deformed,
+    render_reference,
+    write_truth,
+)
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import Speckle
-from modeharvest.imaging.truth import read_displacement, read_truth, write_truth
-from modeharvest.progress import Progress, silent
-from modeharvest.reading import reading
-from modeharvest.typed import made
-from modeharvest.versions import versions
+from modeharvest.imaging.speckle.pattern import Speckle
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_record, reading, sha256_of, write_json
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import source_digest, versions
+from modeharvest.util.typed import made
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+FORMAT = "modeharvest-images-1"
 
-__all__ = ["ImageSet", "ImagingSpec", "image_key", "is_complete", "make_images"]
+
+def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
+    """Digest everything that the images depend on, hexadecimal.
+
+    Parameters
+    ----------
+    solution
+        Mesh and displacements.
+    strains
+        Nominal strains of the snapshots to image [-].
+    spec
+        How.
+
+    Raises
+    ------
+    InputError
+        If a snapshot is missing, or a distortion's file can't be read.
+    """
+    digest = hashlib.sha256()
+    wanted = {"format": FORMAT, "code": source_digest("fem", "imaging"), "spec": asdict(spec),
+              "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
+    digest.update(json.dumps(wanted, sort_keys=True).encode())
+    if isinstance(spec.distortion, str):
+        read_distortion(spec.distortion)  # says what is wrong with it
+        digest.update(sha256_of(spec.distortion).encode())
+    for array in (solution.mesh.nodes, solution.mesh.cells):
+        digest.update(array.tobytes())
+    for strain in strains:
+        digest.update(np.ascontiguousarray(solution.at(strain).displacement).tobytes())
+    return digest.hexdigest()
+
 
 SIDECAR = "images.json"
 _LIBRARIES = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
@@ -260,7 +297,7 @@ def _write_set(
     grid = choose_grid(solution, strains, spec)
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
-    scene = Scene(mesh, None, grid, speckle, spec.background, "undeformed mesh")
+    scene = ImagedState(mesh, None, grid, speckle, spec.background, "undeformed mesh")
     camera = Camera.of(spec, grid.shape, folder)
     ideal = render_reference(located, speckle, spec.background)
     reference = camera.expose(ideal, scene, "reference", "mask.tif")
@@ -288,7 +325,7 @@ def _write_set(
 
 
 def _write_snapshot(
-    camera: Camera, scene: Scene, strain: float, located_reference: Located
+    camera: Camera, scene: ImagedState, strain: float, located_reference: Located
 ) -> dict[str, Any]:
     """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
     assert scene.displacement is not None

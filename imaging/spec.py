@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
-from modeharvest.imaging.distorted import without_affine
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion
-from modeharvest.imaging.distortion.undistort import CameraDistortion
+from modeharvest.imaging.distortion.lens import CameraDistortion
+from modeharvest.imaging.distortion.undistort import without_affine
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.sensor import Sensor
-from modeharvest.imaging.speckle import SpeckleSpec
-from modeharvest.memory import require_memory
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.util.errors import InputError
+from modeharvest.util.machine import require_memory
 
 _FEWEST_PX = 8
 _BYTES_PER_PIXEL = 250.0
@@ -50,7 +50,7 @@ class ImagingSpec:
         distorts them; the truth stays on the ideal grid, that of the images once undistorted.
     affine_distortion
         False takes the distortion's affine part away (see :func:`without_affine
-        <modeharvest.imaging.distorted.without_affine>`): it is no more than another pixel size,
+        <modeharvest.imaging.distortion.undistort.without_affine>`): it is no more than another pixel size,
         and can't be told from the images of a target whose shifts are unknown.
 
     Raises

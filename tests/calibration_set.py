@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.imaging.distortion.mapping import Distortion
-from modeharvest.imaging.distortion.undistort import PolynomialDistortion
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 

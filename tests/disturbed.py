@@ -97,7 +97,7 @@ class Disk:
 
 def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
     """Run the command once in a fork, and print what became of it."""
-    from modeharvest.cli import main
+    from modeharvest.cli.root import main
 
     with tempfile.TemporaryFile() as said:
         child = os.fork()

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.fem.equilibrium import Structure
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.meshing import join, rectangle
+from modeharvest.fem.path.equilibrium import Structure
 
 FloatArray = NDArray[np.float64]
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fourier import FourierMode, free_family, square_family
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
+from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from perforated import PITCH, SQUARE, holed_cell
 
 from modeharvest.fem.field import Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.scoring import make_benchmark
+from modeharvest.runs.benchmark import make_benchmark
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
 FloatArray = NDArray[np.float64]

@@ -11,27 +11,27 @@ from manufactured import image_pair, reference_points, speckle
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.calibration.result import Calibration, DegreeTrial
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.error_bars import field_errors
-from modeharvest.idic.families.pattern import read_pattern
-from modeharvest.idic.families.spectrum import spectral_density
-from modeharvest.idic.fields.local_field import sampled_field
-from modeharvest.idic.fourier import FourierMode
-from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.local.field import sampled_field
+from modeharvest.idic.modes import FourierMode
+from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.result import Result
-from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
-from modeharvest.imaging.distortion.undistort import PolynomialDistortion
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.spectra.pattern import read_pattern
+from modeharvest.idic.spectra.spectrum import spectral_density
+from modeharvest.idic.uncertainty.covariance import field_errors
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.harvest.run import (
+from modeharvest.runs.photographs.results import (
     FrameTruth,
     Harvest,
     HarvestedFrame,
     HarvestTruth,
     TruthRow,
 )
-from modeharvest.validation.harvest.timeline import Moment, find_buckling
+from modeharvest.validation.onset import Moment, find_buckling
 
 FloatArray = NDArray[np.float64]
 

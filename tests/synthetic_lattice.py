@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.fem.dispersion import ZONES, Dispersion, ZoneMap
+from modeharvest.fem.bloch.dispersion import ZONES, Dispersion, ZoneMap
+from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.modes import Branch, BranchState, ModeSet
-from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wave_sum
-from modeharvest.validation.lattice.mode_study import FirstModeLimit, ModeStudy
-from modeharvest.validation.lattice.mode_table import ModeRow
-from modeharvest.validation.lattice.run import CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.validation.studies.lattice import FirstModeLimit, LatticeModeStudy
+from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
 
 FloatArray = NDArray[np.float64]
 
@@ -123,12 +122,12 @@ def row(ratio: float = 0.8, loading: str = "uniaxial", **changes: Any) -> ModeRo
     return ModeRow(**values)
 
 
-def study() -> ModeStudy:
+def study() -> LatticeModeStudy:
     """Rows of two loadings, a limit, an overlay."""
     mesh, _ = cell()
     analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, PITCH)
     mode = PatternMode(row(), mesh, analytic * [1.0, 1.1], analytic)
-    return ModeStudy(
+    return LatticeModeStudy(
         tuple(row(r, name) for name in ("uniaxial", "equibiaxial") for r in (0.3, 0.6, 0.8)),
         (row(pitch=20.0, likeness=1.0),),
         (row(material="other", likeness=0.999),),

@@ -12,9 +12,9 @@ from manufactured import inverted
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 Displacement = Callable[[FloatArray], FloatArray]

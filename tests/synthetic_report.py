@@ -10,16 +10,16 @@ import numpy as np
 from manufactured import DOMAIN, UNIT_CELL, one_mode
 from numpy.typing import NDArray
 
-from modeharvest.case import Case
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.families.pattern import Pattern, read_pattern
-from modeharvest.idic.families.spectrum import Spectrum, spectral_density
-from modeharvest.idic.gauss_newton import Iteration, Outcome
 from modeharvest.idic.result import Result
+from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
+from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.validation.plots import Atlas
+from modeharvest.report.figures.experiment import ExperimentReportData
+from modeharvest.runs.case import Case
 from modeharvest.validation.truth import Comparison
 
 GRID = PixelGrid.centred(130, 110, 0.05)
@@ -76,7 +76,7 @@ def comparison(strain: float, amplitude: float, ansatz: Ansatz | None = None) ->
     return Comparison(strain, GRID, MASK, truth, found, best, residual)
 
 
-def spectrum(one: Comparison) -> tuple[Spectrum, Pattern]:
+def spectrum(one: Comparison) -> tuple[Spectrum, WavePattern]:
     """What the truth's spectral densities say."""
     made = spectral_density(np.nan_to_num(one.displacement), GRID, MASK, UNIT_CELL)
     return made, read_pattern(made)
@@ -113,11 +113,15 @@ def solution(strains: tuple[float, ...], info: dict[str, Any] | None = None) -> 
     return Solution(mesh, shots, {"critical": CRITICAL, "path": PATH} if info is None else info)
 
 
-def atlas(strains: tuple[float, ...] = (0.05, 0.1), ansatz: Ansatz | None = None) -> Atlas:
+def atlas(
+    strains: tuple[float, ...] = (0.05, 0.1), ansatz: Ansatz | None = None
+) -> ExperimentReportData:
     """Everything that the pictures show."""
     found = [comparison(e, 4.0 if _branch(e) != "primary" else 0.1, ansatz) for e in strains]
     images = MadeUpImages(Path(), {})
-    return Atlas(solution(strains), images, found, [spectrum(c) for c in found], UNIT_CELL)
+    return ExperimentReportData(
+        solution(strains), images, found, [spectrum(c) for c in found], UNIT_CELL
+    )
 
 
 def case() -> dict[str, Any]:
@@ -127,7 +131,7 @@ def case() -> dict[str, Any]:
     return plain
 
 
-def summary(of: Atlas, critical: float | None = 0.06) -> dict[str, Any]:
+def summary(of: ExperimentReportData, critical: float | None = 0.06) -> dict[str, Any]:
     """What ``summary.json`` would hold, numbers made up."""
     return {
         "title": "Made up <for tests>",
@@ -148,7 +152,7 @@ def summary(of: Atlas, critical: float | None = 0.06) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _snapshot(one: Comparison, pattern: Pattern) -> dict[str, Any]:
+def _snapshot(one: Comparison, pattern: WavePattern) -> dict[str, Any]:
     has_mode = bool(one.result.ansatz.modes)
     mode = [float(v) for v in one.result.mode_parameters()] if has_mode else []
     stats = {"rms_per_component": 0.1, "median_length": 0.1, "max_length": 0.5}

@@ -12,21 +12,21 @@ from filling_mode import MASK, STRAIN, case
 from manufactured import GRID
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.agreement import (
-    LAGS_PX,
-    Agreement,
-    autocorrelation,
-    lags_for,
-    unmatched,
-)
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.identifiability import identifiability
 from modeharvest.idic.result import Result
-from modeharvest.idic.speckle_width import speckle_width
-from modeharvest.imaging.interpolation import SplineImage
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.idic.uncertainty.residual_test import (
+    LAGS_PX,
+    ResidualTest,
+    autocorrelation,
+    decorrelated_fraction,
+    lags_for,
+)
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
@@ -88,27 +88,27 @@ def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
     speckle = Speckle(SpeckleSpec(standard_deviation=spectrum, blur_px=blur_px, seed=1), shape)
     rows, cols = np.indices(shape).astype(float)
     f = speckle.image()
-    width = speckle_width(f, np.ones(shape, dtype=np.bool_))
+    width = speckle_size(f, np.ones(shape, dtype=np.bool_))
     assert width == pytest.approx(width_px, abs=0.6)
     lags = lags_for(width)
     assert max(lags) <= max(4, 1.1 * width)
     wave = 0.5 * np.sin(2 * np.pi * cols / 80)
     left_over = f - speckle(rows + wave, cols - wave)
-    assert not Agreement(autocorrelation(left_over, lags), f.size, lags_px=lags).is_white
+    assert not ResidualTest(autocorrelation(left_over, lags), f.size, lags_px=lags).is_white
     rng = np.random.default_rng(3)
     noise = left_over.std() * rng.normal(size=(2, *shape))
     beside_noise = left_over + noise[0]
-    assert not Agreement(autocorrelation(beside_noise, lags), f.size, lags_px=lags).is_white
+    assert not ResidualTest(autocorrelation(beside_noise, lags), f.size, lags_px=lags).is_white
     # What was once looked at for every speckle is beyond small ones.
-    assert Agreement(autocorrelation(beside_noise), f.size).is_white == (width < 6.0)
+    assert ResidualTest(autocorrelation(beside_noise), f.size).is_white == (width < 6.0)
     moved = SplineImage.of(noise[1]).sample(*(0.97 * np.stack([rows, cols]) + 3))[0]
-    judged = Agreement(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
+    judged = ResidualTest(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
     assert judged.is_white, judged.sentence
 
 
 def test_lags_of_the_paper_s_speckle() -> None:
     assert lags_for(12.4) == LAGS_PX
-    said = Agreement(0.5, 1000, lags_px=lags_for(4.0)).sentence
+    said = ResidualTest(0.5, 1000, lags_px=lags_for(4.0)).sentence
     assert "autocorrelation over 3 to 4 px" in said
 
 
@@ -117,18 +117,18 @@ def test_unmatched_blocks_are_counted() -> None:
     f = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
     other = np.repeat(np.repeat(rng.normal(size=(80, 80)), 4, axis=0), 4, axis=1)
     g = 0.5 * f - 3.0 + 0.1 * other  # darker and flatter, but the same speckle
-    assert unmatched(f, f - g) == 0.0
+    assert decorrelated_fraction(f, f - g) == 0.0
     g[:, :64] = other[:, :64]  # a fifth of the columns: 64 of 320 px
     # Of 8 x 8 independent speckles a chance correlation has a standard deviation of 1/8.
-    assert unmatched(f, f - g) == pytest.approx(0.2, abs=0.02)
+    assert decorrelated_fraction(f, f - g) == pytest.approx(0.2, abs=0.02)
     g[:, :32] = np.nan
-    assert unmatched(f, f - g) == pytest.approx(1 / 9, abs=0.02)
-    assert unmatched(f, np.full_like(f, np.nan)) == 0.0
+    assert decorrelated_fraction(f, f - g) == pytest.approx(1 / 9, abs=0.02)
+    assert decorrelated_fraction(f, np.full_like(f, np.nan)) == 0.0
 
 
 def test_bad_noise() -> None:
     with pytest.raises(InputError, match="more than 0 grey levels"):
-        Agreement.of(0.1, 0.0, 100, 3, noise_sd=0.0)
+        ResidualTest.of(0.1, 0.0, 100, 3, noise_sd=0.0)
 
 
 def test_standard_deviation_of_the_displacement_is_the_covariance_through_the_sensitivities() -> (

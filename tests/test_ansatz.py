@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modeharvest.errors import InputError
-from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.serialise import ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.slow_fields import Box
+from modeharvest.util.errors import InputError
 
 few = settings(max_examples=15, deadline=None, derandomize=True)
 

@@ -13,14 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.families.automatic import FoundFamily, mode_family
-from modeharvest.idic.families.equivalents import square_mode
-from modeharvest.idic.families.overlap import overlap
-from modeharvest.idic.fourier import FourierMode, free_family, square_family
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family, overlap
+from modeharvest.idic.spectra.pattern import square_mode
+from modeharvest.util.errors import InputError
 
 SETTINGS = settings(deadline=None, derandomize=True, max_examples=10)
 TWO = np.array([[2], [2]])

@@ -7,22 +7,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest.case import shipped_solution
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.brightness import Brightness
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.families.equivalents import REFERENCE_MODE, square_mode
-from modeharvest.idic.fields.local_field import LocalField, sampled_field
-from modeharvest.idic.gauss_newton import Outcome
-from modeharvest.idic.setup import Identification
-from modeharvest.idic.start.automatic import Start, StartOptions, automatic_start
-from modeharvest.idic.start.fits import robust_fit
-from modeharvest.idic.start.motion import first_motion, hole_centres, outline_motion
+from modeharvest.idic.local.field import LocalField, sampled_field
+from modeharvest.idic.photograph.initial_guess import (
+    InitialGuess,
+    InitialGuessOptions,
+    initial_guess,
+)
+from modeharvest.idic.photograph.motion import (
+    first_motion,
+    hole_centres,
+    outline_motion,
+    robust_fit,
+)
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.slow_fields import Box, Brightness
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE, square_mode
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.imageset import ImageSet, ImagingSpec, make_images
+from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.case import shipped_solution
+from modeharvest.util.errors import InputError
 
 PITCH = 1.9
 CELLULAR = Box.centred(6 * PITCH, 10 * PITCH)
@@ -37,8 +45,8 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
     return make_images(solution, [0.078, 0.128], ImagingSpec(pixel_size=PIXEL), folder)
 
 
-def start_of(images: ImageSet, strain: float, **more: object) -> Start:
-    return automatic_start(
+def start_of(images: ImageSet, strain: float, **more: object) -> InitialGuess:
+    return initial_guess(
         images.reference(), images.deformed(strain), images.grid, PITCH, CELLULAR,
         images.mask(), images.deformed_mask(strain), **more,
     )  # fmt: skip
@@ -51,7 +59,7 @@ def correlated(images: ImageSet, strain: float, ansatz, unknowns):
     )  # fmt: skip
 
 
-def fluctuation(start: Start, points: np.ndarray) -> np.ndarray:
+def fluctuation(start: InitialGuess, points: np.ndarray) -> np.ndarray:
     """(n, 2) sum of v_i phi_i of the start at points."""
     total = start.ansatz.displacement_at(start.unknowns, points)
     return total - start.ansatz.v0(start.unknowns, points[:, None, 0], points[:, None, 1])[:, 0]
@@ -64,7 +72,7 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
     assert not start.held
     found = correlated(images, 0.128, start.ansatz, start.unknowns)
     assert found.outcome is Outcome.CONVERGED
-    setup = Identification()
+    setup = SquareLatticeOptions()
     ansatz = setup.ansatz(Specimen())
     paper = correlated(images, 0.128, ansatz, setup.start(ansatz, 0.128))
     apart = (found.displacement() - paper.displacement())[images.mask()] / PIXEL
@@ -146,8 +154,10 @@ GRID = PixelGrid.centred(300, 220, 0.06)
 BLANK = np.zeros(GRID.shape)
 
 
-def from_field(local: LocalField, cellular, cell_size: float = PITCH, **more: object) -> Start:
-    return automatic_start(BLANK, BLANK, GRID, cell_size, cellular, local=local, **more)
+def from_field(
+    local: LocalField, cellular, cell_size: float = PITCH, **more: object
+) -> InitialGuess:
+    return initial_guess(BLANK, BLANK, GRID, cell_size, cellular, local=local, **more)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.95, 0.95), (0.3, -0.7), (-1.4, 0.2)])
@@ -226,19 +236,19 @@ def test_a_wrong_cell_size_is_contradicted(images: ImageSet) -> None:
     f, g = images.reference(), images.deformed(0.128)
     # By the holes in the mask, whether there is a pattern or not.
     with pytest.raises(InputError, match=r"got 1.89 mm between neighbours of 60 holes"):
-        automatic_start(f, g, grid, 3.8, CELLULAR, mask, local=local)
+        initial_guess(f, g, grid, 3.8, CELLULAR, mask, local=local)
     # By the spectrum, where no mask shows the holes.
     with pytest.raises(InputError, match=r"peaks at .* belong to a cell of 1\.9 mm"):
-        automatic_start(f, g, grid, 1.6, CELLULAR, local=local)
+        initial_guess(f, g, grid, 1.6, CELLULAR, local=local)
     # By the lattice that was found.
     with pytest.raises(InputError, match=r"a lattice of holes 1.9 mm apart"):
-        automatic_start(f, g, grid, 1.6, CELLULAR, local=local, lattice=1.9 * np.eye(2))
+        initial_guess(f, g, grid, 1.6, CELLULAR, local=local, lattice=1.9 * np.eye(2))
 
 
 def test_options_are_what_the_ansatz_can_say() -> None:
     mask = holes_mask(GRID, PITCH * np.eye(2), 0.7, (PITCH / 2, PITCH / 2))
     local = sampled_field(patterned(GRID), GRID, mask, 2)
-    options = StartOptions(2, 1, Brightness(gain_degree=0))
+    options = InitialGuessOptions(2, 1, Brightness(gain_degree=0))
     ansatz = from_field(local, Box.centred(11.4, 15.2), options=options).ansatz
     assert ansatz.size == 2 * 6 + 3 + 7 + 1
     assert ansatz.domain == Box(*GRID.extent)

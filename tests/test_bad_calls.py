@@ -13,13 +13,12 @@ import synthetic_benchmark as made
 from PIL import Image
 from test_cli import called, error_line
 
-from modeharvest.case import Case, read_case
-from modeharvest.case_file import checked
 from modeharvest.cli import messages
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.memory import available_bytes, require_memory
+from modeharvest.runs.case import Case, checked, read_case
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.util.errors import InputError
+from modeharvest.util.machine import available_bytes, require_memory
 
 SPECIMEN = "[experiment]\nstrains = [0.05]\n[experiment.specimen]\nholes_x = 2\nholes_y = 3\n"
 HARVEST = """
@@ -138,8 +137,8 @@ def test_a_container_may_have_less_than_its_machine(
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "memory.current").write_text("2500000\n")
     (tmp_path / "own").write_text("0::/job\n")
-    monkeypatch.setattr("modeharvest.memory._CGROUPS", tmp_path)
-    monkeypatch.setattr("modeharvest.memory._OWN_CGROUP", tmp_path / "own")
+    monkeypatch.setattr("modeharvest.util.machine._CGROUPS", tmp_path)
+    monkeypatch.setattr("modeharvest.util.machine._OWN_CGROUP", tmp_path / "own")
     assert available_bytes() == 900_000.0
 
 
@@ -269,18 +268,18 @@ def test_a_bad_experiment_is_told_in_one_line(
 
 
 def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
-    from modeharvest.harvest.inputs import require_inputs
+    from modeharvest.runs.photographs.prepare import require_inputs
 
     path = tmp_path / "experiment.toml"
     path.write_text(HARVEST.replace('"deformed', f'"{place}/def*').replace('"ref', f'"{place}/ref'))
-    require_inputs(read_experiment(path), tmp_path)
+    require_inputs(read_photograph_case(path), tmp_path)
 
 
 # --- what is printed ----------------------------------------------------------------------
 
 
 def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    from modeharvest.terminal import print_experiment
+    from modeharvest.report.terminal import print_experiment
 
     summary = {
         "title": "[/bold] [red]", "snapshots": [], "critical_strain": None,
@@ -333,7 +332,7 @@ def test_whatever_ends_a_command_is_told_in_one_line(
         raise error
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr("modeharvest.case_file.case_text", fail)
+    monkeypatch.setattr("modeharvest.runs.case.case_text", fail)
     assert called(monkeypatch, "cases", "paper-virtual") == code
     text = capsys.readouterr().err
     assert said in text

@@ -18,10 +18,10 @@ import pytest
 import synthetic_benchmark as made
 from synthetic_benchmark import PIXEL, STRAIN
 
-from modeharvest import cli
-from modeharvest.errors import InputError
-from modeharvest.imaging.io import read_image, read_mask
-from modeharvest.scoring import make_benchmark
+from modeharvest.cli.root import main
+from modeharvest.imaging.photographs.files import read_image, read_mask
+from modeharvest.runs.benchmark import make_benchmark
+from modeharvest.util.errors import InputError
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth, displacement_at
 
 PUBLIC = {
@@ -91,7 +91,7 @@ def test_the_command_says_what_is_where(
     arguments = ["benchmark", "make", case, "--out", public, "--solution", solution]
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     assert not end.value.code
     said = capsys.readouterr().out
     assert f"benchmark {BenchmarkTruth.read(truth).id}: 1 deformed images in {public}" in said

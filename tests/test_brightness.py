@@ -13,12 +13,12 @@ from filling_mode import MASK, STRAIN, case, error_px
 from manufactured import GRID
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.brightness import Brightness
 from modeharvest.idic.correlate import correlate, fit_displacement
-from modeharvest.idic.gauss_newton import Outcome
 from modeharvest.idic.result import Result
+from modeharvest.idic.slow_fields import Brightness
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

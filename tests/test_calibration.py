@@ -11,12 +11,16 @@ from calibration_set import photographs, random_lens
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.errors import InputError
-from modeharvest.idic.calibration.calibrate import Calibration, CalibrationOptions, calibrate
-from modeharvest.idic.calibration.gauge import affine_aside
-from modeharvest.idic.calibration.noise import sampled_noise, undistorted_noise
-from modeharvest.imaging.distortion.undistort import PolynomialDistortion, undistorted
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
+from modeharvest.imaging.distortion.calibration.result import (
+    Calibration,
+    sampled_noise,
+    undistorted_noise,
+)
+from modeharvest.imaging.distortion.lens import PolynomialDistortion
+from modeharvest.imaging.distortion.undistort import affine_aside, undistorted
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

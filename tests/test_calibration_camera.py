@@ -7,11 +7,10 @@ import pytest
 from calibration_set import photographs, random_lens
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.calibration.camera import RecoveredLens, recover_camera
-from modeharvest.idic.calibration.model import CameraModel, PolynomialModel
-from modeharvest.imaging.distortion.mapping import Distortion
-from modeharvest.imaging.distortion.undistort import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.calibration.model import CameraModel, PolynomialModel
+from modeharvest.imaging.distortion.calibration.pair import RecoveredLens, recover_camera
+from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.calibration_target import CalibrationTarget, photograph_target
-from modeharvest.imaging.distorted import seen_points
-from modeharvest.imaging.distortion.undistort import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
+from modeharvest.imaging.distortion.undistort import seen_points
 from modeharvest.imaging.sensor import Sensor
-from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

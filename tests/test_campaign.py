@@ -17,11 +17,12 @@ import pytest
 from distributed import default_client
 
 from modeharvest import __version__
-from modeharvest.errors import InputError
-from modeharvest.files import read_json, write_json
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.stages import source_digest
 from modeharvest.validation import workers
-from modeharvest.validation.campaign import Campaign, Workers, grid
-from modeharvest.versions import source_digest
+from modeharvest.validation.campaign import Campaign, grid
+from modeharvest.validation.workers import Workers
 
 BASE = {"x": 0, "wait": 0.0, "bad": -1}
 

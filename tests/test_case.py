@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from modeharvest.case import Case, TwinCase, case_text, read_case, shipped_cases
-from modeharvest.errors import InputError
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.imaging.distortion.undistort import CameraDistortion
-from modeharvest.imaging.speckle import Ink
+from modeharvest.imaging.distortion.lens import CameraDistortion
+from modeharvest.imaging.speckle.pattern import Ink
+from modeharvest.runs.case import Case, TwinCase, case_text, read_case, shipped_cases
+from modeharvest.util.errors import InputError
 
 
 def written(folder: Path, text: str) -> Path:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from modeharvest import __version__, cli
-from modeharvest.case import read_case
+from modeharvest import __version__
+from modeharvest.cli.root import main
+from modeharvest.runs.case import read_case
 
 COMMANDS = (
     ("run",),
@@ -31,7 +32,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
     """Exit code of the ``modeharvest`` command."""
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     return int(end.value.code or 0)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest import cli
+from modeharvest.cli.root import main
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 
 CASE = """[experiment]
@@ -42,7 +42,7 @@ def test_a_specimen_that_overlaps_itself_is_told(
     arguments = ["image", case, "--out", tmp_path / "out", "--solution", solution]
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     assert not end.value.code
     said = " ".join(capsys.readouterr().err.split())
     assert ("warning:" in said) == overlaps

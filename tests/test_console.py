@@ -7,7 +7,7 @@ import io
 import numba
 from rich.console import Console
 
-from modeharvest.console import compilation_announced
+from modeharvest.cli.messages import compilation_announced
 
 
 def test_compilation_is_announced_once() -> None:

@@ -11,13 +11,14 @@ import pytest
 from manufactured import GRID, PIXEL, CosinePattern
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
-from modeharvest.idic.gauss_newton import GaussNewtonOptions, Outcome
-from modeharvest.idic.pyramid import Level, eroded
+from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
+from modeharvest.idic.solver.pyramid import Level, eroded
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 Images = tuple[FloatArray, FloatArray]

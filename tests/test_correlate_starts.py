@@ -10,11 +10,12 @@ from manufactured import DOMAIN, GRID, PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.families.equivalents import mode_equivalent
-from modeharvest.idic.fourier import FourierMode, free_family, square_family
-from modeharvest.idic.gauss_newton import GaussNewtonOptions, Outcome
-from modeharvest.idic.pyramid import Level, eroded
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.modes import FourierMode, free_family, square_family
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
+from modeharvest.idic.solver.pyramid import Level, eroded
+from modeharvest.idic.spectra.pattern import mode_equivalent
 
 FloatArray = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ from manufactured import PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.fourier import FourierMode, square_family
-from modeharvest.idic.gauss_newton import GaussNewtonOptions, Outcome
-from modeharvest.idic.pyramid import Level
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.modes import FourierMode, Taper, square_family
 from modeharvest.idic.result import Result
-from modeharvest.idic.support import Taper
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
+from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 
 FloatArray = NDArray[np.float64]

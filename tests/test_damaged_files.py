@@ -30,35 +30,37 @@ from scipy.io import savemat
 from test_mode_file import sample
 from test_result import some_result
 
-from modeharvest.case import read_case
-from modeharvest.errors import InputError
 from modeharvest.fem import field
+from modeharvest.fem.bloch.modes import read_modes, write_modes
 from modeharvest.fem.field import Solution, read_any_mesh, read_meshio
-from modeharvest.fem.mode_file import read_modes, write_modes
-from modeharvest.harvest.example import EXAMPLE
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.prepare import Prepared
-from modeharvest.idic.families.automatic import mode_family
-from modeharvest.idic.families.equivalents import square_mode
-from modeharvest.idic.families.files import read_family, read_spectrum, write_family
-from modeharvest.idic.families.lattice_spectrum import lattice_spectrum
-from modeharvest.idic.fields import tables
-from modeharvest.idic.fields.files import read_field
-from modeharvest.idic.fields.tables import read_mat
+from modeharvest.idic.local import tables
+from modeharvest.idic.local.field import read_field
+from modeharvest.idic.local.tables import read_mat
+from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.result import Result
+from modeharvest.idic.spectra.lattice_spectrum import lattice_spectrum
+from modeharvest.idic.spectra.mode_family import (
+    mode_family,
+    read_family,
+    read_spectrum,
+    write_family,
+)
+from modeharvest.idic.spectra.pattern import square_mode
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
-from modeharvest.imaging.distortion.undistort import PolynomialDistortion
+from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.imaging.io import read_image, read_mask
+from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
-from modeharvest.imaging.speckle import SpeckleSpec
-from modeharvest.imaging.truth import read_truth
-from modeharvest.lattice.case import read_lattice_case
-from modeharvest.reading import reading
-from modeharvest.studies.case import read_study
-from modeharvest.validation.resolution.star import Star
-from modeharvest.validation.resolution.star_set import StarSet, StarSpec, make_star_set
+from modeharvest.imaging.render import read_truth
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.runs.case import read_case
+from modeharvest.runs.lattice.case import read_lattice_case
+from modeharvest.runs.photographs.case import EXAMPLE, read_photograph_case
+from modeharvest.runs.study import read_study
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import reading
+from modeharvest.validation.resolution.star import Star, StarSet, StarSpec, make_star_set
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.fields import Declared, read_measured
 
@@ -101,7 +103,7 @@ def _cases(folder: Path) -> dict[str, Subject]:
         "twin": Subject(root / "cases" / "paper-real-twin.toml", read_case),
         "lattice": Subject(root / "cases" / "square-lattice.toml", read_lattice_case),
         "study": Subject(root / "studies" / "noise.toml", read_study),
-        "experiment": Subject(harvest, read_experiment),
+        "experiment": Subject(harvest, read_photograph_case),
     }
 
 
@@ -151,7 +153,7 @@ def _sets(folder: Path) -> dict[str, Subject]:
         "images": Subject(truth / "images" / "images.json", images),
         "truth": Subject(next((truth / "images").glob("truth_*.h5")), read_truth),
         "benchmark": Subject(truth / "benchmark.json", benchmark),
-        "prepared": Subject(folder / "prepared.json", lambda p: Prepared.read(p.parent)),
+        "prepared": Subject(folder / "prepared.json", lambda p: PreparedPhotographs.read(p.parent)),
         "star": Subject(star.folder / "star.json", lambda p: StarSet.read(p.parent)),
     }
 
@@ -440,7 +442,7 @@ def test_a_file_that_crashes_its_parser_is_told_in_a_line(
 ) -> None:
     script = tmp_path / "child.py"
     script.write_text("import os\nos.abort()\n")
-    monkeypatch.setattr("modeharvest.child.__file__", str(script))
+    monkeypatch.setattr("modeharvest.util.child.__file__", str(script))
     savemat(tmp_path / "field.mat", {"x": 1.0})
     with pytest.raises(InputError, match=r"field\.mat, got: a file that makes its parser crash"):
         read_mat(tmp_path / "field.mat")

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.imaging.distorted import render_seen, seen_points, without_affine
 from modeharvest.imaging.distortion.files import write_distortion
+from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
 from modeharvest.imaging.distortion.undistort import (
-    CameraDistortion,
-    PolynomialDistortion,
+    seen_points,
     undistorted,
     undistorted_mask,
+    without_affine,
 )
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
-from modeharvest.imaging.isoparametric import locate
-from modeharvest.imaging.render import render_reference
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.render import render_reference, render_seen
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

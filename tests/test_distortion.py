@@ -10,16 +10,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.distortion.mapping import Distortion
-from modeharvest.imaging.distortion.undistort import (
+from modeharvest.imaging.distortion.lens import (
     CameraDistortion,
+    Distortion,
     PolynomialDistortion,
     SampledDistortion,
-    undistorted,
-    undistorted_mask,
 )
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
-from modeharvest.imaging.distortion.undistort import (
+from modeharvest.imaging.distortion.lens import (
     CameraDistortion,
     PolynomialDistortion,
     SampledDistortion,
 )
+from modeharvest.util.errors import InputError
 
 RNG = np.random.default_rng(0)
 LENS = CameraDistortion(2600.5, 2600.25, 959.5, 539.5, -0.25, 0.1, 1e-3, -2e-3, 0.03)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from calibration_set import photographs, random_lens
 
-from modeharvest.idic.calibration.gauge import affine_aside
 from modeharvest.imaging.distortion.files import read_distortion
-from modeharvest.imaging.distortion.undistort import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.undistort import affine_aside
 
 PAGE = (Path(__file__).parents[1] / "docs" / "distortion.md").read_text("utf-8")
 SHAPE = (140, 170)

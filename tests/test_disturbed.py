@@ -16,11 +16,11 @@ import disturbed
 import pytest
 import synthetic_benchmark
 
-from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.case import shipped_solution
 
 PASSING = ("timings.json", ".lock")
 """What two runs leave different, and what one that is killed leaves behind for the next."""

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modeharvest.idic.families.equivalents import (
+from modeharvest.idic.spectra.pattern import (
     REFERENCE_MODE,
     mode_deviation,
     mode_equivalent,

@@ -11,17 +11,17 @@ from filling_mode import MASK, case
 from manufactured import GRID
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.error_bars import (
-    field_errors,
-    leftover_covariance,
-    noise_covariance,
-    softened,
-    softness,
-)
-from modeharvest.idic.pyramid import eroded
 from modeharvest.idic.result import Result
+from modeharvest.idic.solver.pyramid import eroded
+from modeharvest.idic.uncertainty.covariance import (
+    field_errors,
+    hessian_corrected_covariance,
+    inverse_hessian,
+    noise_covariance,
+    sandwich_covariance,
+)
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 NOISE = 0.01
@@ -85,7 +85,7 @@ def test_unknowns_without_information_make_their_fields_infinite() -> None:
 
 def test_where_all_is_noise_the_blocks_say_what_the_noise_predicts() -> None:
     result, f, g = noisy()
-    leftover = leftover_covariance(result, f, g, MASK, block=0.25)
+    leftover = sandwich_covariance(result, f, g, MASK, block=0.25)
     predicted = result.covariance(NOISE)
     # n unknowns have used up n of about 150 blocks' freedom; and the spline smooths g's noise.
     ratio = np.trace(np.linalg.solve(predicted, leftover)) / len(predicted)
@@ -95,15 +95,15 @@ def test_where_all_is_noise_the_blocks_say_what_the_noise_predicts() -> None:
 def test_what_the_ansatz_leaves_over_shows() -> None:
     plain, f, g = noisy()
     wavy, f2, g2 = noisy(0.01)
-    with_w = field_errors(wavy, X, Y, leftover_covariance(wavy, f2, g2, MASK, 0.25))
-    without = field_errors(plain, X, Y, leftover_covariance(plain, f, g, MASK, 0.25))
+    with_w = field_errors(wavy, X, Y, sandwich_covariance(wavy, f2, g2, MASK, 0.25))
+    without = field_errors(plain, X, Y, sandwich_covariance(plain, f, g, MASK, 0.25))
     assert np.median(with_w.displacement[..., 0]) > 1.5 * np.median(without.displacement[..., 0])
 
 
 def test_too_few_blocks_are_refused() -> None:
     result, f, g = noisy()
     with pytest.raises(InputError, match="expected at least 8 blocks"):
-        leftover_covariance(result, f, g, MASK, block=2.0)
+        sandwich_covariance(result, f, g, MASK, block=2.0)
 
 
 def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
@@ -123,7 +123,7 @@ def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
 def test_seeds_of_noise_scatter_as_the_curvature_predicts(leftover: float, sd: float) -> None:
     result, f, g = noisy(leftover, noise=sd)
     assert result.weighting.is_least_squares == (leftover > 0.0)
-    predicted = softened(result, sd, softness(result, f, g, USED))
+    predicted = hessian_corrected_covariance(result, sd, inverse_hessian(result, f, g, USED))
     quiet = noisy(leftover, seed=None)[1:]
     rng = np.random.default_rng(4)
     ends = []
@@ -142,7 +142,9 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(leftover: float, sd: f
 
 def test_a_leftover_makes_the_cost_softer() -> None:
     stiff, soft = (
-        np.linalg.eigvals(softness(result, f, g, USED) @ np.linalg.inv(result.inverse)).real.max()
+        np.linalg.eigvals(
+            inverse_hessian(result, f, g, USED) @ np.linalg.inv(result.inverse)
+        ).real.max()
         for result, f, g in (noisy(), noisy(0.01))
     )
     assert soft > 1.2 * stiff

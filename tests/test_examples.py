@@ -10,7 +10,7 @@ import pytest
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.specimen import Specimen
-from modeharvest.imaging.imageset import ImagingSpec
+from modeharvest.imaging.spec import ImagingSpec
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "virtual_experiment.py"

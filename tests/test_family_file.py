@@ -11,17 +11,22 @@ import numpy as np
 import pytest
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.families.automatic import FoundFamily, mode_family
-from modeharvest.idic.families.equivalents import square_mode
-from modeharvest.idic.families.files import FORMAT, read_family, read_spectrum, write_family
-from modeharvest.idic.families.lattice_spectrum import LatticeSpectrum, lattice_spectrum
-from modeharvest.idic.fourier import FourierMode
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
+from modeharvest.idic.spectra.mode_family import (
+    FORMAT,
+    FoundFamily,
+    mode_family,
+    read_family,
+    read_spectrum,
+    write_family,
+)
+from modeharvest.idic.spectra.pattern import square_mode
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 MESH, LATTICE = holed_cell(SQUARE, 4, (2, 2)), 2 * SQUARE
 FIELD = square_mode([0.987654321, 1, 1, 1, -1, 0.1, -0.07], PITCH, *MESH.nodes.T)

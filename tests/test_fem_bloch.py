@@ -13,23 +13,29 @@ from fem_bodies import FloatArray, plate
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from modeharvest.errors import InputError
-from modeharvest.fem.bloch import BlochWaves, Wave, scan
-from modeharvest.fem.bloch_critical import (
-    CriticalSearch,
-    LatticeCritical,
-    critical_at,
-    first_critical,
+from modeharvest.fem.bloch.critical import LatticeCritical, critical_at, first_critical
+from modeharvest.fem.bloch.eigen import BlochWaves, Wave, scan
+from modeharvest.fem.bloch.zone import Zone, folded, is_same, zone_path
+from modeharvest.fem.lattice.bloch_map import Condensation, factorise, negative_pivots
+from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+from modeharvest.fem.lattice.cells import (
+    HEXAGONAL_ZONE,
+    SQUARE_ZONE,
+    UnitCell,
+    hexagonal,
+    refined_cell,
+    square,
 )
-from modeharvest.fem.cell import CellPath, CellState, PeriodicCell
-from modeharvest.fem.condensation import Condensation
-from modeharvest.fem.lattices import HEXAGONAL_ZONE, SQUARE_ZONE, UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.lattice.options import (
+    CriticalSearch,
+    MacroLoading,
+    equibiaxial,
+    uniaxial,
+    uniaxial_strain,
+)
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.meshing import join, rectangle
-from modeharvest.fem.reduction import factorise, negative_pivots
-from modeharvest.fem.refinement import refined_cell
-from modeharvest.fem.zone import Zone, folded, is_same, zone_path
+from modeharvest.util.errors import InputError
 
 M: Wave = (math.pi, math.pi)
 GENERAL: Wave = (0.7, -2.1)

@@ -13,12 +13,12 @@ import meshio
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
-from modeharvest.fem.body import FreeBody
-from modeharvest.fem.cell_files import cell_from_gmsh, read_cell
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
+from modeharvest.fem.hyperelastic import FreeBody
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.files import cell_from_gmsh, read_cell
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.util.errors import InputError
 
 SQUARE, HEXAGONAL = square(1.9, 1.5, 0.3), hexagonal(1.386, 1.1, 0.2)
 
@@ -296,7 +296,7 @@ def test_the_recipes_work_as_printed(
 def test_a_file_that_crashes_gmsh_is_told_in_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("modeharvest.fem.cell_files._PROBE", "import os; os.abort()")
+    monkeypatch.setattr("modeharvest.fem.lattice.files._PROBE", "import os; os.abort()")
     (tmp_path / "cell.msh").write_text("$MeshFormat\n")
     with pytest.raises(InputError, match=r"cell\.msh, got: a file that makes gmsh crash"):
         read_cell(tmp_path / "cell.msh")

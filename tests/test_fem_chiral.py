@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
-from modeharvest.fem.bloch import BlochWaves
-from modeharvest.fem.body import FreeBody
-from modeharvest.fem.cell import CellPath, CellState, PeriodicCell
-from modeharvest.fem.chiral import chiral
-from modeharvest.fem.lattices import UnitCell
-from modeharvest.fem.macroscopic import uniaxial
+from modeharvest.fem.bloch.eigen import BlochWaves
+from modeharvest.fem.hyperelastic import FreeBody
+from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, chiral
+from modeharvest.fem.lattice.options import uniaxial
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.util.errors import InputError
 
 SIZE = 0.05
 TETRA, HEXA = chiral(1.0, SIZE, ligaments=4), chiral(1.0, SIZE, ligaments=6)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
-from modeharvest.fem.bloch import BlochWaves
-from modeharvest.fem.cell import CellPath, PeriodicCell
-from modeharvest.fem.dispersion import ZONES, Dispersion, dispersion, in_plane, zone_map
-from modeharvest.fem.lattices import hexagonal, square
-from modeharvest.fem.macroscopic import equibiaxial, uniaxial
+from modeharvest.fem.bloch.dispersion import ZONES, Dispersion, dispersion, in_plane, zone_map
+from modeharvest.fem.bloch.eigen import BlochWaves
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import hexagonal, square
+from modeharvest.fem.lattice.options import equibiaxial, uniaxial
 from modeharvest.fem.materials import TwoTermI1
+from modeharvest.util.errors import InputError
 
 LOADS = (0.0, 0.02)
 

@@ -12,15 +12,15 @@ from fem_bodies import FloatArray, moved, plate, points_of, vector_of
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from modeharvest.errors import InputError
 from modeharvest.fem import dolfinx_api
-from modeharvest.fem.continuation import State, Walker
-from modeharvest.fem.corrector import Outcome, correct
-from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.path.continuation import PathFollower, State
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.path.newton import NewtonOutcome, correct
 from modeharvest.fem.specimen import Specimen
+from modeharvest.util.errors import InputError
 
 WIDTH, HEIGHT = 3.0, 2.0
 MATERIALS = [Ogden(), Ogden((0.7, 0.2), (1.3, -2.0), 4.0), TwoTermI1()]
@@ -49,12 +49,12 @@ PATCHES = pytest.mark.parametrize(
 
 
 def structure_of(mesh: Mesh, material: Material, edges: str = "clamped") -> Structure:
-    return Structure(mesh, material, Loading(0.5 * WIDTH, WIDTH, edges))
+    return Structure(mesh, material, EdgeCompression(0.5 * WIDTH, WIDTH, edges))
 
 
 def equilibrium(structure: Structure, strain: float) -> State:
     """The state on the primary path at a strain."""
-    walker = Walker(structure)
+    walker = PathFollower(structure)
     path = [walker.start()]
     assert walker.primary(path, [strain])
     return path[-1]
@@ -211,7 +211,7 @@ def test_t6_converges_at_its_orders() -> None:
 
 def test_energy_of_a_specimen_converges_with_the_mesh() -> None:
     specimen = Specimen(1, 1)
-    loading = Loading(specimen.half_size[0], specimen.length)
+    loading = EdgeCompression(specimen.half_size[0], specimen.length)
 
     def energy(size: float) -> float:
         structure = Structure(mesh_specimen(specimen, size), Ogden(), loading)
@@ -219,7 +219,7 @@ def test_energy_of_a_specimen_converges_with_the_mesh() -> None:
             structure, lambda x: x * [-0.01 * loading.length / loading.half_width, 0]
         )
         found = correct(structure, affine, 0.02)
-        assert found.outcome is Outcome.CONVERGED
+        assert found.outcome is NewtonOutcome.CONVERGED
         return structure.energy(found.u)
 
     best = energy(0.05)
@@ -234,9 +234,9 @@ def test_energy_of_a_specimen_converges_with_the_mesh() -> None:
 def test_reaction_is_the_slope_of_the_energy(edges: str) -> None:
     specimen = Specimen(2, 2)
     mesh = mesh_specimen(specimen, 0.4)
-    loading = Loading(specimen.half_size[0], specimen.length, edges)
+    loading = EdgeCompression(specimen.half_size[0], specimen.length, edges)
     structure = Structure(mesh, Ogden(), loading)
-    walker = Walker(structure)
+    walker = PathFollower(structure)
     path = [walker.start()]
     h = 1e-4
     assert walker.primary(path, [0.05 - h, 0.05, 0.05 + h])
@@ -270,17 +270,17 @@ def test_factor_solves_and_counts() -> None:
 def test_newton_says_when_it_fails() -> None:
     structure = structure_of(CURVED, TwoTermI1())
     found = correct(structure, structure.zero(), 0.9)
-    assert found.outcome in (Outcome.DIVERGED, Outcome.SLOW)
+    assert found.outcome in (NewtonOutcome.DIVERGED, NewtonOutcome.SLOW)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Loading(1.0, 1.0, "glued"), "'clamped' or 'sliding', got 'glued'"),
-        (lambda: Structure(CURVED, Ogden(), Loading(9.0, 1.0)), "nodes on the edges"),
+        (lambda: EdgeCompression(1.0, 1.0, "glued"), "'clamped' or 'sliding', got 'glued'"),
+        (lambda: Structure(CURVED, Ogden(), EdgeCompression(9.0, 1.0)), "nodes on the edges"),
         (
             lambda: Structure(
-                Mesh(CURVED.nodes, CURVED.cells[:, :3], "T3"), Ogden(), Loading(1.5, 3.0)
+                Mesh(CURVED.nodes, CURVED.cells[:, :3], "T3"), Ogden(), EdgeCompression(1.5, 3.0)
             ),
             "expected a T6 mesh, got T3",
         ),

@@ -14,20 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest.fem.bloch_critical import first_critical
-from modeharvest.fem.cell import CellPath, PeriodicCell
+from modeharvest.fem.bloch.critical import first_critical
+from modeharvest.fem.bloch.modes import ModeSet
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattice_modes import real_modes
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.fem.modes import ModeSet
-from modeharvest.fem.postbuckling import follow
-from modeharvest.idic.families.automatic import FoundFamily, mode_family
-from modeharvest.idic.families.files import read_family
-from modeharvest.idic.families.lattice_spectrum import lattice_spectrum
-from modeharvest.idic.families.overlap import overlap
-from modeharvest.idic.fourier import square_family
+from modeharvest.idic.modes import square_family
+from modeharvest.idic.spectra.lattice_spectrum import lattice_spectrum
+from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family, overlap, read_family
 
 PITCH = 1.0
 LOADINGS = {"uniaxial": uniaxial(), "strain": uniaxial_strain(), "equibiaxial": equibiaxial()}

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from modeharvest.case import read_case
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.runs.case import read_case
 
 STRAINS = (0.05, 0.082, 0.09)
 

@@ -14,24 +14,24 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
-from modeharvest.validation.lattice.independence import (
+from modeharvest.util.errors import InputError
+from modeharvest.validation.studies.lattice import ModeTable, study_likeness
+from modeharvest.validation.studies.lattice_pattern import (
     LOADINGS,
-    Lattice,
     PatternMode,
+    StudiedLattice,
     mode_likeness,
     ogden,
     overlap_of_fields,
     pattern_mode,
     pattern_row,
 )
-from modeharvest.validation.lattice.mode_study import Table, study_likeness
 
-BASE = Lattice(ratio=0.8, loading=LOADINGS["equibiaxial"], divisions=6)
+BASE = StudiedLattice(ratio=0.8, loading=LOADINGS["equibiaxial"], divisions=6)
 
 
 @cache
-def mode(lattice: Lattice) -> PatternMode:
+def mode(lattice: StudiedLattice) -> PatternMode:
     return pattern_mode(lattice, pattern_row(lattice))
 
 
@@ -99,7 +99,7 @@ def test_long_waves_come_first_for_smaller_holes_in_uniaxial_compression() -> No
 
 def test_other_materials_have_nearly_the_same_mode() -> None:
     other = replace(BASE, material=ogden(3.0, 0.45))
-    (row,) = study_likeness(BASE, [other], Table())
+    (row,) = study_likeness(BASE, [other], ModeTable())
     assert 0.99 < row.likeness < 1.0 - 1e-9
     assert row.material == "Ogden m=3, nu=0.45"
 

@@ -11,21 +11,21 @@ from fem_bodies import FloatArray, moved, plate
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
-from modeharvest.fem.body import FreeBody
-from modeharvest.fem.cell import CellPath, CellState, PeriodicCell
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import (
+from modeharvest.fem.hyperelastic import FreeBody
+from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.options import (
     MacroLoading,
     equibiaxial,
     simple_shear,
     uniaxial,
     uniaxial_strain,
 )
+from modeharvest.fem.lattice.periodicity import find_periodicity
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.meshing import join, quarter_cell
-from modeharvest.fem.periodicity import find_periodicity
+from modeharvest.util.errors import InputError
 
 SIZE = 1 / 8
 SQUARE = square(1.0, 0.8, SIZE)

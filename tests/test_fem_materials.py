@@ -22,11 +22,11 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.util.errors import InputError
 
 mpmath.mp.dps = 60
 

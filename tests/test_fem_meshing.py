@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.imperfection import Imperfection, perturb
-from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.fem.specimen import Specimen
+from modeharvest.fem.meshing import mesh_specimen, perturb
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.util.errors import InputError
 
 SMALL = Specimen(holes_x=3, holes_y=2)
 CASES = [

@@ -10,15 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
-from modeharvest.fem.bloch import BlochWaves, Wave
-from modeharvest.fem.bloch_critical import LatticeCritical, critical_at, first_critical
-from modeharvest.fem.cell import CellPath, CellState, PeriodicCell
-from modeharvest.fem.lattice_modes import canonical, real_modes
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial
+from modeharvest.fem.bloch.critical import LatticeCritical, critical_at, first_critical
+from modeharvest.fem.bloch.eigen import BlochWaves, Wave
+from modeharvest.fem.bloch.modes import ModeSet
+from modeharvest.fem.bloch.real_modes import canonical, real_modes
+from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.fem.modes import ModeSet
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 M: Wave = (math.pi, math.pi)

@@ -14,18 +14,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import modeharvest
-from modeharvest.errors import InputError
-from modeharvest.fem.bloch_critical import CriticalSearch, critical_at, first_critical
-from modeharvest.fem.cell import CellPath, PeriodicCell
-from modeharvest.fem.contact import overlaps
+from modeharvest.fem.bloch.critical import critical_at, first_critical
+from modeharvest.fem.bloch.modes import Branch, ModeSet, read_modes
+from modeharvest.fem.bloch.postbuckling import follow
+from modeharvest.fem.bloch.real_modes import real_modes
 from modeharvest.fem.field import Solution
-from modeharvest.fem.lattice_modes import real_modes
-from modeharvest.fem.lattices import UnitCell, hexagonal, square
-from modeharvest.fem.macroscopic import MacroLoading, equibiaxial, uniaxial
+from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
+from modeharvest.fem.lattice.options import (
+    BranchOptions,
+    CriticalSearch,
+    MacroLoading,
+    equibiaxial,
+    uniaxial,
+)
+from modeharvest.fem.lattice.periodicity import overlaps
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
-from modeharvest.fem.mode_file import read_modes
-from modeharvest.fem.modes import Branch, ModeSet
-from modeharvest.fem.postbuckling import BranchOptions, follow
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 PRESSED = MacroLoading(((None, 0.0), (0.0, None)), ((-1.0, 0.0), (0.0, 0.0)))

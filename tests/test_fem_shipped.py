@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.case import read_case, shipped_solution
-from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.field import Solution
-from modeharvest.fem.imperfection import perturb
-from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.meshing import mesh_specimen, perturb
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.simulate import simulate
+from modeharvest.runs.case import read_case, shipped_solution
 
 FloatArray = NDArray[np.float64]
 
@@ -43,7 +42,7 @@ def test_shipped_twin_is_in_stable_equilibrium_under_its_tilted_and_guided_loadi
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
     np.testing.assert_array_equal(shipped.mesh.cells, mesh.cells)
     np.testing.assert_allclose(shipped.mesh.nodes, mesh.nodes, rtol=0, atol=1e-12)
-    loading = Loading(
+    loading = EdgeCompression(
         spec.half_size[0], spec.length, "clamped", experiment.tilt, spec.mid_junctions
     )
     structure = Structure(mesh, experiment.material, loading)

@@ -14,13 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment, PathOptions
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.fem.imperfection import Imperfection
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.simulate import simulate
-from modeharvest.fem.specimen import Specimen
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.util.errors import InputError
 
 ALL = ("primary", "buckled+", "buckled-")
 # Small, coarse and so rather stiff, but it buckles as the paper's does: rows of holes into

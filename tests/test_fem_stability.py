@@ -11,15 +11,16 @@ import pytest
 import scipy.linalg
 from fem_bodies import FloatArray, column, vector_of
 
-from modeharvest.fem.branching import follow_branch
-from modeharvest.fem.continuation import State, Walker, hermite_weights
-from modeharvest.fem.critical import Critical, locate_critical
-from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.materials import Material, Ogden
 from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.path.branching import follow_branch
+from modeharvest.fem.path.continuation import PathFollower, State
+from modeharvest.fem.path.critical import Critical, locate_critical
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
+from modeharvest.fem.path.predictor import hermite_weights
+from modeharvest.fem.path.stability import lowest_modes
 from modeharvest.fem.specimen import Specimen
-from modeharvest.fem.stability import lowest_modes
 
 SMALL = Specimen(2, 1)
 # Poisson's ratio 0, so that clamping doesn't hold the ends' width: an ideal column.
@@ -28,7 +29,7 @@ NO_POISSON = Ogden(moduli=(1.2,), exponents=(2.0,), kappa=1e-9)
 
 @cache
 def small_structure() -> Structure:
-    loading = Loading(SMALL.half_size[0], SMALL.length)
+    loading = EdgeCompression(SMALL.half_size[0], SMALL.length)
     return Structure(mesh_specimen(SMALL, 0.5), Ogden(), loading)
 
 
@@ -85,7 +86,7 @@ def test_modes_are_those_of_the_dense_problem(strain: float) -> None:
 class Buckled:
     """A column walked to its critical point."""
 
-    walker: Walker
+    walker: PathFollower
     path: list[State]
     critical: Critical
     euler: float
@@ -96,8 +97,8 @@ def buckled_column(slenderness: float, material: Material = NO_POISSON) -> Buckl
     """A clamped column of height 1 mm; Euler: e = 4 pi^2 I/(A L^2) = pi^2 h^2/(3 L^2)."""
     euler = np.pi**2 / (3 * slenderness**2)
     mesh = column(slenderness, 1.0, round(2 * slenderness), 2)
-    structure = Structure(mesh, material, Loading(0.5 * slenderness, slenderness))
-    walker = Walker(structure, PathOptions(0.4 * euler, 0.4 * euler))
+    structure = Structure(mesh, material, EdgeCompression(0.5 * slenderness, slenderness))
+    walker = PathFollower(structure, PathOptions(0.4 * euler, 0.4 * euler))
     path = [walker.start()]
     assert walker.primary(path, [1.5 * euler], until_unstable=True)
     critical = locate_critical(walker, path[-2], path[-1])
@@ -163,7 +164,7 @@ def test_buckled_column_is_stable_lower_and_as_deep_as_the_elastica() -> None:
 
 def test_critical_strain_does_not_depend_on_the_steps() -> None:
     reference = buckled_column(8.0)
-    walker = Walker(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
+    walker = PathFollower(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
     path = [walker.start()]
     walker.primary(path, [1.5 * reference.euler], until_unstable=True)
     critical = locate_critical(walker, path[-2], path[-1])
@@ -174,7 +175,7 @@ def test_critical_strain_does_not_depend_on_the_steps() -> None:
 def test_critical_strain_is_found_where_the_negative_mode_is_hidden() -> None:
     """At a state that is critical for another mode the eigensolver may lose the negative one."""
     reference = buckled_column(8.0)
-    walker = Walker(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
+    walker = PathFollower(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
     path = [walker.start()]
     walker.primary(path, [1.5 * reference.euler], until_unstable=True)
     walker.modes = [mode for mode in walker.modes if mode.eigenvalue > 0]
@@ -186,7 +187,7 @@ def test_critical_strain_is_found_where_the_negative_mode_is_hidden() -> None:
 
 def test_tangent_is_the_derivative_of_the_path_and_predicts_with_order_four() -> None:
     structure = small_structure()
-    walker = Walker(structure)
+    walker = PathFollower(structure)
     centre, steps = 0.06, np.array([0.02, 0.01, 0.005])
     strains = sorted({centre + s * h for h in steps for s in (-1, 0, 1)})
     path = [walker.start()]

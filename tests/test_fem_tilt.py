@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from fem_bodies import plate
 
-from modeharvest.case import Case
-from modeharvest.errors import InputError
-from modeharvest.fem.continuation import Walker
-from modeharvest.fem.equilibrium import Loading, Structure
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import Ogden
+from modeharvest.fem.path.continuation import PathFollower
+from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
+from modeharvest.runs.case import Case
+from modeharvest.util.errors import InputError
 
 WIDTH, HEIGHT = 3.0, 2.0
 SMALL = Specimen(4, 2)
@@ -49,8 +49,8 @@ def test_small_tilt_of_a_plate_is_pure_bending() -> None:
     mesh = plate(WIDTH, HEIGHT, 5, 4)
 
     def energy_and_force(angle: float) -> tuple[float, float]:
-        structure = Structure(mesh, material, Loading(0.5 * WIDTH, WIDTH, "sliding", angle))
-        walker = Walker(structure)
+        structure = Structure(mesh, material, EdgeCompression(0.5 * WIDTH, WIDTH, "sliding", angle))
+        walker = PathFollower(structure)
         path = [walker.start()]
         assert walker.primary(path, [strain])
         return structure.energy(path[-1].u), structure.reaction(path[-1].u, WIDTH)
@@ -80,8 +80,10 @@ def test_force_and_moment_do_the_work() -> None:
 
 
 def test_no_tilt_is_what_was_before_and_keeps_its_key() -> None:
-    plain = Structure(plate(WIDTH, HEIGHT, 3, 2), Ogden(), Loading(0.5 * WIDTH, WIDTH))
-    zero = Structure(plate(WIDTH, HEIGHT, 3, 2), Ogden(), Loading(0.5 * WIDTH, WIDTH, tilt=0.0))
+    plain = Structure(plate(WIDTH, HEIGHT, 3, 2), Ogden(), EdgeCompression(0.5 * WIDTH, WIDTH))
+    zero = Structure(
+        plate(WIDTH, HEIGHT, 3, 2), Ogden(), EdgeCompression(0.5 * WIDTH, WIDTH, tilt=0.0)
+    )
     for structure in (plain, zero):
         assert structure._stroke.tobytes() == structure._direction.x.array.tobytes()
     assert "tilt" not in Case().plain()["experiment"]

@@ -15,8 +15,8 @@ import meshio
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution, read_meshio
+from modeharvest.util.errors import InputError
 
 RANDOM = np.random.default_rng(0)
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from modeharvest.errors import InputError
-from modeharvest.idic.fields.columns import column
-from modeharvest.idic.fields.files import read_field, write_field
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField, read_field, write_field
+from modeharvest.idic.local.tables import column
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 GRID = PixelGrid.centred(60, 80, 0.05)
 COL, ROW = (a.astype(float) for a in np.meshgrid(np.arange(5, 75, 10), np.arange(5, 55, 10)))

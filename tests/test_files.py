@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from modeharvest.errors import InputError
-from modeharvest.files import atomic, read_json, require_writable, write_json
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, read_json, require_writable, write_json
 
 
 def test_a_finished_write_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:

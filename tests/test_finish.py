@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
-from modeharvest.idic.finish import (
+from modeharvest.idic.correlate import correlate, fit_displacement
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.final_smoothing import (
     WIDTHS,
     blurred_pair,
     contrast_after,
-    finish_for,
-    speckle_width,
+    final_smoothing,
+    speckle_size,
 )
-from modeharvest.idic.identifiability import identifiability
+from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 FWHM = np.sqrt(8 * np.log(2))
@@ -43,7 +44,7 @@ def with_holes() -> NDArray[np.bool_]:
 @pytest.mark.parametrize("sd", [1.5, 3.0, 6.0])
 def test_the_width_is_that_of_a_known_autocorrelation(sd: float) -> None:
     # About SHAPE / width^2 independent speckles know it to 2 %; linear between whole lags.
-    assert speckle_width(blurred_noise(sd), EVERYWHERE) == pytest.approx(
+    assert speckle_size(blurred_noise(sd), EVERYWHERE) == pytest.approx(
         FWHM * np.sqrt(2) * sd, rel=0.05
     )
 
@@ -51,12 +52,12 @@ def test_the_width_is_that_of_a_known_autocorrelation(sd: float) -> None:
 def test_holes_do_not_change_the_width() -> None:
     image, mask = blurred_noise(3.0), with_holes()
     painted = np.where(mask, image, 50.0)
-    assert speckle_width(painted, mask) == pytest.approx(speckle_width(image, EVERYWHERE), rel=0.05)
+    assert speckle_size(painted, mask) == pytest.approx(speckle_size(image, EVERYWHERE), rel=0.05)
 
 
 def test_without_contrast_a_speckle_is_as_wide_as_can_be() -> None:
     image, nowhere = blurred_noise(3.0), np.zeros(SHAPE, dtype=np.bool_)
-    assert speckle_width(image, nowhere) == speckle_width(0.0 * image, EVERYWHERE) == 128.0
+    assert speckle_size(image, nowhere) == speckle_size(0.0 * image, EVERYWHERE) == 128.0
 
 
 def test_the_paper_s_speckle_is_as_wide_as_its_pixels_differences_say() -> None:
@@ -67,21 +68,21 @@ def test_the_paper_s_speckle_is_as_wide_as_its_pixels_differences_say() -> None:
     apart = 0.5 * (apart + np.array([np.mean((image[k:] - image[:-k]) ** 2) for k in lags]))
     independent = 2.0 * np.interp(image.var(), apart, lags)
     assert independent == pytest.approx(12.4, abs=0.5)
-    assert speckle_width(image, EVERYWHERE) == pytest.approx(independent, rel=0.05)
+    assert speckle_size(image, EVERYWHERE) == pytest.approx(independent, rel=0.05)
 
 
 def test_a_small_leftover_needs_no_blur() -> None:
     """10 px speckles and w of 2 px, as in the paper's virtual experiment."""
     image = Speckle(SpeckleSpec(), SHAPE).image()
-    finish = finish_for(image, EVERYWHERE, 2.0)
+    finish = final_smoothing(image, EVERYWHERE, 2.0)
     assert finish.blur_px == 0.0
     assert "on the images as they are" in finish.sentence
 
 
 def test_a_blur_makes_speckles_as_wide_as_the_rule_says() -> None:
     image, leftover = blurred_noise(1.5), 2.0
-    finish = finish_for(image, EVERYWHERE, leftover)
-    after = speckle_width(ndimage.gaussian_filter(image, finish.blur_px), EVERYWHERE)
+    finish = final_smoothing(image, EVERYWHERE, leftover)
+    after = speckle_size(ndimage.gaussian_filter(image, finish.blur_px), EVERYWHERE)
     assert after == pytest.approx(WIDTHS * leftover, rel=0.05)
     assert f"blurred by {finish.blur_px:.1f} px" in finish.sentence
 
@@ -129,7 +130,7 @@ def test_a_blurred_finish_comes_nearer_to_the_best_fit(
     fine = replace(options, levels=options.levels[-1:])
     rough = correlate(f, g, GRID, ansatz, np.zeros(ansatz.size), mask, None, coarse)
     binned = rough.grid.pixel_size / PIXEL
-    finish = finish_for(f, mask, binned * identifiability(rough).leftover_px)
+    finish = final_smoothing(f, mask, binned * identifiability(rough).leftover_px)
     assert finish.width_px == pytest.approx(5.0, abs=0.5)
     assert finish.blur_px > 2.0
     best = fit_displacement(displacement(at), GRID, ansatz, a, mask)

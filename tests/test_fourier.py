@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modeharvest.errors import InputError
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fourier import FourierMode, ModeFamily, free_family, square_family
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, free_family, square_family
+from modeharvest.idic.slow_fields import Box
+from modeharvest.util.errors import InputError
 
 L = 1.9
 TAPER = Taper(Box.centred(11.4, 19.0), 0.5 * L)

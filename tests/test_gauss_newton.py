@@ -10,15 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.gauss_newton import (
-    GaussNewtonOptions,
-    Minimum,
-    Outcome,
-    minimise,
-)
-from modeharvest.idic.normal_equations import NormalEquations
-from modeharvest.idic.scaled_eigen import ScaledEigen
+from modeharvest.idic.solver.assembly import NormalEquations
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, Outcome, minimise
+from modeharvest.util.errors import InputError
+from modeharvest.util.scaled_eigen import ScaledEigen
 
 FloatArray = NDArray[np.float64]
 Residual = Callable[[FloatArray], tuple[FloatArray, FloatArray]]

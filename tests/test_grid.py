@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modeharvest.errors import InputError
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 GRIDS = st.builds(
     PixelGrid,

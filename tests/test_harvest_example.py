@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from modeharvest.case_file import checked
-from modeharvest.cli import app
-from modeharvest.harvest.example import EXAMPLE
-from modeharvest.harvest.experiment import Experiment, RegionTable
+from modeharvest.cli.root import app
+from modeharvest.idic.photograph.geometry import RegionTable
+from modeharvest.runs.case import checked
+from modeharvest.runs.photographs.case import EXAMPLE, PhotographCase
 
 OPTION = re.compile(r"^# (?P<key>\w+) = (?P<value>.*?)\s+# (?P<words>.*)$")
 
@@ -32,7 +32,7 @@ def options() -> dict[str, dict[str, tuple[str, str]]]:
 
 
 def tables() -> dict[str, type[Any]]:
-    kinds = {n: f.annotation for n, f in Experiment.model_fields.items() if n != "title"}
+    kinds = {n: f.annotation for n, f in PhotographCase.model_fields.items() if n != "title"}
     return {**kinds, "specimen.regions": RegionTable}
 
 
@@ -43,7 +43,7 @@ def test_the_command_prints_it() -> None:
 
 
 def test_it_is_an_experiment() -> None:
-    experiment = checked(Experiment, tomllib.loads(EXAMPLE), "example")
+    experiment = checked(PhotographCase, tomllib.loads(EXAMPLE), "example")
     assert experiment.specimen.cell_size == 1.9
     # Tables without a key that counts are as if they weren't there.
     assert experiment.correlation == type(experiment.correlation)()

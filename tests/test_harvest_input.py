@@ -12,13 +12,13 @@ import pytest
 import tifffile
 from synthetic_photographs import NOISE, Photographed, lattice_points, of
 
-from modeharvest import cli
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.noise import measured_noise
-from modeharvest.harvest.pipeline import Harvesting
+from modeharvest.cli.root import main
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.uncertainty.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.pipeline import HarvestRun
 
 PITCH, PIXEL = 1.9, 0.035
 CELLULAR, DOMAIN = Box.centred(3 * PITCH, 4 * PITCH), Box.centred(3 * PITCH + 1.6, 4 * PITCH + 1.6)
@@ -147,7 +147,7 @@ def test_it_is_one_line_and_nothing_is_lost(
     arguments = ["modeharvest", "harvest", str(folder / "experiment.toml"), "--out", str(out)]
     monkeypatch.setattr(sys, "argv", arguments)
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     said = capsys.readouterr().err
     assert end.value.code == 2
     assert "Traceback" not in said
@@ -168,7 +168,7 @@ def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
         whole = SMALL if path.stem == "frame_2a" else np.full(shape, 255, dtype=np.uint8)
         tifffile.imwrite(folder / f"mask_{path.name}", whole)
     text(f"= {PITCH}", f'= {PITCH}\ndeformed_material = ["mask_*.tif"]')(folder)
-    run = Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+    run = HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
     prepared = run.prepared()
     assert prepared.names == ("frame_1", "frame_2", "frame_3")
     reasons = dict(prepared.skipped)
@@ -189,7 +189,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
         header = "x [px],y [px],u [px],v [px]"
         np.savetxt(folder / f"f{n}.csv", rows, delimiter=",", header=header, comments="")
     tables('[local]\ncode = "file"\nfiles = ["f*.csv"]\ny_axis = "down"')(folder)
-    run = Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+    run = HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
     results = run.results()
     assert list(results) == ["frame_1", "frame_3"]
     for n in (1, 3):

@@ -9,16 +9,15 @@ import pytest
 from numpy.typing import NDArray
 from synthetic_photographs import Displacement, Photographed, lattice_points, of
 
-from modeharvest.errors import InputError
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.measure import Measured
-from modeharvest.harvest.pipeline import Harvesting
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fourier import FourierMode, free_family, square_family
-from modeharvest.idic.gauss_newton import Outcome
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
+from modeharvest.idic.photograph.measure import MeasuredPhotograph
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.pipeline import HarvestRun
+from modeharvest.util.errors import InputError
 
 PITCH, PIXEL = 1.9, 0.035
 FloatArray = NDArray[np.float64]
@@ -31,17 +30,17 @@ def corners(box: Box, grid: PixelGrid) -> list[list[float]]:
             ((left, top), (right, top), (right, bottom), (left, bottom))]  # fmt: skip
 
 
-def harvesting(folder: Path, specimen: str = "", correlation: str = "") -> Harvesting:
+def harvesting(folder: Path, specimen: str = "", correlation: str = "") -> HarvestRun:
     """Of the photographs in a folder."""
     (folder / "experiment.toml").write_text(
         '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
         f"[scale]\npixel_size = {PIXEL}\n[correlation]\nv0_degree = 3\nv_degree = 1\n{correlation}"
         f"\n[specimen]\ncell_size = {PITCH}\n{specimen}"
     )
-    return Harvesting(read_experiment(folder / "experiment.toml"), folder, folder / "out")
+    return HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
 
 
-def error_px(measured: Measured, scene: Photographed, truth: Displacement) -> float:
+def error_px(measured: MeasuredPhotograph, scene: Photographed, truth: Displacement) -> float:
     """Rms per component over the material."""
     off = (measured.result.displacement() - truth(scene.points))[scene.mask]
     return float(np.sqrt(np.mean(off**2)) / PIXEL)

@@ -13,19 +13,19 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from modeharvest.case import shipped_solution
-from modeharvest.cli import app
-from modeharvest.errors import InputError
+from modeharvest.cli.root import app
 from modeharvest.fem.field import Solution
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.inputs import named_files
-from modeharvest.harvest.noise import estimated_noise, measured_noise
-from modeharvest.harvest.pipeline import Harvesting, harvest
 from modeharvest.idic.result import Result
+from modeharvest.idic.uncertainty.noise import estimated_noise, measured_noise
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.runs.case import shipped_solution
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
+from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.util.errors import InputError
 
 PIXEL, NOISE = 0.04, 0.01
 EXPERIMENT = f"""
@@ -110,8 +110,8 @@ def test_the_noise_is_measured(harvested: Path) -> None:
 def test_again_repeats_nothing(harvested: Path, photographs: Path) -> None:
     files = [*harvested.glob("results/*"), *harvested.glob("prepared/*")]
     before = {path: path.stat().st_mtime_ns for path in files}
-    experiment = read_experiment(photographs / "experiment.toml")
-    results = Harvesting(experiment, photographs, harvested).results()
+    experiment = read_photograph_case(photographs / "experiment.toml")
+    results = HarvestRun(experiment, photographs, harvested).results()
     assert list(results) == ["frame_1", "frame_2"]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
 
@@ -121,8 +121,8 @@ def test_an_interrupted_harvest_goes_on(harvested: Path, photographs: Path, tmp_
     shutil.copytree(harvested, out)
     (out / "results" / "frame_2_start.json").unlink()  # written last
     kept = (out / "results" / "frame_1.json").stat().st_mtime_ns
-    experiment = read_experiment(photographs / "experiment.toml")
-    Harvesting(experiment, photographs, out).results()
+    experiment = read_photograph_case(photographs / "experiment.toml")
+    HarvestRun(experiment, photographs, out).results()
     assert (out / "results" / "frame_1.json").stat().st_mtime_ns == kept
     again, first = (Result.read(f / "results" / "frame_2.json") for f in (out, harvested))
     assert np.array_equal(again.unknowns, first.unknowns)
@@ -138,7 +138,7 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
     other = Speckle(SpeckleSpec(seed=99), mask.shape).image()
     for name, shown in (("frame_1b.tif", other * mask), ("frame_1c.tif", other)):
         tifffile.imwrite(tmp_path / name, np.rint(255 * shown).astype(np.uint8))
-    harvesting = Harvesting(read_experiment(path), tmp_path, tmp_path / "out")
+    harvesting = HarvestRun(read_photograph_case(path), tmp_path, tmp_path / "out")
     assert list(harvesting.results()) == ["frame_1", "frame_2"]
     ((damaged, why),) = harvesting.prepared().skipped
     assert damaged == "frame_1a.tif"
@@ -153,11 +153,11 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
 def test_the_updated_formulation_agrees_with_the_total_one(
     photographs: Path, harvested: Path, tmp_path: Path
 ) -> None:
-    experiment = read_experiment(photographs / "experiment.toml")
+    experiment = read_photograph_case(photographs / "experiment.toml")
     updated = experiment.model_copy(
         update={"correlation": replace(experiment.correlation, formulation="updated")}
     )
-    results = Harvesting(updated, photographs, tmp_path).results()
+    results = HarvestRun(updated, photographs, tmp_path).results()
     first = Result.read(harvested / "results" / "frame_2.json")
     apart = (results["frame_2"].result.displacement() - first.displacement()) / PIXEL
     # It inherits what the frame before couldn't describe: w of 0.26 px rms there.

@@ -19,21 +19,19 @@ import synthetic_harvest as made_up
 from html_page import Page
 from matplotlib.path import Path
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.error_bars import field_errors
-from modeharvest.idic.fourier import FourierMode, free_family
-from modeharvest.idic.identifiability import identifiability
-from modeharvest.idic.support import Taper
-from modeharvest.imaging.distortion.undistort import PolynomialDistortion
-from modeharvest.validation.harvest import words
-from modeharvest.validation.harvest.atlas import MOST, HarvestAtlas
-from modeharvest.validation.harvest.mask_outline import outline_of_mask
-from modeharvest.validation.harvest.panels import panels
-from modeharvest.validation.harvest.plots_photographs import unaffine
-from modeharvest.validation.harvest.report import write_harvest_report
-from modeharvest.validation.harvest.run import Harvest, HarvestedFrame
-from modeharvest.validation.harvest.summary import harvest_summary
+from modeharvest.idic.modes import FourierMode, Taper, free_family
+from modeharvest.idic.uncertainty.covariance import field_errors
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.distortion.lens import PolynomialDistortion
+from modeharvest.report import photographs as words
+from modeharvest.report.figures.outlines import mask_boundary
+from modeharvest.report.figures.photograph_panels import photograph_panels, unaffine
+from modeharvest.report.figures.photographs import MOST_SHOWN, PhotographReportData
+from modeharvest.report.photographs import write_harvest_report
+from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
+from modeharvest.runs.photographs.summary import harvest_summary
+from modeharvest.util.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +78,7 @@ def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
 
 def test_every_panel_is_there_for_every_photograph(harvest: Harvest, text: str) -> None:
     ids = Page(text).ids
-    every = panels(HarvestAtlas(harvest))
+    every = photograph_panels(PhotographReportData(harvest))
     assert {"image", "Sxx", "v0y", "v1", "phi1", "fluc1x", "residual", "w", "v0-noise",
             "fluc1-leftover", "loss"} <= {panel.key for panel in every}  # fmt: skip
     for panel in every:
@@ -119,7 +117,7 @@ def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None
     assert told[-1] == 1.0
     page = Page((tmp_path / "report.html").read_text("utf-8"))
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    for panel in panels(HarvestAtlas(harvest)):
+    for panel in photograph_panels(PhotographReportData(harvest)):
         known = panel.key not in ("Sxx", "Syy", "w", "true_w", "best", "loss")
         known &= not panel.key.endswith("leftover")
         assert (f"{panel.key}-1" in page.ids) is known, panel.key
@@ -154,8 +152,8 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
     frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
-    atlas = HarvestAtlas(replace(bare(harvest), frames=(frame,)))
-    second = [panel for panel in panels(atlas) if "2" in panel.key]
+    atlas = PhotographReportData(replace(bare(harvest), frames=(frame,)))
+    second = [panel for panel in photograph_panels(atlas) if "2" in panel.key]
     assert [panel.key for panel in second] == [
         "v2", "phi2", "fluc2x", "fluc2y", "v2-noise", "fluc2-noise"]  # fmt: skip
     drawn = second[0].draw(atlas, frame)
@@ -164,7 +162,7 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
     assert told["modes"][1]["waves"][0]["xi"] == pytest.approx([0.6, 0.2])
     tables = words.mode_tables([told])
     assert [len(table["rows"]) for table in tables] == [7, 4]
-    assert words.fact("v2", told).startswith("largest among the holes 400 ±")
+    assert words.panel_numbers("v2", told).startswith("largest among the holes 400 ±")
 
 
 def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]) -> None:
@@ -194,8 +192,8 @@ def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) 
     )
     moments = [made_up.moment(frame) for frame in frames]
     long = replace(harvest, frames=frames, timeline=moments, truth=None)
-    shown = HarvestAtlas(long).shown
-    assert len(shown) == MOST
+    shown = PhotographReportData(long).shown
+    assert len(shown) == MOST_SHOWN
     first = next(k for k, moment in enumerate(moments) if moment.has_pattern)
     assert {frames[0], frames[first - 1], frames[first], frames[-1]} <= set(shown)
     assert len(words.frame_rows(harvest_summary(long))) == 20
@@ -244,7 +242,7 @@ def test_units_of_a_mode_of_another_length(harvest: Harvest) -> None:
 
 
 def test_the_outline_follows_the_mask() -> None:
-    outline = outline_of_mask(made_up.MASK, made_up.GRID)
+    outline = mask_boundary(made_up.MASK, made_up.GRID)
     assert len(outline.loops) == 25  # the edge and 24 holes
     areas = [_area(outline.nodes[loop[:, 0]]) for loop in outline.loops]
     edge = int(np.argmax(np.abs(areas)))
@@ -265,10 +263,10 @@ def test_the_outline_follows_the_mask() -> None:
 
 def test_specks_and_an_empty_mask_have_no_outline() -> None:
     mask = np.zeros(made_up.GRID.shape, dtype=np.bool_)
-    assert not outline_of_mask(mask, made_up.GRID).loops
+    assert not mask_boundary(mask, made_up.GRID).loops
     mask[50:53, 50:53] = True
-    assert len(outline_of_mask(mask, made_up.GRID).loops) == 1
-    assert not outline_of_mask(mask, made_up.GRID, least=20 * made_up.GRID.pixel_size**2).loops
+    assert len(mask_boundary(mask, made_up.GRID).loops) == 1
+    assert not mask_boundary(mask, made_up.GRID, least=20 * made_up.GRID.pixel_size**2).loops
 
 
 def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:

@@ -9,12 +9,12 @@ import pytest
 import tifffile
 from synthetic_photographs import Displacement, Photographed, lattice_points, of
 
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.pipeline import Harvesting
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.pipeline import HarvestRun
 
 PITCH, PIXEL = 1.9, 0.035
 CRITICAL = 0.042
@@ -47,7 +47,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=["total", "updated"])
 def harvesting(
     request: pytest.FixtureRequest, photographs: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Harvesting:
+) -> HarvestRun:
     """In both formulations."""
     path = photographs / f"{request.param}.toml"
     path.write_text(
@@ -56,10 +56,10 @@ def harvesting(
         f'[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = "{request.param}"\n'
     )
     folder = tmp_path_factory.mktemp(request.param)
-    return Harvesting(read_experiment(path), photographs, folder)
+    return HarvestRun(read_photograph_case(path), photographs, folder)
 
 
-def test_buckling_is_bracketed_and_estimated(harvesting: Harvesting) -> None:
+def test_buckling_is_bracketed_and_estimated(harvesting: HarvestRun) -> None:
     found = harvesting.harvest()
     strains = [moment.strain for moment in found.timeline]
     # 0.1 px between two edges that are 217 px apart.
@@ -71,7 +71,7 @@ def test_buckling_is_bracketed_and_estimated(harvesting: Harvesting) -> None:
     assert buckling.estimate == pytest.approx(CRITICAL, abs=5e-4)
 
 
-def test_every_frame_is_measured(harvesting: Harvesting) -> None:
+def test_every_frame_is_measured(harvesting: HarvestRun) -> None:
     results, shown = harvesting.results(), scene()
     assert [name for name, _ in harvesting.failures()] == [f"{FOREIGN}x"]
     for strain, measured in zip(STRAINS, results.values(), strict=True):
@@ -82,7 +82,7 @@ def test_every_frame_is_measured(harvesting: Harvesting) -> None:
         assert np.sqrt(np.mean(off**2)) / PIXEL < 0.03
 
 
-def test_each_goes_on_from_the_one_before(harvesting: Harvesting) -> None:
+def test_each_goes_on_from_the_one_before(harvesting: HarvestRun) -> None:
     """As long as it shows what the one before has shown."""
     results = list(harvesting.results().values())
     goes_on = ["started from the result of the photograph before" in " ".join(m.sentences)

@@ -10,11 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.specimen.hole_lattice import HoleLattice, find_hole_lattice, lattice_of
-from modeharvest.idic.specimen.hole_motion import match, possible_motions
-from modeharvest.idic.specimen.holes import Holes, find_holes
+from modeharvest.idic.photograph.holes import (
+    HoleLattice,
+    Holes,
+    find_hole_lattice,
+    find_holes,
+    lattice_of,
+)
+from modeharvest.idic.photograph.matching import match, possible_motions
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from manufactured import GRID, PIXEL
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.gauss_newton import Outcome
+from modeharvest.idic.solver.gauss_newton import Outcome
 
 PAGE = Path(__file__).parents[1] / "docs" / "idic.md"
 

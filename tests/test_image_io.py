@@ -9,14 +9,14 @@ import skimage.io
 import tifffile
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.io import (
-    quantise,
+from modeharvest.imaging.photographs.files import (
     read_image,
     read_mask,
     require_same_shape,
     write_image,
 )
+from modeharvest.imaging.sensor import quantise
+from modeharvest.util.errors import InputError
 
 RAMP = np.linspace(0.0, 1.0, 30 * 20, dtype=np.float32).reshape(30, 20)
 

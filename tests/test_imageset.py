@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.imaging import set_key
+from modeharvest.imaging import imageset as set_key
 from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
+from modeharvest.imaging.render import read_truth
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import SpeckleSpec
-from modeharvest.imaging.truth import read_truth
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.util.errors import InputError
 
 SPEC = ImagingSpec(pixel_size=0.05, margin_px=5, background=0.1)
 STRAINS = (0.078, 0.128)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.case import read_case
 from modeharvest.imaging.sensor import Sensor
+from modeharvest.runs.case import read_case
 
 PAGE = (Path(__file__).parents[1] / "docs" / "imaging.md").read_text("utf-8")
 

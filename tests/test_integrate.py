@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.aperture import EDGE_POINTS, Aperture
+from modeharvest.imaging.camera import TOLERANCE, ImagedState, integrate, near_edges, points_a_side
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.integrate import (
-    TOLERANCE,
-    Scene,
-    integrate,
-    near_edges,
-    points_a_side,
-)
-from modeharvest.imaging.isoparametric import locate
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.sensor import EDGE_POINTS, Aperture
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -42,11 +36,11 @@ APERTURES = [
 ]
 
 
-def scene(displacement: FloatArray | None = None, background: float = 0.1) -> Scene:
-    return Scene(PLATE, displacement, GRID, SPECKLE, background)
+def scene(displacement: FloatArray | None = None, background: float = 0.1) -> ImagedState:
+    return ImagedState(PLATE, displacement, GRID, SPECKLE, background)
 
 
-def material(state: Scene) -> BoolArray:
+def material(state: ImagedState) -> BoolArray:
     u = 0.0 if state.displacement is None else state.displacement
     return locate(PLATE.nodes + u, PLATE.cells, "Q4", GRID).mask
 
@@ -195,7 +189,7 @@ def test_edge_pixels_mix_material_and_background_in_their_shares(aperture: Apert
     """A plate of one grey level, shifted by odd parts of a pixel: products of 1D shares."""
     speckle = Speckle(SpeckleSpec(dark=0.6, bright=0.6 + 1e-9), GRID.shape)
     shift = np.array([0.3, 0.2]) * H
-    state = Scene(PLATE, np.tile(shift, (4, 1)), GRID, speckle, 0.1)
+    state = ImagedState(PLATE, np.tile(shift, (4, 1)), GRID, speckle, 0.1)
     image, _ = integrate(state, aperture, material(state))
 
     def share(position: FloatArray, low: float, high: float) -> FloatArray:

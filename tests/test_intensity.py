@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.aperture import Aperture
+from modeharvest.imaging.camera import TOLERANCE, ImagedState
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.integrate import TOLERANCE, Scene
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.sensor import Aperture
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "intensity.py"
 GRID = PixelGrid.centred(71, 81, 0.125)
@@ -61,7 +61,7 @@ def test_deformed_images_show_the_analytic_pattern(intensity: ModuleType, unit: 
 def test_averages_over_pixels_within_an_element_keep_their_promise(intensity: ModuleType) -> None:
     """And pixels that a kink of the deformation cuts are off by what a kink costs."""
     mesh = quads()
-    scene = Scene(mesh, bent(mesh), GRID, Speckle(SpeckleSpec(seed=4), GRID.shape), 0.0)
+    scene = ImagedState(mesh, bent(mesh), GRID, Speckle(SpeckleSpec(seed=4), GRID.shape), 0.0)
     points, errors = intensity.aperture_errors(scene, Aperture(1.0), 7, 987)
     assert points == 9
     within, cut, hole = (

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.interpolation import ORDERS, SplineImage, cubic_weights
-from modeharvest.imaging.taps import weights
+from modeharvest.imaging.spline import ORDERS, SplineImage, cubic_weights, lane_weights
+from modeharvest.util.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +20,7 @@ def weights_at(order: int, t: float) -> tuple[np.ndarray, np.ndarray]:
     if order == 3:
         w, d = cubic_weights(t)
         return np.array(w), np.array(d)
-    powers = weights(order)
+    powers = lane_weights(order)
     slopes = np.arange(1, order + 1)[:, None] * powers[1:]
     return t ** np.arange(order + 1) @ powers, t ** np.arange(order) @ slopes
 

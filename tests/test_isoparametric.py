@@ -9,11 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import Located, interpolate, locate
-from modeharvest.imaging.jacobian import non_positive_jacobians, require_positive_jacobian
+from modeharvest.imaging.mapping.elements import (
+    non_positive_jacobians,
+    reference_element,
+    require_positive_jacobian,
+    shape_functions,
+    shape_gradients,
+)
+from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

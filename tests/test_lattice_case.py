@@ -7,21 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from modeharvest.case import read_case
-from modeharvest.case_file import lattice_cases
-from modeharvest.errors import InputError
-from modeharvest.fem.dispersion import ZONES
-from modeharvest.fem.macroscopic import equibiaxial, simple_shear, uniaxial, uniaxial_strain
+from modeharvest.fem.bloch.dispersion import ZONES
+from modeharvest.fem.lattice.options import equibiaxial, simple_shear, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.lattice.case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.lattice.kinds import (
+from modeharvest.runs.case import lattice_cases, read_case
+from modeharvest.runs.lattice.case import LatticeCase, StudyPlan, read_lattice_case
+from modeharvest.runs.lattice.options import (
     ChiralLattice,
+    DispersionPlan,
     FileLattice,
     HexachiralLattice,
     HexagonalLattice,
+    Loading,
+    ModesPlan,
     SquareLattice,
 )
-from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan
+from modeharvest.util.errors import InputError
 
 SHIPPED = ("chiral-lattice", "hexagonal-lattice", "mode-study", "square-lattice")
 

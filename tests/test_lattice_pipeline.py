@@ -14,16 +14,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from modeharvest import cli
-from modeharvest.fem.dispersion import Dispersion
+from modeharvest.cli.root import main
+from modeharvest.fem.bloch.dispersion import Dispersion
+from modeharvest.fem.bloch.modes import read_modes
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.fem.mode_file import read_modes
-from modeharvest.files import read_json
-from modeharvest.lattice.case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.lattice.kinds import HexagonalLattice, SquareLattice
-from modeharvest.lattice.options import DispersionPlan, Loading, ModesPlan, Search
-from modeharvest.lattice.pipeline import LatticeAnalysis, bloch, modes
-from modeharvest.lattice.terminal import print_lattice
+from modeharvest.report.terminal import print_lattice
+from modeharvest.runs.lattice.case import LatticeCase, StudyPlan, read_lattice_case
+from modeharvest.runs.lattice.options import (
+    DispersionPlan,
+    HexagonalLattice,
+    Loading,
+    ModesPlan,
+    Search,
+    SquareLattice,
+)
+from modeharvest.runs.lattice.pipeline import LatticeAnalysis, bloch, modes
+from modeharvest.util.files import read_json
 
 pytestmark = pytest.mark.dolfinx
 
@@ -84,7 +90,7 @@ def changed(before: dict[str, int], folder: Path) -> set[str]:
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     return int(end.value.code or 0)
 
 
@@ -337,7 +343,7 @@ def test_a_mechanism_is_refused_in_one_line(
 def test_without_dolfinx_the_commands_say_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "modeharvest.fem.lattices", None)  # makes its import fail
+    monkeypatch.setitem(sys.modules, "modeharvest.fem.lattice.cells", None)  # makes its import fail
     assert command(monkeypatch, "bloch", "square-lattice", "--out", tmp_path / "out") == 2
     assert "conda" in (line := error_line(capsys))
     assert "dolfinx" in line

@@ -15,10 +15,10 @@ import pytest
 import synthetic_lattice as made_up
 from html_page import Page
 
-from modeharvest.errors import InputError
-from modeharvest.validation.lattice import words
-from modeharvest.validation.lattice.report import CriticalPoint, FoundPattern, write_lattice_report
-from modeharvest.validation.lattice.run import LatticeRun
+from modeharvest.report import lattice as words
+from modeharvest.report.lattice import write_lattice_report
+from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.util.errors import InputError
 
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
 
@@ -88,7 +88,7 @@ def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
 
 def test_long_waves_are_named_by_their_direction() -> None:
     point = CriticalPoint("uniaxial", 0.21, True, "critical", value=0.0, angle=math.pi / 4)
-    assert words.waves_in_words(point) == "long waves along 45°"
+    assert words.waves_text(point) == "long waves along 45°"
     assert "acoustic tensor" in words.proof(point)
     notes = words.notes(made_up.run(critical=(point,)))
     assert any("loss of ellipticity" in note for note in notes)
@@ -148,10 +148,8 @@ def test_waves_are_written_in_units_of_pi(wave: tuple[float, float], written: st
 
 
 def test_a_study_says_where_the_pattern_stops_coming_first() -> None:
-    said = " ".join(words.study_sentences(made_up.study()))
+    said = " ".join(words.study_text(made_up.study()))
     assert "from d/l = 0.69 on; at 0.67 it is long waves" in said
     assert "between 0.930 (d/l = 0.3" in said
     every = replace(made_up.study(), ratios=(made_up.row(0.7), made_up.row(0.9)), limits=())
-    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(
-        words.study_sentences(every)
-    )
+    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(words.study_text(every))

@@ -15,15 +15,17 @@ from hypothesis import strategies as st
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 from scipy.special import j1
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.families.lattice_spectrum import (
+from modeharvest.idic.spectra.lattice_spectrum import (
     LatticeSpectrum,
+    MeshQuadrature,
+    gauss_rule,
     lattice_spectrum,
+    points_for,
     reciprocal_vectors,
     upward,
 )
-from modeharvest.idic.families.quadrature import Quadrature, gauss_rule, points_for
+from modeharvest.util.errors import InputError
 
 SETTINGS = settings(deadline=None, derandomize=True, max_examples=8)
 TWO = np.array([[2], [2]])
@@ -63,7 +65,7 @@ def test_quadrature_is_converged(lattice: np.ndarray, element: str) -> None:
     mesh = holed_cell(lattice, 4, element=element)
     u = field_on(mesh, lattice)
     spectrum = lattice_spectrum(mesh, lattice, u, PITCH)
-    rule = Quadrature(mesh, 2 * points_for(mesh, 6 * np.pi / PITCH))
+    rule = MeshQuadrature(mesh, 2 * points_for(mesh, 6 * np.pi / PITCH))
     field = rule.without_mean(rule.values(u))
     kernel = np.exp(-2j * np.pi / PITCH * spectrum.xi @ rule.positions.T)
     reference = kernel @ (rule.weights[:, None] * field)

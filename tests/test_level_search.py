@@ -12,18 +12,17 @@ from filling_mode import EVERYWHERE, MASK, STRAIN, case, error_px, rms_px
 from manufactured import DOMAIN, GRID, PIXEL
 from numpy.typing import NDArray
 
-from modeharvest.idic import level_search
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.fourier import FourierMode, square_family
-from modeharvest.idic.gauss_newton import Outcome
-from modeharvest.idic.level_search import step_length
-from modeharvest.idic.normal_equations import Assembly
+from modeharvest.idic.modes import FourierMode, square_family
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import landed, residual
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver import level_search
+from modeharvest.idic.solver.assembly import Assembly, residual, valid_pixels
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.idic.solver.level_search import step_length
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
 
 FloatArray = NDArray[np.float64]
 
@@ -130,7 +129,7 @@ def test_landing_and_residual_by_their_definitions() -> None:
     to_row, to_col = row - u[:, 1], col + u[:, 0]
     i, j = np.rint(to_row).astype(int), np.rint(to_col).astype(int)
     inside = (i >= 0) & (i < GRID.rows) & (j >= 0) & (j < GRID.cols)
-    kept, outside = landed(assembly, a, f, spline, allowed)
+    kept, outside = valid_pixels(assembly, a, f, spline, allowed)
     expected = np.zeros(row.size, dtype=bool)
     expected[inside] = allowed[i[inside], j[inside]]
     off = (to_row < 0) | (to_row > GRID.rows - 1) | (to_col < 0) | (to_col > GRID.cols - 1)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fields.local_field import LocalField, sampled_field
+from modeharvest.idic.local.field import LocalField, sampled_field
+from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 X, Y = (a.ravel() for a in np.meshgrid(np.arange(5.0), np.arange(4.0)))
 U = np.column_stack([0.1 * X, -0.2 * Y])

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from modeharvest.errors import InputError
-from modeharvest.idic.specimen.material import MaterialOptions, find_material
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.idic.photograph.material import MaterialOptions, find_material
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 BoolArray = NDArray[np.bool_]
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.families.equivalents import REFERENCE_MODE, square_mode
-from modeharvest.idic.families.pattern import read_pattern
-from modeharvest.idic.families.spectrum import spectral_density
-from modeharvest.idic.families.waves import find_peaks
-from modeharvest.idic.fields.local_field import LocalField, sampled_field
-from modeharvest.idic.fields.measured_spectrum import gridded, measured_spectrum
+from modeharvest.idic.local.field import LocalField, sampled_field
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE, read_pattern, square_mode
+from modeharvest.idic.spectra.spectrum import gridded, measured_spectrum, spectral_density
+from modeharvest.idic.spectra.waves import find_peaks
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 PITCH, PIXEL = 1.9, 0.05
 GRID = PixelGrid.centred(400, 240, PIXEL)

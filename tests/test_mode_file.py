@@ -13,10 +13,17 @@ import meshio
 import numpy as np
 import pytest
 
-from modeharvest.errors import InputError
+from modeharvest.fem.bloch.modes import (
+    Branch,
+    BranchState,
+    ModeSet,
+    read_modes,
+    write_modes,
+    write_vtu,
+    write_xdmf,
+)
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.mode_file import read_modes, write_modes, write_vtu, write_xdmf
-from modeharvest.fem.modes import Branch, BranchState, ModeSet
+from modeharvest.util.errors import InputError
 
 CORNERS = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 MIDDLES = [[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5], [0.5, 0.5]]

@@ -16,25 +16,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_lattice import row
 
-from modeharvest.errors import InputError
-from modeharvest.fem.macroscopic import simple_shear
+from modeharvest.fem.lattice.options import simple_shear
 from modeharvest.fem.materials import Ogden
-from modeharvest.validation.lattice import mode_study
-from modeharvest.validation.lattice.independence import (
+from modeharvest.util.errors import InputError
+from modeharvest.validation.studies import lattice as mode_study
+from modeharvest.validation.studies.lattice import ModeTable, first_mode_limit, study_modes
+from modeharvest.validation.studies.lattice_pattern import (
     LOADINGS,
-    MATERIALS,
-    Lattice,
+    STUDIED_MATERIALS,
+    ModeRow,
+    StudiedLattice,
     name_of,
     ogden,
     ratio_lattices,
+    read_rows,
+    write_rows,
 )
-from modeharvest.validation.lattice.mode_study import Table, first_mode_limit, study_modes
-from modeharvest.validation.lattice.mode_table import ModeRow, read_rows, write_rows
 
 LIMIT = 0.671  # of the made-up lattices
 
 
-def made_up(lattice: Lattice) -> ModeRow:
+def made_up(lattice: StudiedLattice) -> ModeRow:
     kind = "pattern" if lattice.ratio > LIMIT else "long waves"
     material, loading, pitch, ratio, divisions = lattice.key
     return row(ratio, loading, material=material, pitch=pitch, divisions=divisions, kind=kind)
@@ -78,7 +80,7 @@ def test_a_study_goes_on_where_it_was_broken_off(
 ) -> None:
     asked: list[float] = []
 
-    def work(lattice: Lattice) -> ModeRow:
+    def work(lattice: StudiedLattice) -> ModeRow:
         if len(asked) == 2:
             raise KeyboardInterrupt
         asked.append(lattice.ratio)
@@ -87,20 +89,20 @@ def test_a_study_goes_on_where_it_was_broken_off(
     monkeypatch.setattr(mode_study, "pattern_row", work)
     lattices, path = ratio_lattices((0.3, 0.5, 0.7), ("uniaxial",)), tmp_path / "study.csv"
     with pytest.raises(KeyboardInterrupt):
-        study_modes(lattices, Table(path))
+        study_modes(lattices, ModeTable(path))
     assert len(read_rows(path)) == 2
     monkeypatch.setattr(mode_study, "pattern_row", made_up)
-    rows = study_modes(lattices, Table(path))
+    rows = study_modes(lattices, ModeTable(path))
     assert [r.ratio for r in rows] == [0.3, 0.5, 0.7]
     asked.clear()
     monkeypatch.setattr(mode_study, "pattern_row", work)
-    assert len(study_modes(lattices, Table(path))) == 3
+    assert len(study_modes(lattices, ModeTable(path))) == 3
     assert asked == []
 
 
 def test_where_the_pattern_stops_being_first_is_bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mode_study, "pattern_row", made_up)
-    base = Lattice()
+    base = StudiedLattice()
     rows = study_modes(ratio_lattices((0.3, 0.5, 0.9), ("uniaxial",), base))
     limit = first_mode_limit(base, "uniaxial", rows, tolerance=0.003)
     assert limit is not None
@@ -115,7 +117,7 @@ def test_where_the_pattern_stops_being_first_is_bracketed(monkeypatch: pytest.Mo
 
 def test_a_path_that_ends_says_nothing_about_what_comes_first() -> None:
     rows = (row(0.5, kind="path ends", found=False), row(0.9))
-    assert first_mode_limit(Lattice(), "uniaxial", rows) is None
+    assert first_mode_limit(StudiedLattice(), "uniaxial", rows) is None
 
 
 @given(st.floats(0.01, 0.495), st.floats(0.05, 5.0))
@@ -127,12 +129,14 @@ def test_an_ogden_material_has_the_constants_asked_for(nu: float, shear: float) 
 
 
 def test_materials_and_loadings_are_known_by_name_or_by_their_values() -> None:
-    assert name_of(Ogden(), MATERIALS) == "Ogden m=3, nu=0.45"  # the default
-    assert "kappa=2.5" in name_of(Ogden(kappa=2.5), MATERIALS)
+    assert name_of(Ogden(), STUDIED_MATERIALS) == "Ogden m=3, nu=0.45"  # the default
+    assert "kappa=2.5" in name_of(Ogden(kappa=2.5), STUDIED_MATERIALS)
     assert name_of(LOADINGS["equibiaxial"], LOADINGS) == "equibiaxial"
     assert name_of(simple_shear(), LOADINGS).startswith("MacroLoading")
-    keys = {replace(Lattice(), material=material).key for material in MATERIALS.values()}
-    assert len(keys) == len(MATERIALS)
+    keys = {
+        replace(StudiedLattice(), material=material).key for material in STUDIED_MATERIALS.values()
+    }
+    assert len(keys) == len(STUDIED_MATERIALS)
 
 
 @pytest.mark.parametrize(
@@ -140,4 +144,4 @@ def test_materials_and_loadings_are_known_by_name_or_by_their_values() -> None:
 )
 def test_a_lattice_that_cannot_be_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected 0 < d/l < 1"):
-        Lattice(**bad)  # type: ignore[arg-type]  # only numbers
+        StudiedLattice(**bad)  # type: ignore[arg-type]  # only numbers

@@ -13,24 +13,25 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.case import shipped_solution
-from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.files import read_json
-from modeharvest.idic.fourier import square_family
-from modeharvest.studies.case import StudyCase, read_study
-from modeharvest.validation.lattice.independence import EQ_MODE, PatternMode, wave_sum
-from modeharvest.validation.lattice.mode_table import ModeRow
-from modeharvest.validation.studies.modes import specimen as modes_specimen
-from modeharvest.validation.studies.modes.description import Description
-from modeharvest.validation.studies.modes.findings import findings, report_modes
-from modeharvest.validation.studies.modes.lattice import LatticeMode
-from modeharvest.validation.studies.modes.pattern import PatternCells, buckle
-from modeharvest.validation.studies.modes.specimen import likeness, one_specimen
-from modeharvest.validation.studies.modes.study import Modes
-from modeharvest.validation.studies.subject import Subject
+from modeharvest.idic.modes import square_family
+from modeharvest.report.study_modes import modes_findings, report_modes
+from modeharvest.runs.case import shipped_solution
+from modeharvest.runs.study import StudyCase, read_study
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json
+from modeharvest.validation.studies import modes as modes_specimen
+from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
+from modeharvest.validation.studies.modes import MeasuredModesStudy, likeness, one_specimen
+from modeharvest.validation.studies.modes_specimen import (
+    LatticeMode,
+    PatternCells,
+    SpecimenSpec,
+    buckle,
+)
+from modeharvest.validation.studies.study import ImagePairSpec
 
 FloatArray = NDArray[np.float64]
 PAPER = shipped_solution("paper-virtual")
@@ -106,12 +107,12 @@ def test_the_lattice_s_mode_lies_on_the_specimen_s_holes() -> None:
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def subject() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
     assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
-    return Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
+    return ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 
 
 def scaled(solution: Solution, factor: float) -> Solution:
@@ -130,7 +131,7 @@ def stable(specimen: Specimen) -> Solution:
 
 
 @pytest.fixture(scope="module")
-def measured(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
+def measured(subject: ImagePairSpec, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
     """A study of the base, of it twice as large, and of one that stays stable, without dolfinx."""
     folder = tmp_path_factory.mktemp("modes")
 
@@ -140,7 +141,7 @@ def measured(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> tupl
             return scaled(subject.solution, 2.0)
         return stable(experiment.specimen)
 
-    study = Modes(
+    study = MeasuredModesStudy(
         ratios=(0.6,), pitches=(3.8,), materials=(), gradings_x=(), gradings_y=(), divisions=8
     )
     with pytest.MonkeyPatch.context() as patch:
@@ -204,7 +205,7 @@ def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "trapped"
-    said = " ".join(findings(odd, folder, "seed 0").sentences)
+    said = " ".join(modes_findings(odd, folder, "seed 0").sentences)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said
@@ -216,7 +217,7 @@ def test_a_description_comes_back_as_it_was(measured: tuple[Any, ...]) -> None:
     _, table, folder = measured
     for name in table["specimen"]:
         path = folder / "specimens" / name / "specimen.json"
-        again = json.loads(json.dumps(Description.read(path).plain()))
+        again = json.loads(json.dumps(SpecimenSpec.read(path).plain()))
         assert again == read_json(path)
 
 
@@ -228,7 +229,7 @@ def test_a_specimen_is_compressed_to_the_pattern_asked_for() -> None:
     """Its critical strain is that of another walk; the pattern is as large as asked."""
     from mpi4py import MPI
 
-    from modeharvest.fem.pattern_branch import CLOSE
+    from modeharvest.fem.path.branching import PATTERN_TOLERANCE
     from modeharvest.fem.simulate import simulate
 
     specimen = Specimen(2, 2, diameter=1.6, bulk_x=0.9, bulk_y=0.9)
@@ -241,14 +242,14 @@ def test_a_specimen_is_compressed_to_the_pattern_asked_for() -> None:
         walked.info["critical"]["strain"], abs=2 * experiment.path.critical_tolerance
     )
     reached = PatternCells(found.mesh, specimen).amplitude(found.snapshots[0].displacement)
-    assert reached == pytest.approx(0.1, rel=CLOSE)
+    assert reached == pytest.approx(0.1, rel=PATTERN_TOLERANCE)
 
 
 # -- bad input ----------------------------------------------------------------------------
 
 
 def test_the_shipped_study_spells_out_the_defaults() -> None:
-    assert read_study("modes").study == Modes()
+    assert read_study("modes").study == MeasuredModesStudy()
 
 
 @pytest.mark.parametrize(
@@ -264,18 +265,18 @@ def test_the_shipped_study_spells_out_the_defaults() -> None:
 )
 def test_wrong_options_are_told_in_one_line(options: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
-        Modes(**options)
+        MeasuredModesStudy(**options)
     assert "\n" not in str(caught.value)
 
 
-def test_a_base_that_has_not_buckled_is_told(subject: Subject, tmp_path: Path) -> None:
+def test_a_base_that_has_not_buckled_is_told(subject: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"buckled at 7.8 %, got one with 9.6\d* % as its"):
-        Modes(strain=0.078).prepare(subject, tmp_path)
+        MeasuredModesStudy(strain=0.078).prepare(subject, tmp_path)
     tilted = replace(subject, experiment=replace(subject.experiment, tilt=0.01))
     with pytest.raises(InputError, match="perfect specimen"):
-        Modes().prepare(tilted, tmp_path)
+        MeasuredModesStudy().prepare(tilted, tmp_path)
 
 
-def test_gradings_too_steep_are_told(subject: Subject, tmp_path: Path) -> None:
+def test_gradings_too_steep_are_told(subject: ImagePairSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="make grading_x and grading_y smaller"):
-        Modes(gradings_x=(0.2,)).prepare(subject, tmp_path)
+        MeasuredModesStudy(gradings_x=(0.2,)).prepare(subject, tmp_path)

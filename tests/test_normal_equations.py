@@ -12,13 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.brightness import Brightness
-from modeharvest.idic.chebyshev import ChebyshevField
-from modeharvest.idic.normal_equations import Assembly, NormalEquations
+from modeharvest.idic.slow_fields import Brightness, ChebyshevField
+from modeharvest.idic.solver.assembly import Assembly, NormalEquations
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

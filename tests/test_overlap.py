@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.imaging.elements import reference_element
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import locate
+from modeharvest.imaging.mapping.elements import reference_element
+from modeharvest.imaging.mapping.isoparametric import locate
 
 FloatArray = NDArray[np.float64]
 H = 0.125  # mm/px, a binary fraction: edges and nodes lie exactly on pixel centres

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.imaging.periodic_spline import PeriodicSpline
-from modeharvest.imaging.speckle import TOLERANCE, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.layer import TOLERANCE
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
 
 FloatArray = NDArray[np.float64]
 ROUNDING = 1e-14  # sums of 64 products of numbers below 1, and the FFT's own

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.photographs.image_files import _upright
+from modeharvest.imaging.photographs.files import _upright
 from modeharvest.imaging.photographs.photograph import (
     LUMA,
     neighbour_correlation,
@@ -34,6 +33,7 @@ from modeharvest.imaging.photographs.series import (
     require_alike,
     usable_frames,
 )
+from modeharvest.util.errors import InputError
 
 
 def speckle(shape: tuple[int, int] = (96, 128), seed: int = 0, size: float = 1.5) -> NDArray[Any]:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeharvest.imaging.io import quantise, write_image
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.sensor import quantise
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 PAGE = (Path(__file__).parents[1] / "docs" / "photographs.md").read_text("utf-8")
 

@@ -14,15 +14,14 @@ from typing import Any
 
 import pytest
 
-from modeharvest import cli
-from modeharvest.case import Case, read_case
-from modeharvest.errors import InputError
+from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
-from modeharvest.fem.imperfection import Imperfection
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.fem.specimen import Specimen
-from modeharvest.files import read_json
-from modeharvest.pipeline import Run, run
+from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.runs.case import Case, read_case
+from modeharvest.runs.experiment import Run, run
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json
 
 CASE = """
 title = "A reduced demo"
@@ -79,7 +78,7 @@ def changed(before: dict[str, int], after: dict[str, int]) -> set[str]:
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     return int(end.value.code or 0)
 
 

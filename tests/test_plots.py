@@ -17,26 +17,30 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from modeharvest.idic.families.pattern import Pattern
-from modeharvest.idic.families.waves import Wave
-from modeharvest.validation.plots import PANELS, Atlas, Panel, draw_hero
-from modeharvest.validation.plots_fields import Scale, draw_field
-from modeharvest.validation.plots_path import (
+from modeharvest.idic.spectra.pattern import WavePattern
+from modeharvest.idic.spectra.waves import PlaneWave
+from modeharvest.report.figures.curves import (
     draw_convergence,
     draw_density,
     draw_eigenvalues,
     draw_load,
     pattern_density,
 )
-from modeharvest.validation.sheet import Sheet
-from modeharvest.validation.style import BLUE, INK, MUTED, SIGNED, to_svg
+from modeharvest.report.figures.experiment import (
+    PANELS,
+    ExperimentReportData,
+    SnapshotPanel,
+    draw_hero,
+)
+from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
+from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, to_svg
 
 UNITS = {"µm", "mm⁶"}
 FRACTIONS = {"image", "residual"}  # of full scale: grey levels have no unit
 
 
 @pytest.fixture(scope="module")
-def atlas() -> Atlas:
+def atlas() -> ExperimentReportData:
     return made_up.atlas()
 
 
@@ -50,7 +54,9 @@ def pixels(drawn: Figure) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.key)
-def test_every_panel_states_the_unit_of_its_colours(atlas: Atlas, panel: Panel) -> None:
+def test_every_panel_states_the_unit_of_its_colours(
+    atlas: ExperimentReportData, panel: SnapshotPanel
+) -> None:
     units = colour_bar_units(panel.draw(atlas, 1))
     if panel.key in FRACTIONS:
         assert units == [""]
@@ -65,7 +71,7 @@ def test_the_panels_of_the_paper_are_all_there() -> None:
 
 
 @pytest.mark.parametrize("name", ["residual", "w", "best", "loss"])
-def test_a_field_without_any_value_is_drawn_blank(atlas: Atlas, name: str) -> None:
+def test_a_field_without_any_value_is_drawn_blank(atlas: ExperimentReportData, name: str) -> None:
     nothing = np.full_like(atlas.comparisons[0].displacement, np.nan)
     empty = replace(atlas.comparisons[0], displacement=nothing, residual=nothing[..., 0])
     panel = next(p for p in PANELS if p.key == name)
@@ -89,9 +95,9 @@ def sides(drawn: Figure) -> dict[str, NDArray[np.float64]]:
 
 
 def test_a_field_is_drawn_the_right_way_up() -> None:
-    sheet = Sheet.of(made_up.plate(), made_up.GRID)
+    sheet = MapFrame.of(made_up.plate(), made_up.GRID)
     up = np.repeat(np.sign(sheet.grid.y)[:, None], sheet.grid.cols, axis=1)
-    colour = sides(draw_field(sheet, up, Scale.signed(up, "µm")))
+    colour = sides(draw_field(sheet, up, ColourScale.signed(up, "µm")))
     for side in ("left", "right"):
         red, blue = colour[f"upper {side}"], colour[f"lower {side}"]
         assert red[0] > red[2] + 40
@@ -99,7 +105,7 @@ def test_a_field_is_drawn_the_right_way_up() -> None:
 
 
 def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
-    sheet = Sheet.of(made_up.plate(), made_up.GRID)
+    sheet = MapFrame.of(made_up.plate(), made_up.GRID)
     X, Y = sheet.moved_corners(None)
     moved_X, moved_Y = sheet.moved_corners(
         lambda x, y: np.stack(np.broadcast_arrays(0.3 + 0 * x * y, 2 * y + 0 * x), axis=-1)
@@ -112,7 +118,7 @@ def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
 
 
 def test_averages_leave_missing_pixels_out() -> None:
-    sheet = Sheet.of(made_up.plate(), made_up.GRID, cells=26)
+    sheet = MapFrame.of(made_up.plate(), made_up.GRID, cells=26)
     assert sheet.factor == 5
     field = np.full(made_up.GRID.shape, 2.0)
     field[::2] = np.nan
@@ -161,10 +167,13 @@ def test_paths_of_any_completeness_are_drawn(
     assert pixels(draw_eigenvalues(path, critical)).size
 
 
-def test_the_rings_are_at_the_wave_vectors(atlas: Atlas) -> None:
+def test_the_rings_are_at_the_wave_vectors(atlas: ExperimentReportData) -> None:
     spectrum, _ = atlas.spectra[1]
-    waves = (Wave((1.0, 0.9), (0.1, 0.1), 0.0, 0.0), Wave((-1.0, 0.8), (0.1, 0.1), 0.0, 0.0))
-    pattern = Pattern(waves, None, "unknown", None, 0.0, ())
+    waves = (
+        PlaneWave((1.0, 0.9), (0.1, 0.1), 0.0, 0.0),
+        PlaneWave((-1.0, 0.8), (0.1, 0.1), 0.0, 0.0),
+    )
+    pattern = WavePattern(waves, None, "unknown", None, 0.0, ())
     drawn = draw_density(spectrum, pattern, 0, pattern_density(spectrum, pattern))
     rings = {tuple(np.ravel(line.get_xydata()).tolist()) for line in drawn.axes[0].lines}
     # In units of 1/l, half of those of pi/l; a real wave has two vectors.
@@ -173,8 +182,8 @@ def test_the_rings_are_at_the_wave_vectors(atlas: Atlas) -> None:
 
 def test_the_colours_of_a_density_end_at_the_pattern() -> None:
     made_spectrum, _ = made_up.spectrum(made_up.comparison(0.1, 4.0))
-    wave = Wave((1.0, 1.0), (0.1, 0.1), 0.0, 0.0)
-    pattern = Pattern((wave,), None, "unknown", None, 0.0, ())
+    wave = PlaneWave((1.0, 1.0), (0.1, 0.1), 0.0, 0.0)
+    pattern = WavePattern((wave,), None, "unknown", None, 0.0, ())
     end = pattern_density(made_spectrum, pattern)
     assert end == np.max(np.abs(made_spectrum.at((0.5, 0.5))) ** 2)
     image = draw_density(made_spectrum, pattern, 1, end).axes[0].images[0]
@@ -182,7 +191,7 @@ def test_the_colours_of_a_density_end_at_the_pattern() -> None:
     assert pattern_density(made_spectrum, replace(pattern, waves=())) == 0.0
 
 
-def test_each_level_of_the_correlation_is_a_curve(atlas: Atlas) -> None:
+def test_each_level_of_the_correlation_is_a_curve(atlas: ExperimentReportData) -> None:
     history = atlas.comparisons[0].result.history
     curves = draw_convergence(atlas.comparisons[0].result).axes[0].lines
     assert [len(np.asarray(line.get_xdata())) for line in curves] == [2, 2]
@@ -191,7 +200,7 @@ def test_each_level_of_the_correlation_is_a_curve(atlas: Atlas) -> None:
     assert draw_convergence(replace(atlas.comparisons[0].result, history=())).axes
 
 
-def test_the_svg_stands_on_its_own(atlas: Atlas) -> None:
+def test_the_svg_stands_on_its_own(atlas: ExperimentReportData) -> None:
     svg = to_svg(draw_hero(atlas, 1), "hero", 'a "title" & more')
     assert svg.startswith("<svg viewBox=")
     assert svg.endswith("</svg>")
@@ -210,7 +219,7 @@ def test_the_svg_stands_on_its_own(atlas: Atlas) -> None:
     assert to_hex(MUTED) not in svg
 
 
-def test_drawing_leaves_matplotlib_as_it_was(atlas: Atlas) -> None:
+def test_drawing_leaves_matplotlib_as_it_was(atlas: ExperimentReportData) -> None:
     before = dict(mpl.rcParams)
     to_svg(draw_hero(atlas, 0), "hero", "")
     assert dict(mpl.rcParams) == before

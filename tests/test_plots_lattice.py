@@ -20,24 +20,24 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from modeharvest.validation.lattice.independence import EQ_MODE, wave_sum
-from modeharvest.validation.lattice.patch import Patch
-from modeharvest.validation.lattice.plots import draw_growth, draw_lattice, draw_overlay
-from modeharvest.validation.lattice.plots_branches import (
-    combination_name,
+from modeharvest.report.figures.lattice import (
     draw_amplitudes,
     draw_captured,
     draw_critical_strains,
     draw_differences,
-    draw_energies,
-    draw_overlaps,
-)
-from modeharvest.validation.lattice.plots_waves import (
     draw_dispersion,
+    draw_energies,
+    draw_growth,
+    draw_lattice,
     draw_lattice_spectrum,
+    draw_overlaps,
+    draw_overlay,
     draw_zone_map,
 )
-from modeharvest.validation.style import INK
+from modeharvest.report.figures.outlines import LatticePatch
+from modeharvest.report.figures.style import INK
+from modeharvest.runs.lattice.results import combination_name
+from modeharvest.validation.studies.lattice_pattern import EQ_MODE, wave_sum
 
 L = made_up.PITCH
 HEXAGONAL = L * np.array([[1.0, 0.0], [0.5, 0.75**0.5]])
@@ -58,7 +58,7 @@ def test_copies_join_without_seams_and_fill_the_window(
     copies: int, shear: NDArray[np.float64] | None
 ) -> None:
     mesh, lattice = made_up.cell(copies, shear)
-    patch = Patch.of(mesh, lattice, (3 * L, 2 * L))
+    patch = LatticePatch.of(mesh, lattice, (3 * L, 2 * L))
     assert len(np.unique(np.round(patch.mesh.nodes, 9), axis=0)) == len(patch.mesh.nodes)
     # One outer edge, and around each hole one loop of 8 edges; a seam would add more.
     holes = [loop for loop in patch.outline.loops if len(loop) == 8]
@@ -74,7 +74,7 @@ def test_copies_join_without_seams_and_fill_the_window(
 def test_an_affine_displacement_of_the_cell_is_that_of_the_patch(parts: list[float]) -> None:
     F = np.eye(2) + np.reshape(parts, (2, 2))
     mesh, lattice = made_up.cell(1, made_up.SHEAR)
-    patch = Patch.of(mesh, lattice, (2 * L, 2 * L))
+    patch = LatticePatch.of(mesh, lattice, (2 * L, 2 * L))
     moved = patch.moved(mesh.nodes @ (F - np.eye(2)).T, F)
     expected = (patch.mesh.nodes - patch.centre) @ (F - np.eye(2)).T
     np.testing.assert_allclose(moved, expected, atol=1e-12)
@@ -82,14 +82,14 @@ def test_an_affine_displacement_of_the_cell_is_that_of_the_patch(parts: list[flo
 
 def test_a_periodic_displacement_repeats_in_every_copy() -> None:
     modes = made_up.modes()
-    patch = Patch.of(modes.mesh, modes.lattice, (5 * L, 5 * L))
+    patch = LatticePatch.of(modes.mesh, modes.lattice, (5 * L, 5 * L))
     expected = wave_sum(EQ_MODE.waves(EQ_MODE.start), patch.mesh.nodes, L)
     np.testing.assert_allclose(patch.moved(modes.shapes[0]), expected, atol=1e-12)
 
 
 def test_the_cell_s_outline_follows_the_mean_deformation() -> None:
     mesh, lattice = made_up.cell()
-    patch = Patch.of(mesh, lattice, (3 * L, 3 * L))
+    patch = LatticePatch.of(mesh, lattice, (3 * L, 3 * L))
     F = np.array([[0.9, 0.1], [0.0, 1.05]])
     drawn = draw_lattice(patch, L, mesh.nodes @ (F - np.eye(2)).T, F)
     corners = drawn.axes[0].patches[-1].get_xy()[:4]  # type: ignore[attr-defined]  # a polygon
@@ -99,7 +99,7 @@ def test_the_cell_s_outline_follows_the_mean_deformation() -> None:
 
 def test_a_growing_mode_is_nothing_on_the_left_and_all_on_the_right() -> None:
     modes = made_up.modes()
-    patch = Patch.of(modes.mesh, modes.lattice, (6 * L, 4 * L))
+    patch = LatticePatch.of(modes.mesh, modes.lattice, (6 * L, 4 * L))
     drawn = draw_growth(patch, modes.shapes[0], 0.1 * L, L)
     mesh = drawn.axes[0].collections[0]
     length = np.asarray(mesh.get_array())

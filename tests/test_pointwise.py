@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_isoparametric import ELEMENTS, FILLING, patch, single, textbook
 
-from modeharvest.errors import InputError
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import locate
-from modeharvest.imaging.pointwise import locate_points
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from modeharvest import precompile
 from modeharvest.imaging import compiled
-from modeharvest.precompile import precompiling
+from modeharvest.runs import precompile
+from modeharvest.runs.precompile import precompiling
 
 CALLEE = """
 from modeharvest.imaging.compiled import compiled

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.idic.blur import binned, blurred
-from modeharvest.idic.pyramid import eroded
-from modeharvest.imaging.prefilter import spline_coefficients
+from modeharvest.idic.solver.pyramid import binned, blurred, eroded
+from modeharvest.imaging.spline import spline_coefficients
 
 SIZES = st.tuples(st.integers(2, 70), st.integers(2, 70))
 SEEDS = st.integers(0, 10**6)

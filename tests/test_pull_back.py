@@ -9,7 +9,7 @@ from filling_mode import MASK, case, error_px
 from manufactured import GRID
 
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.pull_back import pulled_back
+from modeharvest.idic.photograph.measure import pulled_back
 
 
 def test_the_truth_brings_the_reference_back() -> None:

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.specimen.hole_lattice import find_hole_lattice
-from modeharvest.idic.specimen.region import (
+from modeharvest.idic.photograph.holes import find_hole_lattice
+from modeharvest.idic.photograph.region import (
     junction,
     region_of_lattice,
     region_of_mask,
     region_of_polygon,
 )
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 SPECIMEN = Specimen(holes_x=4, holes_y=3)
 GRID = PixelGrid.centred(251, 401, 0.04)  # [mm/px]; room for the bulk all around

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.isoparametric import locate
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.render import (
     Rendering,
     Truth,
@@ -15,7 +14,8 @@ from modeharvest.imaging.render import (
     render_image,
     render_reference,
 )
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

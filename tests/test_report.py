@@ -17,15 +17,15 @@ import synthetic_report as made_up
 from html_page import Page
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.validation import words
-from modeharvest.validation.page import fixed, short
-from modeharvest.validation.plots import PANELS, Atlas
-from modeharvest.validation.report import write_report
+from modeharvest.report import experiment as words
+from modeharvest.report.experiment import write_experiment_report
+from modeharvest.report.figures.experiment import PANELS, ExperimentReportData
+from modeharvest.report.model import fixed, short
 
 
-def report(atlas: Atlas, folder: Path, summary: dict[str, Any]) -> str:
+def report(atlas: ExperimentReportData, folder: Path, summary: dict[str, Any]) -> str:
     path = folder / "report.html"
-    write_report(path, made_up.case(), atlas.solution, atlas.images, atlas.comparisons,
+    write_experiment_report(path, made_up.case(), atlas.solution, atlas.images, atlas.comparisons,
                  atlas.spectra, summary)  # fmt: skip
     return path.read_text("utf-8")
 
@@ -122,7 +122,7 @@ def test_a_correlation_without_a_mode_has_no_panels_of_it(tmp_path: Path) -> Non
 def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:
     told: list[float] = []
     atlas = made_up.atlas((0.05,))
-    write_report(tmp_path / "r.html", made_up.case(), atlas.solution, atlas.images,
+    write_experiment_report(tmp_path / "r.html", made_up.case(), atlas.solution, atlas.images,
                  atlas.comparisons, atlas.spectra, made_up.summary(atlas),
                  lambda done, total, what: told.append(done / total))  # fmt: skip
     assert told == sorted(told)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import synthetic_report as made_up
 
-from modeharvest.case import read_case, shipped_solution
-from modeharvest.files import read_json
-from modeharvest.pipeline import Run
-from modeharvest.validation import words
+from modeharvest.report import experiment as words
+from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.experiment import Run
+from modeharvest.util.files import read_json
 
 CASE = """
 [experiment]

@@ -15,16 +15,22 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.cli import root
-from modeharvest.errors import InputError
-from modeharvest.files import read_json
-from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.imaging.io import read_image
-from modeharvest.validation.page import short
+from modeharvest.idic.local.field import LocalField
+from modeharvest.imaging.photographs.files import read_image
+from modeharvest.report.model import short
+from modeharvest.runs.benchmark import grade_star
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json
 from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.graded import grade_star
-from modeharvest.validation.resolution.grading import NoiseFloor, StarGrade, ranked
-from modeharvest.validation.resolution.star import Star, StarImages, fine_speckle
-from modeharvest.validation.resolution.star_set import StarSet, StarSpec, make_star_set
+from modeharvest.validation.resolution.grading import NoiseFloor, StarGrade, ranked_grades
+from modeharvest.validation.resolution.star import (
+    Star,
+    StarImages,
+    StarSet,
+    StarSpec,
+    fine_speckle,
+    make_star_set,
+)
 from modeharvest.validation.resolution.transfer import (
     finest_period,
     polynomial_transfer,
@@ -244,7 +250,7 @@ def test_the_indicator_hardly_depends_on_the_size_of_the_subset(tmp_path: Path) 
     # 3.99 w at 0.02 / w, Dirichlet's kernel for many pixels.
     assert indicators == pytest.approx(3.99 * 0.02, rel=0.03)
     lone = StarGrade(STAR, grades[0].moved)
-    assert ranked([lone, *grades])[-1] is lone
+    assert ranked_grades([lone, *grades])[-1] is lone
     assert "n is not known" in lone.notes[0]
 
 

@@ -10,24 +10,37 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.setup import Identification
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import SpeckleSpec
-from modeharvest.studies.case import StudyCase, read_study
-from modeharvest.validation.resolution import findings as told
-from modeharvest.validation.resolution.buckled import LARGEST, Buckled, Wave
-from modeharvest.validation.resolution.curves import AXES, WAVED, Curves, Passband
-from modeharvest.validation.resolution.degrees import QUANTITIES
-from modeharvest.validation.resolution.measure import Subject, one_case
-from modeharvest.validation.resolution.study import Resolution
-from modeharvest.validation.resolution.tangent import Tangent, share
-from modeharvest.validation.resolution.transfer import polynomial_transfer
-from modeharvest.validation.studies.subject import Subject as Experiment
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
+from modeharvest.report import study_resolution as told
+from modeharvest.runs.study import StudyCase, read_study
+from modeharvest.util.errors import InputError
+from modeharvest.validation.resolution.buckled import (
+    LARGEST,
+    AddedWave,
+    BuckledMotion,
+    ResolutionSpec,
+)
+from modeharvest.validation.resolution.transfer import TangentFit, polynomial_transfer, wave_share
+from modeharvest.validation.resolution.waves import (
+    AXES,
+    QUANTITIES,
+    WAVED,
+    Passband,
+    TransferCurves,
+)
+from modeharvest.validation.studies.resolution import (
+    ResolutionStudy,
+    measured_waves,
+    noise_floors,
+    one_case,
+)
+from modeharvest.validation.studies.study import ImagePairSpec as Experiment
 
 FloatArray = NDArray[np.float64]
 
@@ -36,15 +49,17 @@ SPECIMEN = Specimen(holes_x=4, holes_y=4)
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def subject() -> ResolutionSpec:
     """A small specimen on images of 260 x 260 px."""
-    buckled = Buckled(SPECIMEN, Identification(), SpeckleSpec(blur_px=2.0), PIXEL, 0.1, 5.0)
-    return Subject(buckled, (3,), 0.5, 0.01)
+    buckled = BuckledMotion(
+        SPECIMEN, SquareLatticeOptions(), SpeckleSpec(blur_px=2.0), PIXEL, 0.1, 5.0
+    )
+    return ResolutionSpec(buckled, (3,), 0.5, 0.01)
 
 
 @pytest.fixture(scope="module")
-def curves(subject: Subject) -> Curves:
-    return Curves.of(subject, (1, 2, 3))
+def curves(subject: ResolutionSpec) -> TransferCurves:
+    return TransferCurves.of(subject, (1, 2, 3))
 
 
 # -- best fits ----------------------------------------------------------------------------
@@ -62,17 +77,20 @@ def test_on_a_full_rectangle_the_transfer_is_bessel_s(degree: int, axis: int) ->
     phases = [0.0, 0.5 * np.pi]
     waves = np.zeros((len(points), 2, len(period) * len(phases)))
     waves[:, 1] = np.stack(
-        [Wave("v0", axis, p, phase, 1.0).shape(points) for p in period for phase in phases], axis=-1
+        [AddedWave("v0", axis, p, phase, 1.0).shape(points) for p in period for phase in phases],
+        axis=-1,
     )
-    found = Tangent(ansatz, ansatz.start(), points).fit(waves)
+    found = TangentFit(ansatz, ansatz.start(), points).fit(waves)
     # The power of both phases together: their shares, weighted by their own power.
     power = (waves**2).sum(axis=(0, 1))
-    both = (share(found.whole, waves) * power).reshape(-1, 2).sum(1) / power.reshape(-1, 2).sum(1)
+    both = (wave_share(found.whole, waves) * power).reshape(-1, 2).sum(1) / power.reshape(
+        -1, 2
+    ).sum(1)
     expected = polynomial_transfer(degree, 2.0 * half[axis] / period)
     assert both == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: Subject) -> None:
+def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: ResolutionSpec) -> None:
     """The fit's own curvature is what 1e-4 mm of wave leave of the difference."""
     buckled, degree = subject.buckled, 2
     grid = PixelGrid.centred(131, 131, 0.1)
@@ -80,17 +98,17 @@ def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: Subje
     mask = buckled.material(at[..., 0], at[..., 1])
     ansatz, start = subject.ansatz(degree, "buckled"), subject.start(degree, "buckled")
     for part in WAVED:
-        wave = buckled.wave_at(Wave(part, 0, 6.0, 0.3, 1e-4), at)
+        wave = buckled.wave_at(AddedWave(part, 0, 6.0, 0.3, 1e-4), at)
         fit = fit_displacement(buckled.displacement(at) + wave, grid, ansatz, start, mask)
         change = (fit.displacement() - buckled.displacement(at))[mask][..., None]
-        linear = Tangent(ansatz, start, at[mask]).fit(wave[mask][..., None]).whole
-        expected = share(linear, wave[mask][..., None])
-        assert share(change, wave[mask][..., None]) == pytest.approx(expected, abs=1e-3)
+        linear = TangentFit(ansatz, start, at[mask]).fit(wave[mask][..., None]).whole
+        expected = wave_share(linear, wave[mask][..., None])
+        assert wave_share(change, wave[mask][..., None]) == pytest.approx(expected, abs=1e-3)
 
 
-def test_waves_that_the_ansatz_describes_are_found_whole(subject: Subject) -> None:
+def test_waves_that_the_ansatz_describes_are_found_whole(subject: ResolutionSpec) -> None:
     """Degree by degree less is lost, and long waves come back; nothing goes to the other part."""
-    curves = Curves.of(subject, (1, 4))
+    curves = TransferCurves.of(subject, (1, 4))
     for part in WAVED:
         for axis in range(len(AXES)):
             assert (curves.own[part, axis, 4] > curves.own[part, axis, 1] - 0.02).all()
@@ -101,7 +119,7 @@ def test_waves_that_the_ansatz_describes_are_found_whole(subject: Subject) -> No
     assert resolved < 0.05
 
 
-def test_the_pattern_is_tuned_and_not_filtered(subject: Subject) -> None:
+def test_the_pattern_is_tuned_and_not_filtered(subject: ResolutionSpec) -> None:
     band = Passband.of(subject, 2)
     mode = int(np.argmin(np.abs(band.stretch - 1.0)))
     assert band.added[mode] == pytest.approx(1.0, abs=1e-9)
@@ -116,9 +134,9 @@ def test_the_pattern_is_tuned_and_not_filtered(subject: Subject) -> None:
 # -- images -------------------------------------------------------------------------------
 
 
-def test_images_of_a_formula_are_exact(subject: Subject) -> None:
+def test_images_of_a_formula_are_exact(subject: ResolutionSpec) -> None:
     buckled = subject.buckled
-    for wave in (None, Wave("v1", 1, 4.0, 0.2, 0.02)):
+    for wave in (None, AddedWave("v1", 1, 4.0, 0.2, 0.02)):
         base = buckled._base
         points = base.points if wave is None else buckled._improved(base, wave)
         off = points + buckled.displacement(points, wave) - base.at
@@ -132,7 +150,7 @@ def test_images_of_a_formula_are_exact(subject: Subject) -> None:
     assert buckled.displacement(at) == pytest.approx(ansatz.displacement_at(a, at))
 
 
-def test_material_is_what_the_specimen_is(subject: Subject) -> None:
+def test_material_is_what_the_specimen_is(subject: ResolutionSpec) -> None:
     buckled, s = subject.buckled, SPECIMEN
     area = buckled.material(*np.meshgrid(buckled.grid.x, buckled.grid.y)).sum() * PIXEL**2
     holes = 16 * np.pi * (0.5 * s.diameter) ** 2
@@ -142,16 +160,18 @@ def test_material_is_what_the_specimen_is(subject: Subject) -> None:
 
 
 @pytest.fixture(scope="module")
-def table(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def table(subject: ResolutionSpec, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     """All cases of a small study, run here."""
     folder = tmp_path_factory.mktemp("resolution")
     experiment = Experiment(
         replace(StudyCase().experiment, specimen=SPECIMEN),
         replace(StudyCase().imaging, pixel_size=PIXEL, speckle=SpeckleSpec(blur_px=2.0)),
-        Identification(),
+        SquareLatticeOptions(),
         None,  # type: ignore[arg-type]  # nothing simulated is measured
     )
-    study = Resolution(strain=0.1, pattern=5.0, degrees=(1, 2, 3), measured=(3,), realisations=12)
+    study = ResolutionStudy(
+        strain=0.1, pattern=5.0, degrees=(1, 2, 3), measured=(3,), realisations=12
+    )
     rows: list[dict[str, Any]] = []
     for case in study.prepare(experiment, folder):
         rows.append({**case, "error": "", **one_case(case, folder)})
@@ -159,22 +179,22 @@ def table(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> pd.Data
 
 
 def test_images_give_what_best_fits_promise(
-    table: pd.DataFrame, subject: Subject, curves: Curves
+    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
 ) -> None:
     """The speckle's gradient weighs the fit, by grain: some 700 grains share 10 unknowns.
 
     So what is lost, a tenth of the power, comes back in part by chance: with a standard deviation
     of sqrt(10 / 700) sqrt(0.1) = 0.04 of the wave.
     """
-    waves = told.measured_waves(table, subject, curves)
+    waves = measured_waves(table, subject, curves)
     assert len(waves) == len(WAVED) * len(AXES)
     assert waves["difference"].abs().max() < 3.5 * 0.04
     assert abs(waves["difference"].mean()) < 3.5 * 0.04 / np.sqrt(len(waves))
     assert waves["best fit"].to_numpy() == pytest.approx(0.9, abs=1e-3)  # that is what l10 is
 
 
-def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Subject) -> None:
-    floors = told.noise_floors(table, subject)
+def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: ResolutionSpec) -> None:
+    floors = noise_floors(table, subject)
     assert len(floors) == 2 * len(QUANTITIES)
     z = (floors["Monte Carlo / told"] - 1.0) / floors["±"]
     # Twelve realisations: Student's t, and eight numbers that hang together.
@@ -183,9 +203,9 @@ def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Subje
 
 
 def test_findings_of_a_resolution_study(
-    table: pd.DataFrame, subject: Subject, curves: Curves
+    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
 ) -> None:
-    found = told.findings(table, subject, curves, "seed 0")
+    found = told.resolution_findings(table, subject, curves, "seed 0")
     degrees = found.numbers["degrees"]
     finest = [d["finest_px"]["v0 x"] for d in degrees]
     floor = [d["floor_px"]["v0"] for d in degrees]
@@ -213,22 +233,22 @@ def test_findings_of_a_resolution_study(
 )
 def test_studies_that_can_t_be_asked(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Resolution(**options)
+        ResolutionStudy(**options)
 
 
 def test_the_shipped_study_spells_out_the_defaults() -> None:
     case = read_study("resolution")
-    assert case.study == Resolution()
+    assert case.study == ResolutionStudy()
     assert case.imaging.pixel_size == 0.02
     quick = case.quick()
     assert quick.study.measured == (5,)
     with pytest.raises(InputError, match="hold_mode"):
-        case.study.require(Identification(hold_mode=True))
+        case.study.require(SquareLatticeOptions(hold_mode=True))
     with pytest.raises(InputError, match="camera = false"):
-        case.study.require(Identification(camera=True))
+        case.study.require(SquareLatticeOptions(camera=True))
 
 
 def test_a_motion_that_folds_is_refused() -> None:
-    folded = Buckled(SPECIMEN, Identification(), SpeckleSpec(), 0.1, 0.1, 40.0)
+    folded = BuckledMotion(SPECIMEN, SquareLatticeOptions(), SpeckleSpec(), 0.1, 0.1, 40.0)
     with pytest.raises(InputError, match="folds the specimen"):
         folded.images()

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from manufactured import GRID
 
-from modeharvest.errors import InputError
-from modeharvest.idic.gauss_newton import Iteration, Outcome
-from modeharvest.idic.noise_transfer import ImageNoise, NoiseTransfer
 from modeharvest.idic.result import Result
+from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 
 def some_result(seed: int = 0, outcome: Outcome = Outcome.CONVERGED) -> Result:

@@ -12,14 +12,14 @@ from manufactured import PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.blur import blurred
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
-from modeharvest.idic.noise_transfer import ImageNoise, NoiseTransfer, slope_noise
-from modeharvest.idic.pyramid import Level
+from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.pyramid import Level, blurred
+from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
 
 GRID = PixelGrid.centred(240, 220, PIXEL)
 ANSATZ = Ansatz(Box.centred(2.2, 2.4), v0_degree=2)

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.specimen.hole_motion import HoleMotion
-from modeharvest.idic.specimen.scene import _correlation, compare_scenes, require_same_scene
+from modeharvest.idic.photograph.matching import (
+    HoleMotion,
+    _correlation,
+    match_blocks,
+    require_same_surface,
+)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 SHAPE = (300, 340)
 SPECKLE = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0), SHAPE)
@@ -27,7 +31,7 @@ def moved(
 
 @pytest.mark.parametrize("shift", [(0, 0), (7, -3), (-20, 15)])
 def test_a_shifted_surface_is_found_to_the_pixel(shift: tuple[int, int]) -> None:
-    match = compare_scenes(SPECKLE.image(), moved(shift))
+    match = match_blocks(SPECKLE.image(), moved(shift))
     assert match.is_same
     off = (match.after - match.before)[match.found]
     # Some blocks have left the image, and 5 % of those are found elsewhere, by chance.
@@ -36,18 +40,18 @@ def test_a_shifted_surface_is_found_to_the_pixel(shift: tuple[int, int]) -> None
 
 def test_another_surface_is_not_the_same() -> None:
     other = Speckle(SpeckleSpec(standard_deviation=0.06, blur_px=2.0, seed=7), SHAPE).image()
-    match = compare_scenes(SPECKLE.image(), other)
+    match = match_blocks(SPECKLE.image(), other)
     assert match.share < 0.3  # 5 % by the definition of chance, of some 60 blocks
     assert not match.is_same
     with pytest.raises(InputError, match=r"r\.tif and d\.tif, of which only"):
-        require_same_scene(match, "r.tif", "d.tif")
+        require_same_surface(match, "r.tif", "d.tif")
 
 
 def test_large_motion_is_found_where_it_is_expected() -> None:
     image = moved((60.0, -10.0), stretch=0.95)
     f = SPECKLE.image()
-    lost = compare_scenes(f, image)
-    found = compare_scenes(f, image, expected=lambda p: 0.95 * p + (58.0, -7.0))
+    lost = match_blocks(f, image)
+    found = match_blocks(f, image, expected=lambda p: 0.95 * p + (58.0, -7.0))
     assert not lost.is_same
     assert found.is_same
     aims = 0.95 * found.before + (60.0, -10.0)
@@ -62,7 +66,7 @@ def test_turned_blocks_are_found() -> None:
     turn, middle = np.array([[c, s], [-s, c]]), np.array([150.0, 170.0])
     back = (np.stack([row, col], axis=-1) - middle) @ turn.T + middle
     image = SPECKLE(back[..., 0], back[..., 1])
-    match = compare_scenes(SPECKLE.image(), image, expected=lambda p: (p - middle) @ turn + middle)
+    match = match_blocks(SPECKLE.image(), image, expected=lambda p: (p - middle) @ turn + middle)
     assert match.share > 0.8
     assert np.median(np.abs(match.after - (match.before - middle) @ turn - middle)) < 1.0
 
@@ -84,7 +88,7 @@ def test_correlations_are_the_definitions() -> None:
 
 
 def test_blocks_in_mm_have_y_upwards() -> None:
-    match = compare_scenes(SPECKLE.image(), moved((5.0, -8.0)))
+    match = match_blocks(SPECKLE.image(), moved((5.0, -8.0)))
     _, u = match.in_mm(PixelGrid.centred(*SHAPE, 0.5))
     np.testing.assert_allclose(np.median(u, axis=0), [-4.0, -2.5])
 
@@ -92,7 +96,7 @@ def test_blocks_in_mm_have_y_upwards() -> None:
 def test_blocks_lie_on_material() -> None:
     mask = np.zeros(SHAPE, dtype=bool)
     mask[40:260, 100:180] = True
-    match = compare_scenes(SPECKLE.image(), moved((0.0, 0.0)), mask)
+    match = match_blocks(SPECKLE.image(), moved((0.0, 0.0)), mask)
     half = match.block_px // 2
     for row, col in match.before.astype(int):
         assert mask[row - half : row + half + 1, col - half : col + half + 1].all()
@@ -111,8 +115,8 @@ def test_motion_between_holes_reproduces_affine_maps() -> None:
 def test_what_cannot_be_compared_is_refused() -> None:
     f = SPECKLE.image()
     with pytest.raises(InputError, match="one size"):
-        compare_scenes(f, f[:-1])
+        match_blocks(f, f[:-1])
     with pytest.raises(InputError, match="room for blocks"):
-        compare_scenes(f, f, np.zeros(SHAPE))
+        match_blocks(f, f, np.zeros(SHAPE))
     with pytest.raises(InputError, match="motion is too large"):
-        compare_scenes(f, f, expected=lambda p: p + 1e4)
+        match_blocks(f, f, expected=lambda p: p + 1e4)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.scoring.regions import REGIONS, regions
-from modeharvest.validation.scoring.score import ranked, score
+from modeharvest.util.errors import InputError
+from modeharvest.validation.scoring.score import REGIONS, ranked, regions, score
 
 FloatArray = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from synthetic_benchmark import wavy
 
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.validation.scoring.conventions import Truth, check_conventions
 

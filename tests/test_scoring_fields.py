@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from synthetic_benchmark import PIXEL, STRAIN
 
-from modeharvest.errors import InputError
-from modeharvest.scoring import Declared, declarations
+from modeharvest.runs.benchmark import declarations
+from modeharvest.util.errors import InputError
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
-from modeharvest.validation.scoring.fields import read_measured
-from modeharvest.validation.scoring.regions import regions
-from modeharvest.validation.scoring.score import Score, score
+from modeharvest.validation.scoring.fields import Declared, read_measured
+from modeharvest.validation.scoring.score import Score, regions, score
 
 FloatArray = NDArray[np.float64]
 ROUNDED_PX = 1e-6

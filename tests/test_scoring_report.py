@@ -20,17 +20,21 @@ from html_page import Page
 from numpy.typing import NDArray
 from synthetic_benchmark import PIXEL, STRAIN
 
-from modeharvest import cli
-from modeharvest.idic.fields.files import write_field
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.cli.root import main
+from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.page import short
+from modeharvest.report.model import short
 from modeharvest.validation.scoring import score as grades
-from modeharvest.validation.scoring import spectrum as spectra
+from modeharvest.validation.scoring import score as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
-from modeharvest.validation.scoring.regions import REGIONS, regions
-from modeharvest.validation.scoring.score import Score, ranked, score
-from modeharvest.validation.scoring.spectrum import error_spectrum
+from modeharvest.validation.scoring.score import (
+    REGIONS,
+    Score,
+    error_spectrum,
+    ranked,
+    regions,
+    score,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -78,7 +82,7 @@ def run(
     said: list[str] = []
     patch.setattr("rich.console.Console.print", lambda _, *what, **how: said.extend(map(str, what)))
     try:
-        cli.main()
+        main()
     except SystemExit as end:
         return "\n".join(said), int(end.code or 0)
     return "\n".join(said), 0

@@ -9,10 +9,9 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.io import quantise
-from modeharvest.imaging.sensor import Sensor
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.sensor import Sensor, quantise
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.setup import Identification
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.util.errors import InputError
 
-SETUP = Identification()
+SETUP = SquareLatticeOptions()
 
 
 @pytest.mark.parametrize("holes_x", [1, 2, 3, 6])
@@ -66,7 +66,7 @@ def test_the_papers_numbers() -> None:
 
 
 def test_options_are_handed_on() -> None:
-    setup = Identification(edge_px=5, order=3, v0_degree=3, v_degree=2)
+    setup = SquareLatticeOptions(edge_px=5, order=3, v0_degree=3, v_degree=2)
     options = setup.options()
     assert (options.edge_px, options.order) == (5, 3)
     assert setup.ansatz(Specimen()).size == 2 * 10 + 6 + 7
@@ -84,12 +84,12 @@ def test_options_are_handed_on() -> None:
 )
 def test_bad_values_are_named(values: dict[str, float], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        Identification(**values)  # type: ignore[arg-type]
+        SquareLatticeOptions(**values)  # type: ignore[arg-type]
 
 
 def test_a_held_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
     specimen = Specimen(holes_x=5, holes_y=4)
-    free, held = (Identification(hold_mode=h).ansatz(specimen) for h in (False, True))
+    free, held = (SquareLatticeOptions(hold_mode=h).ansatz(specimen) for h in (False, True))
     assert held.size == free.size - 7
     x, y = np.linspace(-5, 5, 7), np.linspace(-4, 4, 9)
     np.testing.assert_allclose(
@@ -98,7 +98,7 @@ def test_a_held_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
 
 
 def test_gain_and_offset_can_be_asked_for() -> None:
-    ansatz = Identification(gain_degree=1, offset_degree=0).ansatz(Specimen())
+    ansatz = SquareLatticeOptions(gain_degree=1, offset_degree=0).ansatz(Specimen())
     assert ansatz.names[77:] == ("gain[0,0]", "gain[1,0]", "gain[0,1]", "offset[0,0]")
     with pytest.raises(InputError, match="degree of the gain"):
-        Identification(gain_degree=9)
+        SquareLatticeOptions(gain_degree=9)

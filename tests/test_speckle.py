@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
-from modeharvest.imaging.speckle_layer import TOLERANCE, Layer, gaussian_field
+from modeharvest.imaging.speckle.layer import TOLERANCE, Layer, gaussian_field
+from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

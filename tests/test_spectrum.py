@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modeharvest.errors import InputError
-from modeharvest.idic.families.equivalents import (
+from modeharvest.idic.spectra.pattern import (
     REFERENCE_MODE,
     mode_deviation,
     mode_equivalent,
+    read_pattern,
     square_mode,
 )
-from modeharvest.idic.families.pattern import read_pattern
-from modeharvest.idic.families.spectrum import spectral_density
-from modeharvest.idic.families.waves import find_peaks
+from modeharvest.idic.spectra.spectrum import spectral_density
+from modeharvest.idic.spectra.waves import find_peaks
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.errors import InputError
 
 PITCH = 1.9
 PIXEL = 0.08

@@ -21,10 +21,10 @@ import pytest
 import synthetic_benchmark
 
 import modeharvest
-from modeharvest import cli, stages
-from modeharvest.errors import InputError
-from modeharvest.stages import Stages, exclusive, stage_key
-from modeharvest.versions import source_digest
+from modeharvest.cli.root import main
+from modeharvest.util import stages
+from modeharvest.util.errors import InputError
+from modeharvest.util.stages import Stages, exclusive, source_digest, stage_key
 
 
 class Work:
@@ -120,7 +120,7 @@ def digest_in(path: Path, *folders: str) -> str:
     """The digest of the package's code that another Python finds at a path."""
     program = (
         f"import sys; sys.path.insert(0, {str(path)!r})\n"
-        "from modeharvest.versions import source_digest\n"
+        "from modeharvest.util.stages import source_digest\n"
         f"print(source_digest(*{folders}))"
     )
     command = [sys.executable, "-S", "-c", program]
@@ -326,7 +326,7 @@ def test_every_command_that_writes_a_folder_has_it_alone(
     )
     monkeypatch.setattr(sys, "argv", ["modeharvest", *command.split(), "--out", str(occupied)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     assert end.value.code == 2
     (line,) = [row for row in capsys.readouterr().err.splitlines() if row.startswith("error:")]
     assert "for this process alone, but it is used by process" in line
@@ -337,8 +337,8 @@ def test_every_command_that_writes_a_folder_has_it_alone(
 def test_under_mpirun_one_rank_holds_for_all_and_all_are_refused(tmp_path: Path) -> None:
     program = (
         "import sys\n"
-        "from modeharvest.errors import InputError\n"
-        "from modeharvest.stages import exclusive\n"
+        "from modeharvest.util.errors import InputError\n"
+        "from modeharvest.util.stages import exclusive\n"
         "try:\n"
         f"    with exclusive({str(tmp_path)!r}):\n"
         "        print('had it', flush=True)\n"

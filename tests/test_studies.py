@@ -17,26 +17,29 @@ import pytest
 from html_page import Page
 from scipy import stats
 
-from modeharvest import cli
-from modeharvest.case import shipped_solution
-from modeharvest.errors import InputError
+from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
-from modeharvest.files import read_json, write_json
-from modeharvest.studies.case import StudyCase, read_study, shipped_studies
-from modeharvest.studies.pipeline import StudyPipeline
+from modeharvest.report import study_robustness as told
+from modeharvest.report.study_noise import report_noise
+from modeharvest.report.study_systematic import report_systematic
+from modeharvest.runs.case import shipped_solution
+from modeharvest.runs.study import StudyAnalysis, StudyCase, read_study, shipped_studies
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.stages import source_digest
 from modeharvest.validation.campaign import Campaign
-from modeharvest.validation.case_run import run_case, store
-from modeharvest.validation.studies.noise import causes as noise_causes
-from modeharvest.validation.studies.noise.findings import report_noise
-from modeharvest.validation.studies.noise.statistics import Pairs
-from modeharvest.validation.studies.noise.study import Noise, one_realisation
-from modeharvest.validation.studies.robustness import findings as told
-from modeharvest.validation.studies.robustness.study import Robustness, one_start
-from modeharvest.validation.studies.subject import Scene, Subject
-from modeharvest.validation.studies.systematic.factors import FACTORS, Setting
-from modeharvest.validation.studies.systematic.findings import report_systematic
-from modeharvest.validation.studies.systematic.study import Systematic, one_level
-from modeharvest.versions import source_digest
+from modeharvest.validation.studies import noise as noise_causes
+from modeharvest.validation.studies.noise import NoiseStudy, one_realisation
+from modeharvest.validation.studies.noise_statistics import PairedErrors
+from modeharvest.validation.studies.robustness import SAME_PX, RobustnessStudy, one_start, wilson
+from modeharvest.validation.studies.study import ImagePairSpec, VirtualImagePair
+from modeharvest.validation.studies.systematic import (
+    FACTORS,
+    StudySetting,
+    SystematicStudy,
+    one_level,
+)
+from modeharvest.validation.workers import run_case, store
 
 PAPER = shipped_solution("paper-virtual")
 TINY = """
@@ -53,12 +56,12 @@ pixel_size = 0.05
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def subject() -> ImagePairSpec:
     """The paper's specimen on images of 0.05 mm/px, which take a tenth of a second."""
     case = StudyCase()
     assert PAPER is not None
     imaging = replace(case.imaging, pixel_size=0.05)
-    return Subject(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
+    return ImagePairSpec(case.experiment, imaging, case.correlation, lambda: Solution.read(PAPER))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +86,7 @@ def starts_table(distances: list[float], outcomes: list[str] | None = None) -> p
 @pytest.mark.parametrize(("good", "n"), [(98, 100), (100, 100), (0, 7), (3, 5)])
 def test_intervals_are_wilson_s(good: int, n: int) -> None:
     """Against the score test that they invert: its p-value at their ends is 5 %."""
-    low, high = told.wilson(good, n)
+    low, high = wilson(good, n)
     share = good / n
     for end, is_open in ((low, share > 0.0), (high, share < 1.0)):
         if is_open:
@@ -98,7 +101,7 @@ def test_numbers_of_a_robustness_study() -> None:
     table.loc[98, "outcome"] = "trapped"
     table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
-    found = told.findings(table, 0.1, "seed 0")
+    found = told.robustness_findings(table, 0.1, "seed 0")
     numbers = found.numbers
     assert (numbers["starts"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
     assert numbers["success"] == 0.97
@@ -119,7 +122,7 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
         part = starts_table([9.0] * lost + [1e-9] * (4 - lost), ["trapped"] * lost
                             + ["converged"] * (4 - lost))  # fmt: skip
         parts.append(part.assign(radius=radius))
-    found = told.findings(pd.concat(parts, ignore_index=True), 0.1, "seed 0")
+    found = told.robustness_findings(pd.concat(parts, ignore_index=True), 0.1, "seed 0")
     (said,) = [s for s in found.sentences if "All starts arrive" in s]
     assert "up to 10 % off" in said
     assert "50 %: 1 of 4" in said
@@ -128,11 +131,11 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
     assert list(basin["others recognised"]) == ["0 of 0", "0 of 0", "1 of 1", "0 of 0", "3 of 3"]
 
 
-def test_one_start_against_a_calculation_of_its_own(subject: Subject, folder: Path) -> None:
-    study = Robustness(starts=1, radii=(), strain_errors=(-0.5,))
+def test_one_start_against_a_calculation_of_its_own(subject: ImagePairSpec, folder: Path) -> None:
+    study = RobustnessStudy(starts=1, radii=(), strain_errors=(-0.5,))
     near, far = study.prepare(subject, folder)
     found = one_start(near, folder)
-    scene = Scene.open(folder, near["subject"])
+    scene = VirtualImagePair.open(folder, near["subject"])
     home = scene.correlate()
     start = scene.start()
     unit = np.random.default_rng([0, 0]).uniform(-1.0, 1.0, 7)
@@ -144,19 +147,19 @@ def test_one_start_against_a_calculation_of_its_own(subject: Subject, folder: Pa
     assert found["epsilon_percent"] == pytest.approx(epsilon, rel=1e-6, abs=1e-12)
     distance = np.linalg.norm(u - other) / np.sqrt(len(u))
     assert found["distance_px"] == pytest.approx(distance, rel=1e-6, abs=1e-12)
-    assert found["distance_px"] < told.SAME_PX < found["start_distance_px"]
+    assert found["distance_px"] < SAME_PX < found["start_distance_px"]
     assert one_start(far, folder)["start_distance_px"] > 1.0
 
 
 # -- noise --------------------------------------------------------------------------------
 
 
-def normal_pairs(bias: float = 0.0, told_by: float = 1.0, pairs: int = 400) -> Pairs:
+def normal_pairs(bias: float = 0.0, told_by: float = 1.0, pairs: int = 400) -> PairedErrors:
     """Errors at the bound, with a bias [bounds]; the bound differs from one to the next."""
     bound = np.array([1.0, 2.0, 5.0])
     noise = np.random.default_rng(1).normal(size=(pairs, 1, 3)) * np.array([1.0, -1.0])[:, None]
     errors = (noise + bias) * bound
-    return Pairs(errors, np.full(errors.shape, told_by) * bound, bound)
+    return PairedErrors(errors, np.full(errors.shape, told_by) * bound, bound)
 
 
 def test_statistics_of_errors_at_the_bound() -> None:
@@ -192,7 +195,7 @@ def test_the_same_errors_against_a_larger_bound() -> None:
 def test_what_no_noise_moves_does_not_count() -> None:
     pairs = normal_pairs()
     zero = np.zeros((400, 2, 2))
-    more = Pairs(np.concatenate([pairs.errors, zero], axis=2),
+    more = PairedErrors(np.concatenate([pairs.errors, zero], axis=2),
                  np.concatenate([pairs.told, zero], axis=2),
                  np.concatenate([pairs.bound, [0.0, 0.0]]))  # fmt: skip
     for name in ("ratio", "bias", "coverage"):
@@ -202,15 +205,15 @@ def test_what_no_noise_moves_does_not_count() -> None:
 
 
 def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
-    subject: Subject, folder: Path
+    subject: ImagePairSpec, folder: Path
 ) -> None:
     """And softer with one, if only a little where w is short against a speckle."""
-    scene = Scene.open(folder, subject.describe(folder, 0.128))
+    scene = VirtualImagePair.open(folder, subject.describe(folder, 0.128))
     result = scene.correlate()
-    seen = noise_causes.compared(scene, result, scene.pair())
+    seen = noise_causes.matched_images(scene, result, scene.pair())
     # Chosen at the end itself, not a step before it.
     assert seen.used.sum() == pytest.approx(result.pixels, rel=0.01)
-    explained = noise_causes.explained(seen, result)
+    explained = noise_causes.zero_residual(seen, result)
     left = result.residual(explained.reference, explained.deformed)[seen.used]
     assert np.abs(left).max() < 1e-6  # float32
     stiff, soft = (np.sqrt(np.diag(s.softness(result))) for s in (explained, seen))
@@ -220,10 +223,10 @@ def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
 
 
 def test_noise_study_on_tiny_images(
-    subject: Subject, folder: Path, monkeypatch: pytest.MonkeyPatch
+    subject: ImagePairSpec, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noise_causes, "EXAMPLES", 3)
-    study = Noise(levels=(0.002,), pairs=2)
+    study = NoiseStudy(levels=(0.002,), pairs=2)
     cases = study.prepare(subject, folder)
     assert len(cases) == 5
     rows = [{**case, "error": "", **one_realisation(case, folder)}
@@ -246,8 +249,8 @@ def test_noise_study_on_tiny_images(
 # -- systematic errors --------------------------------------------------------------------
 
 
-def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None:
-    study = Systematic(
+def test_systematic_study_on_tiny_images(subject: ImagePairSpec, folder: Path) -> None:
+    study = SystematicStudy(
         factors=("order", "gradient", "bits"),
         levels={"bits": (2, 10), "gradient": ("reference", "deformed")},
         seeds_of_speckle=(0,),
@@ -256,8 +259,14 @@ def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None
     factors = ["base", *["order"] * 3, *["gradient"] * 2, *["bits"] * 2]
     assert [c["factor"] for c in cases] == factors
     rows = [{**case, "error": "", **one_level(case, folder)} for case in cases]
-    kept = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if c["keep"]}
-    gone = {Scene.images_folder(folder, c["subject"]).is_dir() for c in cases if not c["keep"]}
+    kept = {
+        VirtualImagePair.images_folder(folder, c["subject"]).is_dir() for c in cases if c["keep"]
+    }
+    gone = {
+        VirtualImagePair.images_folder(folder, c["subject"]).is_dir()
+        for c in cases
+        if not c["keep"]
+    }
     assert (kept, gone) == ({True}, {False})
     found = report_systematic(study, pd.DataFrame(rows), folder)
     levels = found.tables["Every level"].set_index(["name", "level"])
@@ -272,7 +281,7 @@ def test_systematic_study_on_tiny_images(subject: Subject, folder: Path) -> None
 
 def test_every_factor_has_levels_that_can_be_set() -> None:
     case = StudyCase()
-    base = Setting(case.imaging, case.correlation)
+    base = StudySetting(case.imaging, case.correlation)
     for name, factor in FACTORS.items():
         changed = [factor.set(base, level) for level in factor.levels]
         assert len({repr(setting) for setting in changed}) == len(changed), name
@@ -299,9 +308,9 @@ def test_a_quick_study_is_smaller() -> None:
     for name in shipped_studies():
         case = read_study(name)
         assert case.quick().imaging.pixel_size == 2.0 * case.imaging.pixel_size
-    assert Robustness().quick().starts == 20
-    assert Noise().quick().pairs == 5
-    assert Systematic().quick().levels["v_degree"] == (2, 5, 8)
+    assert RobustnessStudy().quick().starts == 20
+    assert NoiseStudy().quick().pairs == 5
+    assert SystematicStudy().quick().levels["v_degree"] == (2, 5, 8)
 
 
 @pytest.mark.parametrize(
@@ -337,7 +346,9 @@ def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str)
     assert "\n" not in str(caught.value)
 
 
-def test_levels_out_of_range_are_told_before_anything_runs(subject: Subject, folder: Path) -> None:
+def test_levels_out_of_range_are_told_before_anything_runs(
+    subject: ImagePairSpec, folder: Path
+) -> None:
     for name, level, said in (
         ("order", 4.5, "whole numbers"),
         ("order", 4, "order 3, 5 or 11"),
@@ -346,19 +357,21 @@ def test_levels_out_of_range_are_told_before_anything_runs(subject: Subject, fol
         ("speckle_size", 0.0, "above 0 times"),
         ("fill_factor", 2.0, "fill factor in 0"),
     ):
-        study = Systematic(factors=(name,), levels={name: (level,)})
+        study = SystematicStudy(factors=(name,), levels={name: (level,)})
         with pytest.raises(InputError, match=said):
             study.prepare(subject, folder)
 
 
-def test_a_solution_of_another_experiment_is_not_taken(subject: Subject, tmp_path: Path) -> None:
+def test_a_solution_of_another_experiment_is_not_taken(
+    subject: ImagePairSpec, tmp_path: Path
+) -> None:
     name = subject.describe(tmp_path, 0.128)
     (tmp_path / "solution.h5").unlink()
     first = subject.solution.snapshots[0]
     other = replace(subject.solution, snapshots=(replace(first, nominal_strain=0.128),))
     other.write(tmp_path / "solution.h5")
     with pytest.raises(InputError, match="found another"):
-        Scene.open(tmp_path, name)
+        VirtualImagePair.open(tmp_path, name)
 
 
 # -- the command --------------------------------------------------------------------------
@@ -368,7 +381,7 @@ def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
     """Exit code of the ``modeharvest`` command."""
     monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main()
     return int(end.value.code or 0)
 
 
@@ -432,9 +445,9 @@ def test_a_case_has_one_thread(tmp_path: Path) -> None:
 def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which one of two starts failed, and none is left to be run."""
     assert PAPER is not None
-    case = StudyCase(study=Robustness(starts=2, radii=(), strain_errors=()))
+    case = StudyCase(study=RobustnessStudy(starts=2, radii=(), strain_errors=()))
     case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
-    pipeline = StudyPipeline(case, tmp_path, solution=PAPER)
+    pipeline = StudyAnalysis(case, tmp_path, solution=PAPER)
     cases = case.study.prepare(pipeline.subject(), tmp_path)
     plan = Campaign(case.study.function, cases, tmp_path)
     result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()

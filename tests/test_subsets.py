@@ -14,12 +14,18 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from modeharvest.errors import InputError, MissingDependencyError
-from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.fields.subset_sd import predicted_sd, speckle_area
-from modeharvest.idic.fields.subsets import WHERE, SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.subsets import (
+    WHERE,
+    SubsetOptions,
+    predicted_sd,
+    pyvale_python,
+    speckle_area,
+    subset_field,
+)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.errors import InputError, MissingDependencyError
 
 GRID = PixelGrid.centred(160, 200, 0.05)
 MASK = np.hypot(GRID.x[None, :] - 1.0, GRID.y[:, None]) > 1.2

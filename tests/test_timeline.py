@@ -9,9 +9,9 @@ import pytest
 from filling_mode import MASK, case
 from manufactured import GRID
 
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.validation.harvest.timeline import Moment, find_buckling, mean_strain
+from modeharvest.idic.slow_fields import Box
+from modeharvest.validation.onset import Moment, find_buckling, mean_strain
 
 CRITICAL = 0.091
 

@@ -9,19 +9,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.case import Case, TwinCase, read_case, shipped_solution
-from modeharvest.errors import InputError
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.harvest.experiment import read_experiment
-from modeharvest.harvest.twin import Twin, make_twin
-from modeharvest.imaging.calibration_target import CalibrationTarget
-from modeharvest.imaging.distortion.undistort import CameraDistortion
-from modeharvest.imaging.io import read_image
+from modeharvest.imaging.distortion.lens import CameraDistortion
+from modeharvest.imaging.distortion.target import CalibrationTarget
+from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
-from modeharvest.imaging.speckle import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
+from modeharvest.runs.case import Case, TwinCase, read_case, shipped_solution
+from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.twin import Twin, make_twin
+from modeharvest.util.errors import InputError
 
 LENS = CameraDistortion(200.0, 200.0, 60.0, 55.0, k1=-0.1, p1=0.005)
 STRAINS = (0.082, 0.127)
@@ -60,7 +60,7 @@ def test_a_user_has_photographs_and_what_a_user_knows(twin: Twin) -> None:
     names |= {"deformed_0820.tif", "deformed_1270.tif"}
     names |= {f"calibration_{k:02d}.tif" for k in range(3)}
     assert {path.name for path in folder.iterdir()} == names
-    found = read_experiment(twin.experiment)
+    found = read_photograph_case(twin.experiment)
     assert found.scale.pixel_size == CASE.imaging.pixel_size
     assert found.specimen.cell_size == CASE.experiment.specimen.pitch
     assert found.images.deformed == ("deformed_0820.tif", "deformed_1270.tif")

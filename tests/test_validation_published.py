@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from modeharvest.validation.published import expectations
+from modeharvest.validation.summary import expectations
 
 
 def snapshot(strain: float, **changes: Any) -> dict[str, Any]:

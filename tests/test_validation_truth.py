@@ -19,10 +19,9 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.validation import truth as truth_module
-from modeharvest.validation.metrics import describe
-from modeharvest.validation.outline import Outline
-from modeharvest.validation.truth import Comparison, best_fit, pattern_size
+from modeharvest.validation.truth import Comparison, best_fit, describe, pattern_size
 
 GRID = PixelGrid.centred(150, 130, 0.02)
 # The body that `manufactured.one_mode` is made for: a cellular part of 2.0 x 2.4 mm, l = 1 mm.
@@ -154,7 +153,7 @@ def ring(n: int = 16) -> Mesh:
     return Mesh(nodes, np.array(cells), "Q8")
 
 
-def area_of(outline: Outline, displacement: NDArray[np.float64] | None = None) -> float:
+def area_of(outline: MeshBoundary, displacement: NDArray[np.float64] | None = None) -> float:
     """Sum up the signed area inside the path; holes count negative."""
     zoom = 1e4  # curves are flattened to a fraction of a unit
     total = 0.0
@@ -165,7 +164,7 @@ def area_of(outline: Outline, displacement: NDArray[np.float64] | None = None) -
 
 
 def test_outline_finds_edge_and_hole_and_keeps_them_curved() -> None:
-    outline = Outline.of(ring())
+    outline = MeshBoundary.of(ring())
     assert sorted(len(loop) for loop in outline.loops) == [16, 16]
     # Parabolas through three points each, pi/16 apart, miss a circle's area by (pi/16)^4 / 30 or
     # so, 5e-5; straight chords would miss 6e-3.
@@ -174,7 +173,7 @@ def test_outline_finds_edge_and_hole_and_keeps_them_curved() -> None:
 
 def test_outline_moves_with_the_nodes() -> None:
     mesh = ring()
-    outline = Outline.of(mesh)
+    outline = MeshBoundary.of(mesh)
     moved = outline.path(np.full_like(mesh.nodes, 5.0)).get_extents()
     np.testing.assert_allclose([moved.x0, moved.x1], [3.0, 7.0], atol=0.01)
     assert area_of(outline, mesh.nodes) == pytest.approx(

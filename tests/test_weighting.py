@@ -13,23 +13,21 @@ from manufactured import PIXEL
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.errors import InputError
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.brightness import Brightness
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.correlate import CorrelationOptions, correlate
-from modeharvest.idic.estimating_equation import instrument, root
-from modeharvest.idic.gauss_newton import GaussNewtonOptions, Minimum, Outcome
-from modeharvest.idic.inputs import CheckedImages
-from modeharvest.idic.level_search import step_length
-from modeharvest.idic.noise_transfer import ImageNoise
-from modeharvest.idic.normal_equations import Assembly
-from modeharvest.idic.pyramid import FULL, prepare
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.pair import CheckedImages
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import brought_back
-from modeharvest.idic.weighting import Gradient, Weighting, best_blur
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box, Brightness
+from modeharvest.idic.solver.assembly import Assembly, warped_back
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, Outcome
+from modeharvest.idic.solver.level_search import step_length
+from modeharvest.idic.solver.pyramid import FULL, level_pair
+from modeharvest.idic.solver.weighting import Gradient, Weighting, best_blur, instrument, root
+from modeharvest.idic.uncertainty.noise import ImageNoise
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.interpolation import SplineImage
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
@@ -57,7 +55,7 @@ def test_the_deformed_image_itself_as_the_instrument_changes_nothing() -> None:
     f, g = (image.astype(np.float32) for image in pair())
     spline, used = SplineImage.of(g), Assembly(ANSATZ, GRID, MASK)
     a = ANSATZ.start(0.028)
-    given = brought_back(used, a, f, spline)
+    given = warped_back(used, a, f, spline)
     own, same = used.images(a, f, spline), used.images(a, f, spline, instrument=given)
     # float32 slopes, of which 10^4 are summed.
     np.testing.assert_allclose(same.matrix, own.matrix, rtol=1e-5, atol=1e-7 * own.matrix.max())
@@ -69,7 +67,7 @@ def steps_to_the_truth(weighting: Weighting) -> int:
     """Go to the root from unknowns that are 0.3 px off; returns in how many steps."""
     f, g = pair()
     images = CheckedImages.checked(f, g, GRID, MASK, None)
-    level = prepare(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    level = level_pair(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
     used = Assembly(ANSATZ, GRID, level.mask)
     a = truth() + 0.002 * np.random.default_rng(4).normal(size=ANSATZ.size)
     length = step_length(ANSATZ, GRID, level.mask, 1)
@@ -98,7 +96,7 @@ def test_exact_images_have_their_root_at_the_truth(gradient: Gradient, blur_px: 
 def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> None:
     f, g = pair()
     images = CheckedImages.checked(f, g, GRID, MASK, None)
-    level = prepare(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    level = level_pair(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
     used = Assembly(ANSATZ, GRID, level.mask)
     of_f, of_g = (instrument(Weighting(gradient), images, level, used, truth())[:2, level.mask]
                   for gradient in (Gradient.REFERENCE, Gradient.DEFORMED))  # fmt: skip
@@ -363,7 +361,7 @@ def test_a_root_that_is_not_found_is_told() -> None:
     """Weights that have nothing to do with the images lead nowhere."""
     f, g = pair()
     used = Assembly(ANSATZ, GRID, MASK)
-    level = prepare(f, g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    level = level_pair(f, g, GRID, MASK, None, FULL, edge_px=2, order=5)
     here = used.images(truth(), level.reference, level.deformed)
     noise = np.random.default_rng(1).normal(size=(3, *GRID.shape)).astype(np.float32)
     found = root(

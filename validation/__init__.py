@@ -1,1 +1,1 @@
-"""How wrong a measurement was, and why."""
+"""Validation: how far measurements are from the truth, and why."""

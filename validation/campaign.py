@@ -1,13 +1,11 @@
 """Campaigns: one function for a grid of cases, run by workers, each case stored when it is done.
 
-A case is a mapping of plain values, its seed among them. What becomes of it is written, whole or
+A case is a mapping of plain values, its seed among them. Its outcome is written, whole or
 not at all, by the worker that ran it, to ``cases/KEY.json`` with KEY the digest of the function's
 name, the case and modeharvest's code: a campaign that is killed goes on where it was, an
 option that is changed makes anew what it touches and nothing else, and results of other
 code are never mixed with this one's. A case that fails is stored with its traceback, and the
 rest goes on.
-
-Workers are processes of dask.distributed: of this machine, or of any scheduler by its address.
 """
 
 from __future__ import annotations
@@ -22,12 +20,13 @@ from typing import Any
 
 import pandas as pd
 
-from modeharvest.errors import InputError
-from modeharvest.files import atomic, require_writable
-from modeharvest.progress import Progress, silent
-from modeharvest.stages import exclusive
-from modeharvest.validation.case_run import (
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, require_writable
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import exclusive, source_digest
+from modeharvest.validation.workers import (
     Case,
+    Workers,
     named,
     read_result,
     result_path,
@@ -35,10 +34,6 @@ from modeharvest.validation.case_run import (
     store,
     stored,
 )
-from modeharvest.validation.workers import Workers
-from modeharvest.versions import source_digest
-
-__all__ = ["Campaign", "Case", "Workers", "grid"]
 
 _KILLED = "KilledWorker: its workers died; it may need more memory than they are given"
 _ATTEMPTS = 3

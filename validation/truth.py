@@ -1,37 +1,77 @@
-"""The parts of a measurement's error, kept apart.
+"""The error of a measurement against a known displacement, in parts and in numbers.
 
 u_true - u_idic is what the paper calls the microfluctuation field w. It has two parts:
 
-* u_true - u_best, what the ansatz can't say: ``best`` is its best possible fit to the truth;
-* u_best - u_idic, what the measurement loses on top of that.
+* u_true - u_best, the model (ansatz) error: ``best`` is the ansatz' best possible fit to the truth;
+* u_best - u_idic, the measurement error on top of that.
 
-The grey-level residual is what remains visible of all this in the images.
+The grey-level residual is what remains visible of all this in the images. "rms" in this project is
+*per component*: the root of the mean square over both components of all pixels, as grey-level noise
+or the noise of a local DIC is quoted. The rms of the vectors' length is sqrt(2) times that.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.gauss_newton import GaussNewtonOptions
-from modeharvest.idic.normal_equations import Assembly
 from modeharvest.idic.result import Result
-from modeharvest.idic.warp import residual
+from modeharvest.idic.solver.assembly import Assembly, residual
+from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.imaging.interpolation import SplineImage
-from modeharvest.progress import Progress, silent
-from modeharvest.validation.metrics import lengths
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.progress import Progress, silent
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+
+def lengths(field: FloatArray) -> FloatArray:
+    """(...) Euclidean lengths of the vectors of a field (..., 2)."""
+    x, y = field[..., 0], field[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
+
+
+def describe(field: FloatArray, mask: BoolArray, unit: float = 1.0) -> dict[str, Any]:
+    """Bias, rms, percentiles and maximum of a vector field.
+
+    Parameters
+    ----------
+    field
+        (rows, cols, 2).
+    mask
+        (rows, cols) True where the field counts.
+    unit
+        The size of the unit to give the numbers in, e.g. the pixel size [mm/px] to turn a
+        field in mm into px.
+
+    Returns
+    -------
+    dict
+        ``mean`` and ``rms`` as (x, y); ``rms_per_component``; ``rms_length``, ``median_length``,
+        ``p95_length`` and ``max_length`` of the vectors' Euclidean length.
+    """
+    x, y = (field[..., c][mask] / unit for c in (0, 1))
+    mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
+    length = np.sqrt(x * x + y * y)
+    median, p95, largest = np.quantile(length, (0.5, 0.95, 1.0), overwrite_input=True)
+    return {
+        "mean": [float(x.mean()), float(y.mean())],
+        "rms": [math.sqrt(square) for square in mean_squares],
+        "rms_per_component": math.sqrt(0.5 * sum(mean_squares)),
+        "rms_length": math.sqrt(sum(mean_squares)),
+        "median_length": float(median),
+        "p95_length": float(p95),
+        "max_length": float(largest),
+    }
+
 
 _ENOUGH = 40_000
 """Pixels of material that tell one minimum of the best fit from another."""

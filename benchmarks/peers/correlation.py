@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from pairs import ImagePair, inside_the_ansatz, paper
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import CorrelationOptions, correlate, fit_displacement
+from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions
 
 FloatArray = NDArray[np.float64]
 

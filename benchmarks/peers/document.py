@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from modeharvest.files import atomic
+from modeharvest.util.files import atomic
 
 END = "<!-- end -->"
 

@@ -12,7 +12,7 @@ import riley_side
 from laps import in_turn, use_threads
 from meshes import ELEMENTS, Scene, aligned, bulged, specimen
 
-from modeharvest.imaging.isoparametric import locate, map_back
+from modeharvest.imaging.mapping.isoparametric import locate, map_back
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:

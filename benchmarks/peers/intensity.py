@@ -15,9 +15,9 @@ from meshes import Scene, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.imaging.isoparametric import interpolate, locate
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate
 from modeharvest.imaging.render import render_image
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.case import shipped_solution
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.case import shipped_solution
 
 FloatArray = NDArray[np.float64]
 

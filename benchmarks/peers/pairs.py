@@ -13,16 +13,15 @@ import numpy as np
 from meshes import STRAIN
 from numpy.typing import NDArray
 
-from modeharvest.case import Case, shipped_solution
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.fourier import FourierMode, square_family
-from modeharvest.idic.pyramid import eroded
-from modeharvest.idic.support import Taper
+from modeharvest.idic.modes import FourierMode, Taper, square_family
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.runs.case import Case, shipped_solution
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

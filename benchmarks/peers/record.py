@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from modeharvest.files import write_json
+from modeharvest.util.files import write_json
 
 PACKAGES = ("riley-raster", "pyxel-dic", "numpy", "scipy", "numba", "finufft")
 CODE = ("fem/field.py", "imaging/**/*.py", "idic/**/*.py", "benchmarks/peers/*.py")

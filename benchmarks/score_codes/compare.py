@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from modeharvest.case import read_case, shipped_solution
-from modeharvest.errors import InputError, MissingDependencyError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.fields.files import write_field
-from modeharvest.idic.fields.local_field import sampled_field
-from modeharvest.idic.fields.subsets import WHERE, SubsetOptions, subset_field
-from modeharvest.idic.setup import Identification
+from modeharvest.idic.local.field import sampled_field, write_field
+from modeharvest.idic.local.subsets import WHERE, SubsetOptions, subset_field
+from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.io import read_image, read_mask
-from modeharvest.scoring import grade, make_benchmark, print_grading, truth_folder
+from modeharvest.imaging.photographs.files import read_image, read_mask
+from modeharvest.report.terminal import print_grading
+from modeharvest.runs.benchmark import grade, make_benchmark, truth_folder
+from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.util.errors import InputError, MissingDependencyError
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parents[1] / "out" / "score_codes"
@@ -73,7 +73,7 @@ class Task:
 
 def idic(task: Task, field: Path, codes: str) -> None:
     """Micromorphic IDIC with the paper's ansatz and start: it knows where the holes are."""
-    how = Identification()
+    how = SquareLatticeOptions()
     ansatz = how.ansatz(Specimen())
     found = correlate(
         task.reference, task.deformed, task.grid, ansatz, how.start(ansatz, task.strain),

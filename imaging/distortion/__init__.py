@@ -1,1 +1,1 @@
-"""Optical distortion: kinds of lenses, their exact inverses, images freed from them."""
+"""Optical distortion: kinds of lenses, their exact inverses, undistorted images, calibration."""

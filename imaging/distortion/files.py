@@ -17,15 +17,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from modeharvest.errors import InputError
-from modeharvest.files import read_json, write_json
-from modeharvest.imaging.distortion.undistort import (
+from modeharvest.imaging.distortion.lens import (
     CameraDistortion,
     PolynomialDistortion,
     SampledDistortion,
 )
-from modeharvest.reading import reading
-from modeharvest.typed import made
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, reading, write_json
+from modeharvest.util.typed import made
 
 AnyDistortion = PolynomialDistortion | CameraDistortion | SampledDistortion
 

@@ -1,30 +1,28 @@
-"""Images freed from an optical distortion, and the kinds of distortion.
+"""Images freed from an optical distortion, ideal points of distorted pixels, affine parts.
 
 f(phi_S(x)) of the paper's Eq. (r2) is :func:`undistorted`: each image is resampled once on the
 ideal pixel grid, and a correlation of such images needs to know nothing of the lens.
+
+Photographs of a target under unknown shifts look the same for phi_S and for phi_S after any affine
+map A, because A turns shifts into shifts. So :func:`affine_aside` compares two distortions after
+the A that brings them nearest to each other; with S of 15 px over 1000 px, to subtract the affine
+part of S itself would be wrong by some tenths of a px.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.distortion.camera import CameraDistortion
-from modeharvest.imaging.distortion.mapping import Distortion
-from modeharvest.imaging.distortion.polynomial import PolynomialDistortion
-from modeharvest.imaging.distortion.sampled import SampledDistortion
-from modeharvest.imaging.interpolation import SplineImage
-
-__all__ = [
-    "CameraDistortion",
-    "PolynomialDistortion",
-    "SampledDistortion",
-    "undistorted",
-    "undistorted_mask",
-]
-
-FloatArray = NDArray[np.float64]
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
 _BAND = 64
 """Rows that are resampled in one go."""
@@ -56,7 +54,7 @@ def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDA
     rows, cols = spline.shape
     result = np.empty(spline.shape, dtype=np.float32)
     for first in range(0, rows, _BAND):
-        row, col = _seen_from(distortion, spline.shape, slice(first, first + _BAND))
+        row, col = _observed_from(distortion, spline.shape, slice(first, first + _BAND))
         np.clip(row, 0, rows - 1, out=row)
         np.clip(col, 0, cols - 1, out=col)
         result[first : first + _BAND] = spline.sample(row, col)[0]
@@ -86,17 +84,120 @@ def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool
     result = np.zeros(inside.shape, dtype=np.bool_)
     for first in range(0, rows, _BAND):
         band = slice(first, first + _BAND)
-        row, col = _seen_from(distortion, inside.shape, band)
+        row, col = _observed_from(distortion, inside.shape, band)
         kept = (row >= 0) & (row <= rows - 1) & (col >= 0) & (col <= cols - 1)
         i, j = (np.rint(a[kept]).astype(np.intp) for a in (row, col))
         result[band][kept] = inside[i, j]
     return result
 
 
-def _seen_from(
+def _observed_from(
     distortion: Distortion, shape: tuple[int, ...], band: slice
 ) -> tuple[FloatArray, FloatArray]:
     """phi_S at the pixels of some rows."""
     row = np.arange(shape[0], dtype=np.float64)[band, None]
     col = np.arange(shape[1], dtype=np.float64)[None, :]
     return distortion.observed(row, col)
+
+
+Positions = tuple[FloatArray, FloatArray]
+
+_DEGREE = 9
+_NEGLIGIBLE_PX = 1e-12
+_STRIP = 64  # rows that a thread takes at a time
+
+
+def seen_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
+    """(row, col), each (rows, cols) [px]: the ideal positions that an image's pixels show.
+
+    Raises
+    ------
+    InputError
+        If the distortion folds in the image.
+    """
+    row, col = np.ogrid[: shape[0], : shape[1]]
+    strips = [slice(k, k + _STRIP) for k in range(0, shape[0], _STRIP)]
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        found = list(pool.map(lambda strip: distortion.ideal(row[strip], col), strips))
+    return np.concatenate([r for r, _ in found]), np.concatenate([c for _, c in found])
+
+
+def without_affine(distortion: Distortion, shape: tuple[int, int]) -> PolynomialDistortion:
+    """The same distortion without its affine part, as a polynomial.
+
+    The terms 1, xi, eta of its Chebyshev series over the image are left out, and those of the
+    highest degrees where they are negligible; exact for lenses that are polynomials of degree 9
+    or less (those of k1 ... k3, p1, p2).
+
+    Parameters
+    ----------
+    distortion
+        Of any kind.
+    shape
+        (rows, cols) of the images [px].
+    """
+    nodes = chebyshev.chebpts1(_DEGREE + 1)
+    row, col = (0.5 * (n - 1) * (1.0 + nodes) for n in shape)
+    fields = distortion.shift(row[:, None], col[None, :])
+    transform = chebyshev.chebvander(nodes, _DEGREE) * 2.0 / (_DEGREE + 1)
+    transform[:, 0] *= 0.5
+    series = [transform.T @ np.broadcast_to(f, (nodes.size,) * 2) @ transform for f in fields]
+    orders = PolynomialDistortion.orders(_DEGREE)
+    coefficients = np.array([[s[j, i] for i, j in orders] for s in series])
+    coefficients[:, :3] = 0.0
+    degree = max(
+        (i + j for (i, j), c in zip(orders, coefficients.T, strict=True)
+         if np.abs(c).max() > _NEGLIGIBLE_PX),
+        default=0,
+    )  # fmt: skip
+    return PolynomialDistortion(shape, coefficients[:, : PolynomialDistortion.size_of(degree)])
+
+
+_LINES = 33
+"""Of the grid on which distortions are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class AffineAside:
+    """The difference of two distortions whose affine parts don't count.
+
+    Parameters
+    ----------
+    rms_px, largest_px
+        Over the image: rms per component; largest length [px].
+    difference
+        (2, 33, 33) phi_found(x) - phi_truth(A x), along rows and columns, on an even grid over
+        the image [px].
+    matrix, offset
+        (2, 2), (2,) of A x = matrix x + offset, x = (row, col) [px].
+    """
+
+    rms_px: float
+    largest_px: float
+    difference: FloatArray
+    matrix: FloatArray
+    offset: FloatArray
+
+
+def affine_aside(found: Distortion, truth: Distortion, shape: tuple[int, int]) -> AffineAside:
+    """Compare two distortions over an image of ``shape`` (rows, cols) [px], affine part aside."""
+    axes = [np.linspace(0.0, n - 1.0, _LINES) for n in shape]
+    row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    seen = np.stack(found.observed(row, col))
+    terms = np.stack([np.ones(row.size), row, col])
+    affine = np.eye(2, 3, 1)
+    for _ in range(6):  # Gauss-Newton, from the identity
+        at = affine @ terms
+        misfit = np.stack(truth.observed(*at)) - seen
+        slope = truth.gradient(*at) + np.eye(2)[:, :, None]
+        columns = np.einsum("ijn,kn->injk", slope, terms).reshape(2 * row.size, 6)
+        step = np.linalg.lstsq(columns, -misfit.ravel(), rcond=None)[0]
+        affine = affine + step.reshape(2, 3)
+    misfit = seen - np.stack(truth.observed(*(affine @ terms)))
+    return AffineAside(
+        rms_px=float(np.sqrt(np.mean(misfit**2))),
+        largest_px=float(np.hypot(*misfit).max()),
+        difference=misfit.reshape(2, _LINES, _LINES),
+        matrix=affine[:, 1:],
+        offset=affine[:, 0],
+    )

@@ -1,1 +1,1 @@
-"""Files of a camera: read, turned to grey, judged."""
+"""Files of images and photographs: read, turned to grey, checked."""

@@ -1,4 +1,4 @@
-"""Photographs as a camera leaves them: read, turned to grey, and judged one by one.
+"""Photographs as a camera leaves them: read, turned to grey, and checked one by one.
 
 Grey levels stay counts. Whole-number TIFF (8 and 16 bit, 10 to 14 bits stored in 16 included),
 float TIFF, PNG and JPEG are read; what was changed on the way is said in ``Photograph.notes``.
@@ -18,11 +18,9 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.imaging.photographs.image_files import Stored, read_stored
-
-FloatImage = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
+from modeharvest.imaging.photographs.files import StoredImage, read_stored
+from modeharvest.util.arrays import BoolArray, FloatImage
+from modeharvest.util.errors import InputError
 
 LUMA = (0.2125, 0.7154, 0.0721)
 """Weights of red, green and blue in a grey level."""
@@ -229,7 +227,7 @@ def pixel_size(first: tuple[float, float], second: tuple[float, float], length_m
     return length_mm / distance
 
 
-def _without_alpha(stored: Stored) -> NDArray[Any]:
+def _without_alpha(stored: StoredImage) -> NDArray[Any]:
     """(rows, cols) grey or (rows, cols, 3) colour."""
     levels = stored.levels
     if levels.ndim == 3 and levels.shape[2] in (1, 2):

@@ -1,4 +1,4 @@
-"""A series of photographs of one test: do they belong together, and which frames are damaged."""
+"""A series of photographs of one test: do they belong together, which frames are damaged."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
 from modeharvest.imaging.photographs.photograph import Photograph, read_photograph, require_usable
-
-BoolArray = NDArray[np.bool_]
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.errors import InputError
 
 _OTHER_SCALE = 4.0
 """Ratio of two frames' bright levels from which on they can't be of one bit depth."""
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedFrame:
     """A frame of a series that can't be used.
 
     Parameters
@@ -83,7 +81,7 @@ def read_frame(path: Path | str, reference: Photograph) -> Photograph:
 
 def usable_frames(
     paths: Sequence[Path | str], reference: Photograph
-) -> tuple[tuple[Path, ...], tuple[Skipped, ...]]:
+) -> tuple[tuple[Path, ...], tuple[SkippedFrame, ...]]:
     """Look at all frames, one at a time, and split them into those to use and those to skip.
 
     Returns
@@ -96,7 +94,7 @@ def usable_frames(
         try:
             read_frame(path, reference)
         except InputError as error:
-            skipped.append(Skipped(number, path, str(error)))
+            skipped.append(SkippedFrame(number, path, str(error)))
         else:
             good.append(path)
     return tuple(good), tuple(skipped)

@@ -1,12 +1,14 @@
 """``python -m modeharvest`` and the ``modeharvest`` command."""
 
+from __future__ import annotations
+
 import sys
 
 
 def start() -> None:
     """Load the command line and run it; Ctrl-C may come before there is anything to catch it."""
     try:
-        from modeharvest.cli import main
+        from modeharvest.cli.root import main
     except KeyboardInterrupt:
         sys.exit(130)
     main()

@@ -1,1 +1,1 @@
-"""Resolution: how fine a structure a measurement still shows, and what noise that costs."""
+"""Spatial resolution: how fine a displacement a measurement resolves, and at what noise."""

@@ -1,4 +1,4 @@
-"""How much of the star's wave a measured field holds, period by period, and where 10 % are lost.
+"""Attenuation of the star's wave in a measured field, period by period, and where it is 10 %.
 
 At every column the returned displacements are set against the true ones by least squares through
 the origin: their slope is the share of the wave that is left, T. Along the centre row alone that is
@@ -14,16 +14,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.errors import InputError
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
 from modeharvest.validation.resolution.star import Star
 from modeharvest.validation.resolution.transfer import KEPT
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _WIDTH = 0.35
 """Half width of the local regression, in the logarithm of the period."""

@@ -1,4 +1,4 @@
-"""A buckled specimen whose motion is a formula, with a small wave on top, exactly imaged.
+"""An analytic motion of a buckled specimen with a small wave added, exactly imaged.
 
 The base is a homogeneous strain and one pattern of even amplitude, which an ansatz of any degree
 describes; what an ansatz makes of the wave is what is asked.
@@ -6,22 +6,110 @@ describes; what an ansatz makes of the wave is what is asked.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy import ndimage
 
-from modeharvest.errors import InputError
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.setup import Identification
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import CorrelationOptions, SquareLatticeOptions
+from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.stages import digest
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+SPACING = 0.2
+
+_SPARSE = 2
+
+
+@dataclass(frozen=True)
+class ResolutionSpec:
+    """What a resolution study measures.
+
+    Parameters
+    ----------
+    buckled
+        The base motion and its images.
+    measured
+        Degrees of v0 and v1 that images are measured with.
+    amplitude_px
+        Of a wave [px].
+    noise
+        Standard deviation in each image [fraction of full scale].
+    """
+
+    buckled: BuckledMotion
+    measured: tuple[int, ...]
+    amplitude_px: float
+    noise: float
+
+    def write(self, folder: Path) -> str:
+        """Leave it for workers; returns its name."""
+        content = asdict(self)
+        name = digest(content)[:16]
+        write_json(folder / "subjects" / f"{name}.json", content)
+        return name
+
+    @classmethod
+    def read(cls, folder: Path, name: str) -> ResolutionSpec:
+        """What :meth:`write` left; one worker keeps it, and its images, between cases."""
+        return _resolution_spec(folder, name)
+
+    @property
+    def points(self) -> FloatArray:
+        """(m, 2) points of the material at which fields are compared [mm]."""
+        width, height = self.buckled.specimen.half_size
+        x, y = (np.arange(-half + 0.5 * SPACING, half, SPACING) for half in (width, height))
+        grid = np.stack(np.meshgrid(x, y), axis=-1)
+        return np.asarray(grid[self.buckled.material(grid[..., 0], grid[..., 1])])
+
+    @property
+    def sparse(self) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """(k, 2) fewer of them, and (k,) which of those lie in the cellular part."""
+        some = self.points[::_SPARSE]
+        a, b = self.buckled.specimen.cellular_half_size
+        return some, (np.abs(some[:, 0]) <= a) & (np.abs(some[:, 1]) <= b)
+
+    def ansatz(self, degree: int, motion: str) -> Ansatz:
+        """The paper's at a degree; without a pattern its mode is held."""
+        return self.buckled.ansatz(degree, degree, hold_mode=motion == "still")
+
+    def start(self, degree: int, motion: str) -> FloatArray:
+        """The base motion, or none."""
+        ansatz = self.ansatz(degree, motion)
+        if motion == "still":
+            return np.zeros(ansatz.size)
+        return ansatz.start(self.buckled.strain, self.buckled.pattern)
+
+    def correlate(self, pair: AnalyticPair, degree: int, motion: str) -> Result:
+        """Measure a pair from what is nearly its motion, on the full images."""
+        options = CorrelationOptions(
+            (Level(1, 0.0),), self.buckled.how.edge_px, self.buckled.how.order
+        )
+        return correlate(
+            pair.f, pair.g, self.buckled.grid, self.ansatz(degree, motion),
+            self.start(degree, motion), pair.mask, pair.deformed_mask, options,
+        )  # fmt: skip
+
+
+_ADAPTER = TypeAdapter(ResolutionSpec)
+
+
+@lru_cache(maxsize=1)
+def _resolution_spec(folder: Path, name: str) -> ResolutionSpec:
+    return _ADAPTER.validate_python(read_json(folder / "subjects" / f"{name}.json"))
+
 
 _MARGIN = 0.03
 """Background around the specimen, as a share of its larger side."""
@@ -35,7 +123,7 @@ _ENOUGH_PX = 1e-6
 
 
 @dataclass(frozen=True)
-class Wave:
+class AddedWave:
     """A small wave of v0 or of v1.
 
     Parameters
@@ -71,7 +159,7 @@ class Wave:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class AnalyticPair:
     """Two images and where they show material, (rows, cols) each."""
 
     f: NDArray[np.float32]
@@ -79,14 +167,14 @@ class Pair:
     mask: BoolArray
     deformed_mask: BoolArray
 
-    def noisy(self, level: float, rng: np.random.Generator) -> Pair:
+    def noisy(self, level: float, rng: np.random.Generator) -> AnalyticPair:
         """The pair with white noise of that standard deviation in both images."""
         n = rng.normal(scale=level, size=(2, *self.f.shape)).astype(np.float32)
-        return Pair(self.f + n[0], self.g + n[1], self.mask, self.deformed_mask)
+        return AnalyticPair(self.f + n[0], self.g + n[1], self.mask, self.deformed_mask)
 
 
 @dataclass(frozen=True, eq=False)
-class Inverse:
+class InverseMotion:
     """Where deformed pixels come from.
 
     Parameters
@@ -106,7 +194,7 @@ class Inverse:
 
 
 @dataclass(frozen=True)
-class Buckled:
+class BuckledMotion:
     """A base motion and how it is imaged and correlated.
 
     Parameters
@@ -126,7 +214,7 @@ class Buckled:
     """
 
     specimen: Specimen
-    how: Identification
+    how: SquareLatticeOptions
     speckle: SpeckleSpec
     pixel_size: float
     strain: float
@@ -169,7 +257,7 @@ class Buckled:
         inside = (np.abs(x) <= width) & (np.abs(y) <= height)
         return np.asarray(inside & (np.hypot(dx, dy) > 0.5 * s.diameters[hole]))
 
-    def wave_at(self, wave: Wave, points: FloatArray) -> FloatArray:
+    def wave_at(self, wave: AddedWave, points: FloatArray) -> FloatArray:
         """(..., 2) displacement of a wave at points (..., 2) [mm]."""
         size = wave.amplitude * wave.shape(points)[..., None]
         if wave.part == "v0":
@@ -181,7 +269,7 @@ class Buckled:
         ansatz, a = self.truth
         return ansatz.phi(0, a, points[..., None, 0], points[..., None, 1])[..., 0, :]
 
-    def displacement(self, points: FloatArray, wave: Wave | None = None) -> FloatArray:
+    def displacement(self, points: FloatArray, wave: AddedWave | None = None) -> FloatArray:
         """(..., 2) base and wave at points (..., 2) [mm]."""
         height = np.full(points.shape[:-1], self.pattern)
         if wave is not None and wave.part == "v1":
@@ -192,7 +280,7 @@ class Buckled:
             u[..., wave.axis] += wave.amplitude * wave.shape(points)
         return np.asarray(u)
 
-    def images(self, wave: Wave | None = None) -> Pair:
+    def images(self, wave: AddedWave | None = None) -> AnalyticPair:
         """Exact images before and after the motion."""
         grid = self.grid
         speckle = Speckle(self.speckle, grid.shape)
@@ -208,17 +296,17 @@ class Buckled:
         g = np.zeros(grid.shape, dtype=np.float32)
         g[deformed_mask] = speckle(*grid.to_px(*point[inside].T))
         f = np.where(mask, speckle.image(), 0.0).astype(np.float32)
-        return Pair(f, g, mask, deformed_mask)
+        return AnalyticPair(f, g, mask, deformed_mask)
 
-    def still(self) -> Pair:
+    def still(self) -> AnalyticPair:
         """The image before the motion, twice."""
         mask = self.material(self.grid.x[None, :], self.grid.y[:, None])
         image = Speckle(self.speckle, self.grid.shape).image()
         f = np.where(mask, image, 0.0).astype(np.float32)
-        return Pair(f, f, mask, mask)
+        return AnalyticPair(f, f, mask, mask)
 
     @cached_property
-    def _base(self) -> Inverse:
+    def _base(self) -> InverseMotion:
         """Of the base, by fixed-point iteration and Newton's method."""
         at = np.stack(np.meshgrid(self.grid.x, self.grid.y), axis=-1)
         point = at
@@ -231,10 +319,10 @@ class Buckled:
             slope = np.asarray(np.linalg.inv(self._gradient(point)), dtype=np.float64)
             error = point + self.displacement(point) - at
             point = point - (slope @ error[..., None])[..., 0]
-        found = Inverse(near, at, point, slope)
+        found = InverseMotion(near, at, point, slope)
         return replace(found, points=self._improved(found, None))
 
-    def _improved(self, base: Inverse, wave: Wave | None) -> FloatArray:
+    def _improved(self, base: InverseMotion, wave: AddedWave | None) -> FloatArray:
         """(n, 2) X from near ones, by steps of one slope."""
         point = base.points
         for _ in range(_STEPS):

@@ -1,30 +1,116 @@
-"""Codes graded on the star: finest period, noise floor, metrological efficiency indicator.
+"""Grades on the star: finest period, noise floor, metrological efficiency indicator.
 
     l10    the period at which 10 % of the amplitude are lost [px]
     n      standard deviation of v between two images without motion [px]
     n l10  the indicator [px^2]; the less, the better
 
-A larger subset raises l10 as its edge w and lowers n as 1/w, so that the indicator tells a code and
+A larger subset raises l10 as its edge w and lowers n as 1/w, so that the indicator rates a code and
 its shape functions rather than the choice of w. Sources: M. Grédiac, B. Blaysat, F. Sur, Exp. Mech.
 57 (2017) 871, doi 10.1007/s11340-017-0279-x; P. L. Reu et al., doi 10.1007/s11340-021-00806-6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from modeharvest.errors import InputError
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.star import Star
+from modeharvest.validation.resolution.star import Star, StarSet
 from modeharvest.validation.resolution.transfer import KEPT
 
-FloatArray = NDArray[np.float64]
+RESOLUTION_FORMAT = "modeharvest-resolution-1"
+
+GRADE_COLUMNS = {
+    "l10 [px]": "finest_px",
+    "± l10 [px]": "finest_se_px",
+    "n [px]": "noise_px",
+    "± n [px]": "noise_se_px",
+    "n l10 [px²]": "indicator_px2",
+    "± n l10 [px²]": "indicator_se_px2",
+    "l10, centre row [px]": "challenge_px",
+    "ripple [%]": "ripple_percent",
+    "left at the longest [%]": "left_percent",
+    "points": "points",
+    "returned [%]": "returned_percent",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StarGrading:
+    """Codes graded on a star set, the best first; and why others were not."""
+
+    star_set: StarSet
+    grades: tuple[StarGrade, ...]
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know, in sentences."""
+        told = [f"not graded: {why}" for why in self.refused.values()]
+        return [*told, *(note for grade in self.grades for note in grade.notes)]
+
+
+def grade_numbers(grade: StarGrade) -> dict[str, Any]:
+    """A code's grade as plain values, units in the names; None where not known."""
+    found, noise = grade.attenuation, grade.noise
+    row: dict[str, Any] = {
+        "name": grade.name,
+        "finest_px": found.finest_px,
+        "finest_se_px": found.finest_se_px,
+        "safe_px": found.safe_px,
+        "challenge_px": found.challenge_px,
+        "noise_px": np.nan if noise is None else noise.v_px,
+        "noise_se_px": np.nan if noise is None else noise.v_se_px,
+        "indicator_px2": grade.indicator_px2,
+        "indicator_se_px2": grade.indicator_se_px2,
+        "ripple_percent": 100.0 * found.ripple,
+        "left_percent": 100.0 * found.at(float(found.period[-1])),
+        "points": grade.moved.x.size,
+        "returned_percent": 100.0 * grade.moved.valid_share,
+        "shortest_px": float(found.period[0]),
+        "longest_px": float(found.period[-1]),
+    }
+    return {key: _none_for_nan(value) for key, value in row.items()}
+
+
+def star_summary(grading: StarGrading) -> dict[str, Any]:
+    """The content of ``resolution.json``: codes, the best first, and their curves."""
+    codes = []
+    for grade in grading.grades:
+        found = grade.attenuation
+        share, error = found.curve
+        curve = {"period_px": found.period, "left": share, "standard_error": error}
+        codes.append({
+            **grade_numbers(grade),
+            "noise": None if grade.noise is None else asdict(grade.noise),
+            "curve": {k: [_none_for_nan(float(v)) for v in values] for k, values in curve.items()},
+        })  # fmt: skip
+    star_set = grading.star_set
+    return {"format": RESOLUTION_FORMAT, "benchmark": star_set.id, "spec": star_set.info["spec"],
+            "codes": codes, "remarks": grading.notes}  # fmt: skip
+
+
+def star_csv_lines(grades: Sequence[StarGrade]) -> Iterator[str]:
+    """The table as CSV."""
+    yield ",".join(["name", *GRADE_COLUMNS])
+    for grade in grades:
+        row = grade_numbers(grade)
+        values = [row[key] for key in GRADE_COLUMNS.values()]
+        cells = ["" if v is None else f"{v:.6g}" for v in values]
+        yield ",".join([f'"{grade.name}"', *cells])
+
+
+def _none_for_nan(value: Any) -> Any:
+    """NaN as None, which JSON knows."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
 
 _PARTS = 10
 """Stretches of the image whose scatters tell how sure the noise floor is."""
@@ -170,7 +256,7 @@ class StarGrade:
         return tuple(said)
 
 
-def ranked(grades: Sequence[StarGrade]) -> list[StarGrade]:
+def ranked_grades(grades: Sequence[StarGrade]) -> list[StarGrade]:
     """The best first: by the indicator; then those without one, by l10."""
 
     def key(grade: StarGrade) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The star pattern of DIC Challenge 2.0: a wave whose period grows along the image, exactly imaged.
+"""The star pattern of DIC Challenge 2.0: its motion, its exact images, and the image set.
 
 With the row i down and the column j, in px, from the centre of the upper left pixel,
 
@@ -9,22 +9,40 @@ is how much of a wave of each period it sees. By default 4000 x 501 px, A = 0.5 
 to 300 px, as in P. L. Reu et al., Exp. Mech. 62 (2022) 639, doi 10.1007/s11340-021-00806-6.
 
 The displacement belongs to points of the *reference*: a deformed pixel shows the point X with
-X + u(X) = x, found to rounding, where the speckle is evaluated, not interpolated.
+X + u(X) = x, found to rounding, where the speckle is evaluated, not interpolated. In a folder::
+
+    DIR/reference.tif deformed.tif                          exact, float
+        reference_1pct.tif still_1pct.tif deformed_1pct.tif a camera's, for each level of noise
+        star.json README.md
+
+Nothing is secret: the displacement is a formula. The set's id is a digest of its files.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.errors import InputError
+from modeharvest import __version__
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.speckle import Speckle, SpeckleSpec
-from modeharvest.memory import require_memory
-
-FloatArray = NDArray[np.float64]
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, read_json, read_record, reading, sha256_of, write_json
+from modeharvest.util.machine import require_memory
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import stage_key
+from modeharvest.util.typed import made
+from modeharvest.validation.scoring.benchmark import RETURNED
 
 _BYTES_PER_PIXEL = 300.0
 """Of making the images."""
@@ -159,3 +177,286 @@ class StarImages:
         row, residual_px = self.star.came_from()
         col = np.broadcast_to(np.arange(self.star.cols, dtype=np.float64), row.shape)
         return pattern.image(), pattern.exact(row, col), residual_px
+
+
+_README = """\
+# Star pattern {id}: how fine a displacement does your code resolve?
+
+Images of a speckle moved by a wave whose period grows along the image, from {shortest:g} px at the
+left to {longest:g} px at the right: the star of DIC Challenge 2.0 (P. L. Reu et al., Exp. Mech.
+2022, doi 10.1007/s11340-021-00806-6).
+
+## What is here
+
+| file | content |
+|---|---|
+{files}
+
+`star.json` says the same to programs, with every value needed to make the set again.
+
+## The displacement
+
+With the row *i* (down) and the column *j*, from 0 at the upper left pixel's centre, in px:
+
+    v(i, j) = {amplitude:g} cos(2 pi (i - {centre}) / p(j))   (positive down),   u = 0
+    p(j) = {shortest:g} + {range:g} j / {last}
+
+It belongs to points of the *reference* image: a deformed pixel x shows the point X with
+X + u(X) = x, found by Newton's method (largest residual {residual:.1e} px); there the speckle, a
+trigonometric polynomial, is evaluated. Nothing is interpolated.
+
+## What to return
+
+Two fields, with one choice of subset, step and filter for both: one of `reference` to `deformed`,
+one of `reference` to `still` (the same scene with other noise) of a level of noise. CSV, NPZ, HDF5,
+MAT or VTU, points in any order, as dense as you like along the centre row and about it. In pixels,
+*y* and *v* down:
+
+```
+# benchmark: {id}
+x [px],y down [px],u [px],v down [px]
+120,{centre},0.0031,0.482
+124,{centre},nan,nan
+```
+
+Points that your code could not measure stay in the file, as NaN: they are counted.
+
+## How it is graded
+
+```sh
+modeharvest benchmark resolution STAR.csv --still STILL.csv --set DIR --out graded
+```
+
+- *l*₁₀ %: the period at which 10 % of the amplitude is lost [px].
+- *n*: the standard deviation of *v* between the two images without motion [px].
+- *n l*₁₀ %, the metrological efficiency indicator [px²]: less is better. A larger subset lowers
+  *n* and raises *l*₁₀ %; for a given code and speckle their product hardly changes.
+
+## Licence
+
+The images are free under CC-BY 4.0, https://creativecommons.org/licenses/by/4.0/: use them, and
+name where they are from. Made with {made_with}.
+"""
+
+_ROLES = {
+    "reference": "before the motion",
+    "still": "the same again, with other noise",
+    "deformed": "after it",
+}
+
+
+def star_readme(info: Mapping[str, Any]) -> str:
+    """The README of a set, Markdown, from the content of its ``star.json``."""
+    star = info["spec"]["star"]
+    return _README.format(
+        id=info["id"],
+        made_with=info["made_with"],
+        files="\n".join(_readme_row(name, info) for name in info["files"]),
+        amplitude=star["amplitude_px"],
+        shortest=star["shortest_px"],
+        longest=star["longest_px"],
+        range=star["longest_px"] - star["shortest_px"],
+        last=star["cols"] - 1,
+        centre=star["rows"] // 2,
+        residual=info["law"]["residual_of_inversion_px"],
+    )
+
+
+def _readme_row(name: str, info: Mapping[str, Any]) -> str:
+    """A row of the table of files."""
+    role, _, level = name.removesuffix(".tif").partition("_")
+    percent = level.removesuffix("pct").replace("p", ".")
+    camera = f"{info['spec']['bits']} bit, noise {percent} % of full scale"
+    kind = camera if level else "exact, float"
+    return f"| `{name}` | {_ROLES[role]}; {kind} |"
+
+
+FORMAT = "modeharvest-star-1"
+SIDECAR, README = "star.json", "README.md"
+ROLES = ("reference", "still", "deformed")
+"""Images of a level of noise: still shows what reference shows, with noise of its own."""
+
+
+@dataclass(frozen=True)
+class StarSpec:
+    """What a star set holds.
+
+    Parameters
+    ----------
+    star
+        The wave and the size of the image.
+    speckle
+        What moves.
+    noise
+        Standard deviations of the white noise in the camera's images [fraction of full scale]:
+        0.01 is 2.6 of 255 levels.
+    bits
+        Of the camera's images.
+    seed
+        Of the noise.
+
+    Raises
+    ------
+    InputError
+        If a level comes twice or is out of range.
+    """
+
+    star: Star = field(default_factory=Star)
+    speckle: SpeckleSpec = field(default_factory=fine_speckle)
+    noise: tuple[float, ...] = (0.01,)
+    bits: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noise", tuple(self.noise))
+        if len({level_name(n) for n in self.noise}) < len(self.noise) or not all(
+            1e-4 <= n <= 0.1 for n in self.noise
+        ):
+            raise InputError(
+                "star: expected different levels of noise from 0.0001 to 0.1 of full scale, got "
+                f"{', '.join(f'{n:g}' for n in self.noise)}"
+            )
+        if not 1 <= self.bits <= 16 or self.seed < 0:
+            raise InputError(
+                f"star: expected 1 to 16 bits and a seed of 0 or more, got {self.bits} and "
+                f"{self.seed}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class StarSet:
+    """A star set in its folder.
+
+    Parameters
+    ----------
+    folder
+        Where it is.
+    spec
+        What it holds.
+    info
+        The content of its ``star.json``.
+    """
+
+    folder: Path
+    spec: StarSpec
+    info: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path | str) -> StarSet:
+        """Open a set.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        path = Path(folder) / SIDECAR
+        what, remedy = "a star set", "'modeharvest benchmark star' makes one"
+        with reading(path, what, remedy):
+            info = read_record(path, FORMAT, what, remedy)
+            return cls(Path(folder), made(StarSpec, info["spec"]), info | {"id": str(info["id"])})
+
+    @property
+    def id(self) -> str:
+        """Of the set."""
+        return str(self.info["id"])
+
+
+def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silent) -> StarSet:
+    """Write a star set; a whole one of the same spec is left as it is.
+
+    Parameters
+    ----------
+    spec
+        What to make.
+    folder
+        Where; made if it does not exist.
+    progress
+        Listener.
+    """
+    folder = Path(folder)
+    if not _is_whole(folder, spec):
+        (folder / SIDECAR).unlink(missing_ok=True)
+        progress(0, 3, "star: images")
+        f, g, residual_px = StarImages(spec.star, spec.speckle).render()
+        progress(1, 3, "star: images")
+        files = _write_images(folder, spec, f, g)
+        progress(2, 3, "star: images")
+        info = _info(spec, files, residual_px)
+        with atomic(folder / README) as part:
+            part.write_text(star_readme(info), "utf-8")
+        write_json(folder / SIDECAR, info)  # last: it says that all is there
+        progress(3, 3, "star: images")
+    return StarSet.read(folder)
+
+
+def level_name(noise: float) -> str:
+    """A level of noise as part of a file's name: 0.01 is 1pct, 0.005 is 0p5pct."""
+    return f"{100.0 * noise:g}pct".replace(".", "p")
+
+
+def image_name(role: str, noise: float | None = None) -> str:
+    """The file of an image: an exact one, or one of a level of noise."""
+    return f"{role}.tif" if noise is None else f"{role}_{level_name(noise)}.tif"
+
+
+def _write_images(
+    folder: Path, spec: StarSpec, f: NDArray[np.float64], g: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Write all images; returns their sizes and digests."""
+    still, moved = f.astype(np.float32), g.astype(np.float32)
+    exact = {"reference": still, "still": still, "deformed": moved}
+    images: dict[str, NDArray[Any]] = {
+        image_name(role): exact[role] for role in ("reference", "deformed")
+    }
+    for noise in spec.noise:
+        camera = Sensor(read_noise=noise, read_seed=spec.seed)
+        for role in ROLES:
+            name = image_name(role, noise)
+            images[name] = camera.expose(exact[role], spec.bits, name)
+    for name, image in images.items():
+        write_image(folder / name, image)
+    return {
+        name: {"bytes": (folder / name).stat().st_size, "sha256": sha256_of(folder / name)}
+        for name in images
+    }
+
+
+def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[str, Any]:
+    """The content of ``star.json``."""
+    star = spec.star
+    return {
+        "format": FORMAT,
+        "id": hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:12],
+        "key": _key(spec),
+        "licence": "CC-BY-4.0",
+        "made_with": f"modeharvest {__version__}",
+        "law": {
+            "v_down_px": f"{star.amplitude_px:g} cos(2 pi (row - {star.centre_row}) / period)",
+            "period_px": f"{star.shortest_px:g} + {star.longest_px - star.shortest_px:g} "
+            f"col / {star.cols - 1}",
+            "u_px": 0,
+            "of": "points of the reference image; the centre of the upper left pixel is (0, 0)",
+            "residual_of_inversion_px": residual_px,
+        },
+        "spec": asdict(spec),
+        "returned": RETURNED,
+        "files": dict(files),
+    }
+
+
+def _key(spec: StarSpec) -> str:
+    return stage_key(asdict(spec))
+
+
+def _is_whole(folder: Path, spec: StarSpec) -> bool:
+    """Whether the folder holds this set, nothing missing or changed."""
+    try:
+        info = read_json(folder / SIDECAR)
+        return bool(
+            info["key"] == _key(spec)
+            and (folder / README).read_text("utf-8") == star_readme(info)
+            and all(sha256_of(folder / n) == f["sha256"] for n, f in info["files"].items())
+        )
+    except (InputError, OSError, ValueError, KeyError, TypeError):
+        return False

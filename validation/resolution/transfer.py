@@ -1,9 +1,13 @@
-"""What is left of a wave after a least-squares fit of polynomials: theory, for exact images.
+"""Transfer functions of least-squares fits: subsets, polynomials, and an ansatz near a state.
 
 A local DIC whose subsets have polynomial shape functions is, to first order, the least-squares fit
 of these to the displacement in the subset, read at its centre: a Savitzky–Golay filter [1]_, [2]_.
 A global one with polynomials over the whole domain is the same fit there. The share of a wave's
 amplitude that comes back is its transfer T; the finest period is the one with T = 0.9 [2]_.
+
+Near a state a an ansatz can follow small changes S da of the displacement; the best it can make of
+a wave w are the da that minimise the sum of |w - S da|^2 over the material. A correlation weighs
+the same sum by the speckle's gradient, which averages out over many speckles.
 
 References
 ----------
@@ -14,16 +18,17 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import spherical_jn
 
-from modeharvest.errors import InputError
-from modeharvest.idic.chebyshev import orders
-
-FloatArray = NDArray[np.float64]
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.slow_fields import orders
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
 KEPT = 0.9
 """Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
@@ -128,3 +133,60 @@ def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high
     at = below[-1]
     found = brentq(lambda p: float(transfer(np.array([p]))[0]) - KEPT, periods[at], periods[at + 1])
     return float(found)
+
+
+@dataclass(frozen=True, eq=False)
+class PartFields:
+    """Changes of the displacement in the parts of an ansatz, at points.
+
+    Parameters
+    ----------
+    v0, v1
+        (points, 2, waves): of v0 and of v1 phi1 [mm].
+    """
+
+    v0: FloatArray
+    v1: FloatArray
+
+    @property
+    def whole(self) -> FloatArray:
+        """(points, 2, waves): of the displacement [mm]."""
+        return self.v0 + self.v1
+
+    def of(self, part: str) -> FloatArray:
+        """One of "v0", "v1" and "whole"."""
+        return np.asarray(getattr(self, part))
+
+
+@dataclass(frozen=True, eq=False)
+class TangentFit:
+    """An ansatz with one mode near some unknowns.
+
+    Parameters
+    ----------
+    ansatz, unknowns
+        The kinematics, and (n,) where.
+    points
+        (m, 2) of the material that the fit counts [mm].
+    """
+
+    ansatz: Ansatz
+    unknowns: FloatArray
+    points: FloatArray
+
+    def fit(self, waves: FloatArray) -> PartFields:
+        """The best fits of waves (m, 2, k) at the points [mm]."""
+        x, y = self.points.T
+        S = self.ansatz.sensitivities(self.unknowns, x[:, None], y[:, None])[:, 0]
+        flat = S.reshape(-1, self.ansatz.size)
+        scale = np.sqrt((flat**2).sum(axis=0))
+        q, r = np.linalg.qr(flat / scale)
+        step = np.linalg.solve(r, q.T @ waves.reshape(len(flat), -1)) / scale[:, None]
+        slow = 2 * self.ansatz.v0_space.size
+        v0, v1 = S[..., :slow] @ step[:slow], S[..., slow:] @ step[slow:]
+        return PartFields(v0, v1)
+
+
+def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
+    """(k,) slope of what was found (m, 2, k) against the waves (m, 2, k) [-]."""
+    return np.asarray((found * wave).sum(axis=(0, 1)) / (wave**2).sum(axis=(0, 1)))

@@ -1,1 +1,1 @@
-"""Grades of displacement fields from any DIC code, against the truth of a set of images."""
+"""Scoring: displacement fields of any DIC code against the truth of a benchmark image set."""

@@ -1,4 +1,4 @@
-"""Images to measure, for anybody, and apart from them the truth that measurements are graded by.
+"""Benchmark image sets: a public folder of images, and apart from it the truth.
 
 ::
 
@@ -21,23 +21,134 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from modeharvest import __version__
-from modeharvest.errors import InputError
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.files import atomic, copy_whole, read_json, read_record, sha256_of, write_json
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.imageset import ImageSet, ImagingSpec
-from modeharvest.imaging.isoparametric import interpolate, locate
-from modeharvest.imaging.pointwise import locate_points
-from modeharvest.reading import reading
-from modeharvest.typed import made
-from modeharvest.validation.scoring.benchmark_words import RETURNED, readme
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate
+from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import (
+    atomic,
+    copy_whole,
+    read_json,
+    read_record,
+    reading,
+    sha256_of,
+    write_json,
+)
+from modeharvest.util.typed import made
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+RETURNED = {
+    "what": "the displacement of material points, at their positions in the reference image",
+    "columns": ["x [px]", "y down [px]", "u [px]", "v down [px]"],
+    "origin": "the centre of the upper left pixel is (0, 0)",
+    "lost": "points that were not measured stay in the file, with NaN as u and v",
+    "id": "a first line '# benchmark: ID' lets a mistaken file be noticed",
+    "formats": ["csv", "npz", "h5", "mat", "vtu"],
+}
+"""How displacements are to be returned."""
+
+_README = """\
+# Benchmark {id} for digital image correlation
+
+Images of a specimen with holes, before and after a deformation, made by computer: the displacement
+of every point is known, and is not in this folder. Measure it, and have your field graded.
+
+## What is here
+
+| file | content |
+|---|---|
+{files}
+
+The float images hold grey levels as fractions of full scale, as exact as they could be made; the
+{bits}-bit images are what a camera would have stored. Say which you used. Holes and surroundings
+are {background:g}. The specimen's unit cells measure {unit_cell_mm:g} mm, a pixel
+{pixel_size_mm:g} mm. `{mask}` is white where the reference image shows material.
+`benchmark.json` says the same to programs, with the SHA-256 of every image.
+
+## What to return
+
+For each deformed image one file with the displacement *u, v* of material points at their positions
+*x, y* in the **reference** image: CSV, NPZ, HDF5, MAT or VTU, points in any order or a grid. For
+example, in pixels, *y* and *v* down, the centre of the upper left pixel being (0, 0):
+
+```
+# benchmark: {id}
+x [px],y down [px],u [px],v down [px]
+120,85,3.217,-0.482
+125,85,nan,nan
+```
+
+Points that your code could not measure stay in the file, as NaN: they are counted. In millimetres,
+with *y* up, the centre of the upper left pixel is at x = {x0:.6g} mm, y = {y0:.6g} mm.
+
+## How it is graded
+
+Who has the truth runs
+
+```sh
+modeharvest score FIELD.csv --truth TRUTH --strain {strain:g} --out graded
+```
+
+The error is the returned displacement less the true one at the returned positions, evaluated on
+the finite elements that the images were made of. Told are its mean (bias), its rms per component,
+percentiles and the largest length, over all and by region (within 10 px of an edge, ligaments,
+junctions, bulk), the share of points that were measured, the share of the material that they
+cover, and the error's spectrum. Fields are ranked by rms; those that cover less than half of the
+material come after those that cover more.
+
+## How it was made
+
+A hyperelastic finite-element simulation deforms the specimen; a random speckle pattern moves with
+it. For each pixel of a deformed image the material point that it shows is found by inverting the
+isoparametric mapping, and the pattern is evaluated there, not interpolated. Method: section
+"Virtual Experiments" of doi 10.1016/j.ijsolstr.2024.112916. Made with {made_with}.
+
+Whoever made this set of a case that is public has not hidden its truth from those who can simulate
+it again.
+
+## Licence
+
+The images are free under CC-BY 4.0, https://creativecommons.org/licenses/by/4.0/: use them, and
+name where they are from.
+"""
+
+
+def readme(info: Mapping[str, Any]) -> str:
+    """The README of a set, Markdown, from the content of its ``benchmark.json``."""
+    first = info["first_pixel_mm"]
+    return _README.format(
+        **{key: info[key] for key in ("id", "bits", "background", "unit_cell_mm", "pixel_size_mm",
+                                      "made_with")},
+        mask=info["reference"]["mask"],
+        files="\n".join(_files(info)),
+        strain=info["deformed"][-1]["nominal_strain"],
+        x0=first["x"],
+        y0=first["y_up"],
+    )  # fmt: skip
+
+
+def _files(info: Mapping[str, Any]) -> list[str]:
+    """A row of the table for each file."""
+    reference, bits = info["reference"], info["bits"]
+    size = f"{info['rows']} × {info['cols']} px"
+    rows = [
+        f"| `{reference['image']}` | undeformed, float, {size} |",
+        f"| `{reference['camera_image']}` | undeformed, {bits} bit |",
+        f"| `{reference['mask']}` | material of the undeformed image |",
+    ]
+    for entry in info["deformed"]:
+        strain = f"nominal strain {100 * entry['nominal_strain']:g} %"
+        rows += [f"| `{entry['image']}` | {strain}, float |",
+                 f"| `{entry['camera_image']}` | {strain}, {bits} bit |"]  # fmt: skip
+    return rows
+
 
 FORMAT, TRUTH_FORMAT = "modeharvest-benchmark-1", "modeharvest-benchmark-truth-1"
 SIDECAR, README, SOLUTION = "benchmark.json", "README.md", "solution.h5"

@@ -1,10 +1,11 @@
-"""Convention checks: whether a field means what was declared of it, or something else.
+"""Convention checks: axes, signs, units and origin of a displacement field against the truth.
 
 What a DIC code writes can be taken wrongly in many ways, several at once: y up for y down, u and v
 or rows and columns exchanged, a sign, deformed positions for reference ones, another origin, px for
-mm. All combinations are tried against the truth. One is told only if the errors with it are smaller
-than as declared by more than chance explains, and if it leaves nothing of what it was to explain:
-an error of any other kind (noise, bias, too small a strain) is not mistaken for a convention.
+mm. All combinations are tried against the truth. One is reported only if the errors with it are
+smaller than as declared by more than chance explains, and if it leaves nothing of what it was to
+explain: an error of any other kind (noise, bias, too small a strain) is not mistaken for a
+convention.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from modeharvest.errors import InputError
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.idic.local.field import LocalField
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
-FloatArray = NDArray[np.float64]
 Truth = Callable[[FloatArray, FloatArray], FloatArray]
 """(n, 2) true displacement [mm] at positions x, y (n,) [mm]; NaN off the material."""
 
@@ -143,7 +144,7 @@ def check_conventions(
     InputError
         If the displacements are in pixels and were declared as millimetres, or the reverse.
     """
-    sample = _Sample.of(field, truth, grid)
+    sample = _FieldSample.of(field, truth, grid)
     declared = as_declared()
     if len(sample.x) < 4 * _FEWEST_BLOCKS or not np.isfinite(sample.cap):
         return declared, ()
@@ -217,7 +218,7 @@ def _near_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
         yield shift, f"the first pixel's centre were {called} in the file's count from the declared"
 
 
-def _promising(sample: _Sample, grid: PixelGrid) -> list[Reading]:
+def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
     """The readings with the smallest errors, and those that differ from them by little.
 
     First all that change displacements by as much as they are, at a few points; to the best of
@@ -254,7 +255,7 @@ def _in_deformed_positions(reading: Reading) -> Reading:
     return reading.but(1, "the positions were those of the deformed image", deformed=True)
 
 
-class _Sample:
+class _FieldSample:
     """Some of a field's points, with the errors of readings of them.
 
     Parameters
@@ -277,16 +278,16 @@ class _Sample:
         self.cap = 3.0 * float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
 
     @classmethod
-    def of(cls, field: LocalField, truth: Truth, grid: PixelGrid) -> _Sample:
+    def of(cls, field: LocalField, truth: Truth, grid: PixelGrid) -> _FieldSample:
         """Some of a field's valid points."""
         x, y, u = field.valid_points()
         some = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int)
         return cls(x[some], y[some], u[some], truth, grid.pixel_size)
 
-    def every(self, step: int) -> _Sample:
+    def every(self, step: int) -> _FieldSample:
         """One of so many points."""
         some = slice(None, None, step if len(self.x) > _POINTS // step else 1)
-        return _Sample(self.x[some], self.y[some], self.u[some], self.truth, self.unit)
+        return _FieldSample(self.x[some], self.y[some], self.u[some], self.truth, self.unit)
 
     def look_up(self, readings: Sequence[Reading]) -> None:
         """Find the truth for many readings at once, which is quicker than for one after another."""

@@ -1,4 +1,4 @@
-"""Fields that come to be graded: read from any file, with the id of the set they claim to be of."""
+"""Displacement fields of any DIC code: read from file, with the id of the benchmark they claim."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from typing import Any
 import h5py
 import numpy as np
 
-from modeharvest.errors import InputError
 from modeharvest.fem.field import read_any_mesh
-from modeharvest.idic.fields.files import read_field
-from modeharvest.idic.fields.local_field import LocalField
-from modeharvest.idic.fields.tables import read_mat
+from modeharvest.idic.local.field import LocalField, read_field
+from modeharvest.idic.local.tables import read_mat
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.reading import open_hdf5, reading
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import open_hdf5, reading
 
 _VTK = {".vtk", ".vtu", ".vtp"}
 _TEXT = {".csv", ".txt", ".dat", ".tsv"}
@@ -41,7 +40,7 @@ class Declared:
     name
         Of the code, for tables; the file's by default.
     units, displacement_units, y_axis, first_pixel, columns
-        As for :func:`modeharvest.idic.fields.files.read_field`.
+        As for :func:`modeharvest.idic.local.field.read_field`.
     """
 
     name: str | None = None

@@ -1,4 +1,8 @@
-"""How good a displacement field from any DIC code is, against the truth of a benchmark."""
+"""Errors of a displacement field: by region of the specimen, by wavelength, and ranking.
+
+Errors of a displacement measurement differ from one region to the next: subsets stick out over
+edges, ligaments bend, junctions turn almost rigidly, the bulk hardly moves.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,70 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from modeharvest.errors import InputError
-from modeharvest.idic.fields.local_field import LocalField
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.spectra.spectrum import gridded, spectral_density
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.validation.scoring.regions import REGIONS
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+EDGES, LIGAMENTS, JUNCTIONS, BULK = REGIONS = ("edges", "ligaments", "junctions", "bulk")
+EDGE_PX = 10
+"""Material closer than this to a hole or to the outside counts as edge [px]."""
+
+
+def regions(
+    mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int = EDGE_PX
+) -> NDArray[np.int8]:
+    """Label every pixel of the undeformed specimen.
+
+    Parameters
+    ----------
+    mask
+        (rows, cols) True on material.
+    grid
+        Where the pixels are.
+    specimen
+        The geometry; its scatter, if any, is small against the ligaments.
+    edge_px
+        Width of the edges [px].
+
+    Returns
+    -------
+    (rows, cols) index into :data:`REGIONS`, -1 where there is no material. Edges are told first,
+    then what lies outside the cellular part (bulk); the rest belongs to the ligament or junction
+    whose middle is nearest.
+    """
+    labels = np.full(grid.shape, -1, dtype=np.int8)
+    # A pixel on the boundary belongs to the cellular part, however its position was rounded.
+    a, b = (size + 1e-9 * specimen.pitch for size in specimen.cellular_half_size)
+    cellular = (np.abs(grid.y)[:, None] <= b) & (np.abs(grid.x)[None, :] <= a)
+    labels[mask & ~cellular] = REGIONS.index(BULK)
+    row, col = np.nonzero(mask & cellular)
+    labels[row, col] = _nearest(specimen, grid.x[col], grid.y[row])
+    padded = np.pad(mask, 1)
+    near = ndimage.distance_transform_edt(padded)[1:-1, 1:-1] <= edge_px
+    labels[mask & near] = REGIONS.index(EDGES)
+    return labels
+
+
+def _nearest(specimen: Specimen, x: ArrayLike, y: ArrayLike) -> NDArray[np.int8]:
+    """Whether the middle of a ligament or of a junction is nearest to positions [mm]."""
+    pitch, half = specimen.pitch, 0.5 * specimen.pitch
+    # From the nearest hole's centre, in the quarter of its cell where both are positive.
+    dx, dy = (
+        np.abs(np.mod(np.asarray(at) - centre + half, pitch) - half)
+        for at, centre in zip((x, y), specimen.hole_centres[0], strict=True)
+    )
+    ligament = np.minimum(np.hypot(dx - half, dy), np.hypot(dx, dy - half))
+    is_junction = np.hypot(dx - half, dy - half) < ligament - 1e-9 * pitch
+    kinds = REGIONS.index(LIGAMENTS), REGIONS.index(JUNCTIONS)
+    return np.where(is_junction, kinds[1], kinds[0]).astype(np.int8)
+
 
 _ENOUGH_POINTS = 20_000
 """For a median or a share."""
@@ -85,7 +142,7 @@ class Score:
     everywhere
         Over all its points on material.
     by_region
-        For each of :data:`modeharvest.validation.scoring.regions.REGIONS`.
+        For each of :data:`modeharvest.validation.scoring.score.REGIONS`.
     off_material
         Points that lie in holes or outside the specimen: not graded.
     spacing_px
@@ -144,7 +201,7 @@ def score(
     truth
         (n, 2) true displacements at the field's points [mm]; NaN off the material.
     labels
-        (rows, cols) of :func:`modeharvest.validation.scoring.regions.regions`.
+        (rows, cols) of :func:`modeharvest.validation.scoring.score.regions`.
     grid
         The reference image's pixels.
     reach_px
@@ -249,3 +306,83 @@ def _near(field: LocalField, used: BoolArray, reach_px: float, grid: PixelGrid) 
     if missed.all():
         return ~missed
     return np.asarray(ndimage.distance_transform_edt(missed) <= reach_px)
+
+
+BANDS_AN_OCTAVE = 3
+_MOST = 1000  # points along the longer side: finer fields are averaged to so many
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSpectrum:
+    """The error by wavelength, in thirds of an octave.
+
+    Parameters
+    ----------
+    wavelength_px
+        (m,) middle of each band, ascending [px].
+    rms_px
+        (m,) rms error per component in it [px]: the squares of all and of ``affine_px`` add up to
+        that of the whole error, but for what bins of a fine field average out.
+    affine_px
+        Rms of the error's affine part: translation, rotation, strain [px].
+    """
+
+    wavelength_px: FloatArray
+    rms_px: FloatArray
+    affine_px: float
+
+
+def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
+    """Decompose a field's error; None where its points don't fill a box.
+
+    Gaps, at holes and where points were lost, count as zero error: what the pattern of gaps does
+    to a wave is spread over its neighbours.
+    """
+    if not len(graded.x):
+        return None
+    try:
+        u, points, mask = gridded(_averaged(graded, grid))
+        unit = 10.0 * points.pixel_size  # any: wavelengths are told in px
+        spectrum = spectral_density(u, points, mask, unit, bins_per_cell=10, padding=1)
+    except InputError:
+        return None
+    density = (spectrum.S_xx + spectrum.S_yy).ravel()
+    cell = (spectrum.xi1[1] - spectrum.xi1[0]) * (spectrum.xi2[1] - spectrum.xi2[0]) / unit**2
+    area = mask.sum() * points.pixel_size**2
+    frequency = np.hypot(spectrum.xi1[None, :], spectrum.xi2[:, None]).ravel() / unit
+    waves = frequency > 0
+    wavelength = 1.0 / (frequency[waves] * grid.pixel_size)
+    band = np.rint(BANDS_AN_OCTAVE * np.log2(wavelength)).astype(int)
+    low = int(band.min())
+    square_mm = np.bincount(band - low, density[waves] * cell) / (2.0 * area)
+    middle = 2.0 ** ((low + np.arange(square_mm.size)) / BANDS_AN_OCTAVE)
+    there = np.bincount(band - low) > 0
+    rms = np.sqrt(square_mm) / grid.pixel_size
+    return ErrorSpectrum(
+        middle[there], rms[there], _affine_rms(graded, spectrum.affine) / grid.pixel_size
+    )
+
+
+def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
+    """The error as a field [mm], its points averaged over squares where there are too many."""
+    x, y, error = graded.x, graded.y, graded.error_px * grid.pixel_size
+    step = graded.spacing_px * grid.pixel_size
+    many = int(np.ceil(max(np.ptp(x), np.ptp(y)) / (step * _MOST)))
+    if many > 1:
+        side = many * step
+        left, low = (at.min() - 0.5 * step for at in (x, y))  # no point of a grid on a border
+        col, row = (((at - begin) / side).astype(int) for at, begin in ((x, left), (y, low)))
+        cols = int(col.max()) + 1
+        square = row * cols + col
+        count = np.bincount(square)
+        there = np.flatnonzero(count)
+        error = np.column_stack([np.bincount(square, e)[there] / count[there] for e in error.T])
+        x = left + side * (there % cols + 0.5)
+        y = low + side * (there // cols + 0.5)
+    return LocalField(x, y, error, source=graded.source)
+
+
+def _affine_rms(graded: Score, affine: FloatArray) -> float:
+    """Rms of an affine field at the points, per component [mm]."""
+    points = np.stack([np.ones_like(graded.x), graded.x, graded.y])
+    return float(np.sqrt(np.mean((affine @ points) ** 2)))

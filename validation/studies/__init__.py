@@ -1,5 +1,5 @@
-"""Studies: how the measurement's error depends on what it starts from, on noise, on options.
+"""Studies: how a measurement's error depends on its start, on noise, on options, on the specimen.
 
 A study is a grid of cases (:mod:`modeharvest.validation.campaign`), the function that runs one of
-them, and what the table of their results tells.
+them, and statistics of the table of their results.
 """

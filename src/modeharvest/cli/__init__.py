@@ -1,5 +1,1 @@
-"""The command line: a file for each family of commands, and ``root``, which joins them."""
-
-from modeharvest.cli.root import app, main
-
-__all__ = ["app", "main"]
+"""The command line: ``root`` joins the commands and turns errors into exit codes."""

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from modeharvest.cli.arguments import CaseName, OutFolder, SolutionFile
-from modeharvest.cli.messages import UNUSABLE, bars, tell
-from modeharvest.errors import InputError
+from modeharvest.cli.messages import UNUSABLE, CaseName, OutFolder, SolutionFile, bars, tell
+from modeharvest.util.errors import InputError
 
 
 def make(
@@ -27,10 +26,10 @@ def make(
     The public folder holds reference.tif, deformed_*.tif, mask.tif, benchmark.json and README.md,
     and nothing that gives the displacements away.
     """
-    from modeharvest.case import read_case
+    from modeharvest.runs.case import read_case
 
     checked = read_case(case)
-    from modeharvest.scoring import make_benchmark, truth_folder
+    from modeharvest.runs.benchmark import make_benchmark, truth_folder
 
     with bars() as progress:
         info = make_benchmark(checked, out, truth, solution, progress)
@@ -71,8 +70,9 @@ def score(
     Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
     the end, and the exit code is then 2.
     """
-    from modeharvest.scoring import declarations, grade, print_grading
-    from modeharvest.stages import exclusive
+    from modeharvest.report.terminal import print_grading
+    from modeharvest.runs.benchmark import declarations, grade
+    from modeharvest.util.stages import exclusive
 
     declared = declarations(fields, name, unit, y_axis, first_pixel, column)
     with bars() as progress, exclusive(out):
@@ -105,9 +105,8 @@ def star(
     Exact ones, and for each level of noise three as a camera's: before, the same without motion,
     after. Its displacement is a formula, in README.md and star.json beside them.
     """
-    from modeharvest.stages import exclusive
-    from modeharvest.validation.resolution.star import Star, fine_speckle
-    from modeharvest.validation.resolution.star_set import StarSpec, make_star_set
+    from modeharvest.util.stages import exclusive
+    from modeharvest.validation.resolution.star import Star, StarSpec, fine_speckle, make_star_set
 
     levels = tuple(noise) if noise else (0.01,)
     spec = StarSpec(Star(rows, cols), fine_speckle(seed), levels, bits, seed)
@@ -149,9 +148,9 @@ def resolution(
     All in px. --y-axis and --first-pixel count for all fields, or are given once for each FIELD;
     its --still has the same. Leaves report.html, resolution.json and resolution.csv in DIR.
     """
-    from modeharvest.scoring import declarations
-    from modeharvest.stages import exclusive
-    from modeharvest.validation.resolution.graded import grade_star, print_star_grading
+    from modeharvest.report.terminal import print_star_grading
+    from modeharvest.runs.benchmark import declarations, grade_star
+    from modeharvest.util.stages import exclusive
 
     declared = declarations(fields, name, None, y_axis, first_pixel, column)
     quiet = declarations(still, name, None, y_axis, first_pixel, column) if still else {}

@@ -16,15 +16,23 @@ import typer
 from modeharvest import __version__
 from modeharvest.cli import messages
 from modeharvest.cli.benchmark import make, resolution, score, star
-from modeharvest.cli.cases import cases
-from modeharvest.cli.experiment import correlate, fem, image, run, validate
-from modeharvest.cli.lattice import bloch, modes
-from modeharvest.cli.photographs import harvest
-from modeharvest.cli.study import study
-from modeharvest.ranks import is_first
+from modeharvest.cli.commands import (
+    bloch,
+    cases,
+    correlate,
+    fem,
+    harvest,
+    image,
+    modes,
+    run,
+    study,
+    validate,
+)
+from modeharvest.util.machine import is_first
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
+
 
 app = typer.Typer(
     help=(

@@ -1,0 +1,1 @@
+"""Bloch waves on deformed lattices: eigenvalues, critical loads, dispersion, modes, branches."""

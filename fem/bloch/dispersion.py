@@ -1,0 +1,331 @@
+"""The dispersion of a lattice under load: lowest eigenvalues against the wave vector.
+
+Along a path through the zone at several loads, and over the whole zone at one. What is found is
+plain numpy, held, written and read without dolfinx.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
+from modeharvest.util.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from modeharvest.fem.bloch.eigen import BlochWaves
+    from modeharvest.fem.lattice.cell import CellPath, CellState
+
+
+Wave = tuple[float, float]
+Corners = Sequence[tuple[str, Wave]]
+
+_PI = math.pi
+ZONES: dict[str, tuple[tuple[str, Wave], ...]] = {
+    "oblique": (
+        ("Γ", (0.0, 0.0)),
+        ("X", (_PI, 0.0)),
+        ("M", (_PI, _PI)),
+        ("Y", (0.0, _PI)),
+        ("Γ", (0.0, 0.0)),
+        ("M", (_PI, _PI)),
+    ),
+    "square": (
+        ("Γ", (0.0, 0.0)),
+        ("X", (_PI, 0.0)),
+        ("M", (_PI, _PI)),
+        ("Γ", (0.0, 0.0)),
+    ),
+    "hexagonal": (
+        ("Γ", (0.0, 0.0)),
+        ("M", (_PI, _PI)),
+        ("K", (4 * _PI / 3, 2 * _PI / 3)),
+        ("Γ", (0.0, 0.0)),
+    ),
+    "rhombic": (
+        ("Γ", (0.0, 0.0)),
+        ("K", (4 * _PI / 3, 2 * _PI / 3)),
+        ("M₁", (_PI, _PI)),
+        ("K′", (2 * _PI / 3, 4 * _PI / 3)),
+        ("M₂", (0.0, _PI)),
+        ("Γ", (0.0, 0.0)),
+        ("M₁", (_PI, _PI)),
+    ),
+}
+"""Closed tours of a zone by its symmetry, corners as phases (k . a1, k . a2) [rad].
+
+"square" and "hexagonal" (60 degrees between a1 and a2): a quarter and a sixth of a turn leave the
+lattice under its load as it is. "rhombic": the hexagonal lattice under a load that doesn't, K at
+0 and K′ at 60 degrees from x, M₁ at 30 and M₂ at 90. "oblique": anything else; with k and -k the
+same, the edges X-M and Y-M are all of the boundary."""
+
+
+@dataclass(frozen=True, eq=False)
+class ZoneMap:
+    """The lowest eigenvalue over all of the zone at one load.
+
+    Parameters
+    ----------
+    load
+        [-].
+    phases
+        (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
+    eigenvalues
+        (g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0.
+    lattice
+        (2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm].
+    """
+
+    load: float
+    phases: FloatArray
+    eigenvalues: FloatArray
+    lattice: FloatArray
+
+    @property
+    def softest(self) -> tuple[float, Wave]:
+        """The eigenvalue [N/mm^4] and phases [rad] where lambda / |k|^2 is lowest, Γ left out.
+
+        |k| is that of the shortest of the equivalent wave vectors.
+        """
+        half = self.phases[1:]  # -pi and pi are the same
+        turns = 2.0 * _PI * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+        grid = np.stack(np.meshgrid(half, half, indexing="ij"), axis=-1)
+        k = (grid[:, :, None] + turns) @ np.linalg.inv(self.lattice).T
+        squared = np.sum(k**2, axis=-1).min(axis=-1)
+        values = self.eigenvalues[1:, 1:] / np.where(squared > 0, squared, np.inf)
+        values[squared == 0] = np.inf
+        i, j = np.unravel_index(int(np.argmin(values)), values.shape)
+        return float(self.eigenvalues[i + 1, j + 1]), (float(half[i]), float(half[j]))
+
+
+@dataclass(frozen=True, eq=False)
+class Dispersion:
+    """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors.
+
+    Parameters
+    ----------
+    labels, stops
+        Names of the path's corners, and their places among its points.
+    waves
+        (p, 2) phases (k . a1, k . a2) [rad].
+    distances
+        (p,) length of the path so far [rad/mm].
+    loads
+        (s,) [-].
+    eigenvalues
+        (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
+    zone
+        Maps of the zone, one for each load that was asked for.
+    """
+
+    labels: tuple[str, ...]
+    stops: tuple[int, ...]
+    waves: FloatArray
+    distances: FloatArray
+    loads: FloatArray
+    eigenvalues: FloatArray
+    zone: tuple[ZoneMap, ...] = ()
+
+    def __post_init__(self) -> None:
+        expected = (len(self.loads), len(self.waves))
+        if self.eigenvalues.shape[:2] != expected or len(self.labels) != len(self.stops):
+            raise InputError(
+                f"dispersion: expected eigenvalues of {expected} and as many labels as stops, got "
+                f"{self.eigenvalues.shape}, {len(self.labels)} and {len(self.stops)}"
+            )
+
+    @property
+    def bands(self) -> int:
+        """Number of eigenvalues at each wave vector."""
+        return int(self.eigenvalues.shape[2])
+
+    def write(self, path: Path | str) -> None:
+        """Write an HDF5 file, atomically: the arrays above by name, maps in ``zone/0``, ..."""
+        with atomic_hdf5(path) as file:
+            file.attrs["labels"] = list(self.labels)
+            file["stops"] = np.array(self.stops)
+            for name in ("waves", "distances", "loads", "eigenvalues"):
+                file[name] = getattr(self, name)
+            for k, part in enumerate(self.zone):
+                group = file.create_group(f"zone/{k}")
+                group.attrs["load"] = part.load
+                for name in ("phases", "eigenvalues", "lattice"):
+                    group[name] = getattr(part, name)
+
+    def write_csv(self, path: Path | str) -> None:
+        """Write the path as a table for own plots: a row for each load and wave vector."""
+        at = dict(zip(self.stops, self.labels, strict=True))
+        bands = [f"eigenvalue_{k + 1}_N_per_mm4" for k in range(self.bands)]
+        head = ["load", "corner", "phase_1_rad", "phase_2_rad", "distance_rad_per_mm", *bands]
+        with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(head)
+            for load, values in zip(self.loads, self.eigenvalues, strict=True):
+                for k, (wave, row) in enumerate(zip(self.waves, values, strict=True)):
+                    numbers = [*wave, self.distances[k], *row]
+                    table.writerow([f"{load:.9g}", at.get(k, ""), *(f"{x:.9g}" for x in numbers)])
+
+    @classmethod
+    def read(cls, path: Path | str) -> Dispersion:
+        """Read what ``write`` wrote.
+
+        Raises
+        ------
+        InputError
+            If there is no such file, or it is none of these.
+        """
+        with open_hdf5(path, "a dispersion file (HDF5)") as file:
+            arrays = {n: file[n][()] for n in ("waves", "distances", "loads", "eigenvalues")}
+            labels = tuple(str(label) for label in file.attrs["labels"])
+            stops = tuple(int(k) for k in file["stops"])
+            groups = file.get("zone", {}).values()
+            zone = tuple(_read_map(group) for group in groups)
+            return cls(labels, stops, **arrays, zone=zone)
+
+
+def _read_map(group: h5py.Group) -> ZoneMap:
+    names = ("phases", "eigenvalues", "lattice")
+    return ZoneMap(float(group.attrs["load"]), *(group[name][()] for name in names))
+
+
+def dispersion(
+    path: CellPath,
+    corners: Corners,
+    loads: Sequence[float],
+    count: int = 60,
+    bands: int = 3,
+    progress: Progress = silent,
+) -> Dispersion:
+    """The lowest eigenvalues along a zone path, at several loads of a cell's primary path.
+
+    Parameters
+    ----------
+    path
+        The primary path of a primitive cell.
+    corners
+        Names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
+    loads
+        [-].
+    count
+        Number of wave vectors, corners included.
+    bands
+        Number of eigenvalues at each.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If a wave vector is not two finite phases, or a load can't be reached.
+    """
+    from modeharvest.fem.bloch.eigen import BlochWaves
+    from modeharvest.fem.bloch.zone import zone_path
+
+    corners = [(label, in_plane(wave)) for label, wave in corners]
+    if bands < 1 or not len(loads):
+        raise InputError(f"dispersion: expected a band and a load or more, got {bands}, {loads}")
+    lattice = path.cell.cell.lattice
+    points, stops = zone_path(corners, lattice, count)
+    values = []
+    for k, load in enumerate(loads):
+        progress(k, len(loads), "dispersion")
+        values.append(_along(BlochWaves(path.cell, _state(path, load)), points, bands))
+    progress(len(loads), len(loads), "dispersion")
+    steps = np.diff(np.array(points), axis=0) @ np.linalg.inv(lattice).T
+    distances = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    labels = tuple(label for label, _ in corners)
+    arrays = (np.array(points), distances, np.array(loads, dtype=np.float64), np.array(values))
+    return Dispersion(labels, tuple(stops), *arrays)
+
+
+def zone_map(
+    path: CellPath, load: float, divisions: int = 24, progress: Progress = silent
+) -> ZoneMap:
+    """The lowest eigenvalue over a grid of the zone at one load.
+
+    Parameters
+    ----------
+    path
+        The primary path of a primitive cell.
+    load
+        [-].
+    divisions
+        Of each axis; an even number has Γ, X and M on the grid.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If the load can't be reached.
+    """
+    from modeharvest.fem.bloch.eigen import BlochWaves
+
+    if divisions < 2 or divisions % 2:
+        raise InputError(f"zone map: expected an even number of divisions, got {divisions}")
+    waves = BlochWaves(path.cell, _state(path, load))
+    phases = np.asarray(np.linspace(-_PI, _PI, divisions + 1), dtype=np.float64)
+    phases[divisions // 2] = 0.0
+    values = np.empty((divisions + 1, divisions + 1))
+    # k and -k are the same: the rows from -pi to 0 are all rows.
+    half = divisions // 2 + 1
+    for i in range(half):
+        progress(i, half, "zone map")
+        values[i] = _along(waves, [(float(phases[i]), float(q)) for q in phases], 1)[:, 0]
+    values[half:] = values[: half - 1][::-1, ::-1]
+    progress(half, half, "zone map")
+    return ZoneMap(load, phases, values, path.cell.cell.lattice)
+
+
+def in_plane(wave: Sequence[float]) -> Wave:
+    """The wave as two finite phases [rad].
+
+    Raises
+    ------
+    InputError
+        If it is anything else: a third component points out of the plane.
+    """
+    try:
+        phases = np.asarray(wave, dtype=np.float64)
+    except (TypeError, ValueError):
+        phases = np.array([])
+    if phases.shape != (2,) or not np.isfinite(phases).all():
+        raise InputError(
+            "wave vector: expected two finite phases (k . a1, k . a2) in the lattice's plane, got "
+            f"{wave!r}"
+        )
+    return float(phases[0]), float(phases[1])
+
+
+def _state(path: CellPath, load: float) -> CellState:
+    state = path.at(load)
+    if state is None:
+        reached = max(known.load for known in path.states) if path.states else 0.0
+        raise InputError(
+            f"dispersion: expected loads that the lattice's path reaches, got {load:.6g}; Newton's "
+            f"method converged up to {reached:.6g}"
+        )
+    return state
+
+
+def _along(waves: BlochWaves, points: Sequence[Wave], bands: int) -> FloatArray:
+    """(p, bands) eigenvalues, the translations' two zeros among those of Γ."""
+    from modeharvest.fem.bloch.eigen import scan
+
+    centre = [max(abs(p), abs(q)) < 1e-12 for p, q in points]
+    elsewhere = [wave for wave, is_centre in zip(points, centre, strict=True) if not is_centre]
+    values = np.empty((len(points), bands))
+    values[~np.array(centre)] = scan(waves, elsewhere, bands)
+    if any(centre):
+        others = waves.lowest((0.0, 0.0), bands).eigenvalues
+        values[centre] = np.sort([0.0, 0.0, *others])[:bands]
+    return values

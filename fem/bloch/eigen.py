@@ -1,0 +1,343 @@
+"""Bloch waves on a deformed lattice: their lowest eigenvalues, for any wave vector.
+
+K x = lambda M x with both matrices reduced by T(k)^H . T(k) to the primitive cell; a negative
+lambda means that a wave of this length and direction grows. Wave vectors are given as phases
+from cell to cell, (k . a1, k . a2) in rad: M of the square lattice is (pi, pi). Eigenpairs are
+found by Lanczos' method in blocks, for many wave vectors at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
+
+from modeharvest.fem.lattice.bloch_map import (
+    Batch,
+    Condensation,
+    CondensedWaves,
+    applied,
+    factorise,
+    negative_pivots,
+)
+from modeharvest.fem.lattice.cell import CellState, PeriodicCell
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+Wave = tuple[float, float]
+
+_SCAN_TOLERANCE = 1e-10  # of lambda + s, relative
+_TOGETHER = 30  # waves iterated at once: more would only take more memory
+_NOISE = 0.2  # in a start vector, relative
+_DIRECTIONS = 36  # over half a turn
+
+
+@dataclass(frozen=True, eq=False)
+class BlochModes:
+    """The lowest eigenpairs at one wave vector.
+
+    Parameters
+    ----------
+    wave
+        Phases (k . a1, k . a2) [rad].
+    eigenvalues
+        (m,) ascending [N/mm^4].
+    vectors
+        (size, m) x with x^H M x = 1, in the order of ``Reduction``.
+    """
+
+    wave: Wave
+    eigenvalues: FloatArray
+    vectors: NDArray[Any]
+
+
+class BlochWaves:
+    """All Bloch waves on one state of a cell; the stiffness is assembled and sorted once.
+
+    ``factorisations`` counts those of reduced matrices.
+
+    Parameters
+    ----------
+    cell
+        The cell, primitive for all wave vectors to mean what they say.
+    state
+        An equilibrium of it.
+    """
+
+    def __init__(self, cell: PeriodicCell, state: CellState) -> None:
+        self.cell, self.state = cell, state
+        self.stiffness = cell.reduction.reduced(state.stiffness)
+        self.factorisations = 0
+        # Eigenvalues are looked for from below, so that Γ with its translations is regular.
+        scale = np.linalg.norm(state.moduli.ravel()) / (cell.filling * cell.cell.area)
+        self._below = 0.02 * float(scale)
+        self._condense()
+
+    def lowest(
+        self,
+        wave: Wave,
+        count: int = 1,
+        near: BlochModes | None = None,
+        tolerance: float = 1e-14,
+    ) -> BlochModes:
+        """The ``count`` lowest eigenpairs, at Γ without the two translations.
+
+        Lanczos with the inverse of K + s M; s is so large that this is positive definite, which
+        its factors prove, so the eigenvalues nearest to -s are the lowest.
+
+        Parameters
+        ----------
+        wave
+            Phases (k . a1, k . a2) [rad].
+        count
+            Number of eigenpairs.
+        near
+            Those of a wave vector nearby, as a start.
+        tolerance
+            About the relative error of lambda + s that is allowed.
+        """
+        values, vectors = self.iterated(phases_of([wave]), count, near, tolerance)
+        return BlochModes(wave, values[0], vectors[:, 0])
+
+    def iterated(
+        self, waves: FloatArray, count: int, near: BlochModes | None, tolerance: float
+    ) -> tuple[FloatArray, Batch]:
+        """What ``lowest`` does, for several waves that are alike: see ``scan``.
+
+        Parameters
+        ----------
+        waves
+            (w, 2) phases [rad]: all of them Γ, all where T(k) is real, or all elsewhere.
+        count, near, tolerance
+            As in ``lowest``.
+
+        Returns
+        -------
+        values, vectors
+            (w, count) and (size, w, count).
+        """
+        solver, below = self._solver_below(waves)
+        T = self.cell.reduction.copies.at(waves)
+
+        def weigh(block: Batch) -> Batch:
+            return T.gather(applied(self.cell.nodal_mass.__matmul__, T.spread(block)))
+
+        start = self._start(T.dtype, count, near)[:, None]
+        fixed = self._translations() if _are_centre(waves).all() else start[:, :, :0]
+        start, fixed = (np.repeat(vectors, len(waves), axis=1) for vectors in (start, fixed))
+        inverse, vectors = largest(solver.solve, weigh, start, fixed, tolerance)
+        return 1.0 / inverse - below, vectors
+
+    def unstable(self, wave: Wave) -> int:
+        """Number of negative eigenvalues, by the inertia of one factor; not for Γ itself."""
+        phases_of([wave])
+        self.factorisations += 1
+        return negative_pivots(factorise(self.stiffness.at(wave)))
+
+    def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
+        """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
+        self.factorisations += 1
+        condensation = Condensation(self.state.stiffness, self.cell.reduction.outline)
+        waves = phases_of(points)
+        bad = [condensation.at(wave[None]) is None for wave in waves]
+        return tuple(wave for wave, is_bad in zip(points, bad, strict=True) if is_bad)
+
+    def slope(self, modes: BlochModes) -> FloatArray:
+        """(2,) derivatives of the lowest eigenvalue by k . a1 and k . a2 (Hellmann-Feynman)."""
+        x, value = modes.vectors[:, 0], modes.eigenvalues[0]
+        parts = [
+            self.stiffness.slope(modes.wave, axis) @ x
+            - value * (self.cell.mass.slope(modes.wave, axis) @ x)
+            for axis in (0, 1)
+        ]
+        return np.array([np.vdot(x, part).real for part in parts])
+
+    def acoustic(self, angle: float) -> float:
+        """Smallest eigenvalue of the acoustic tensor Q_ik = L_ijkl n_j n_l [MPa].
+
+        The limit of filling * lambda / |k|^2 for waves much longer than the cell that travel
+        along n = (cos, sin) of ``angle`` [rad]. Where it reaches zero the effective medium
+        loses ellipticity (Geymonat, Mueller & Triantafyllidis, Arch. Ration. Mech. Anal. 122
+        (1993) 231-290).
+        """
+        n = np.array([np.cos(angle), np.sin(angle)])
+        Q = np.einsum("ijkl,j,l->ik", self.state.moduli, n, n)
+        return float(np.linalg.eigvalsh(0.5 * (Q + Q.T))[0])
+
+    def long_wave(self) -> tuple[float, float]:
+        """The smallest acoustic eigenvalue over all directions [MPa], and its angle [rad]."""
+        angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+        best = float(min(angles, key=self.acoustic))
+        width = np.pi / _DIRECTIONS
+        found = minimize_scalar(
+            lambda turn: self.acoustic(best + turn), bounds=(-width, width), method="bounded"
+        )
+        if found.fun < self.acoustic(best):
+            return float(found.fun), best + float(found.x)
+        return self.acoustic(best), best
+
+    def _solver_below(self, waves: FloatArray) -> tuple[CondensedWaves, float]:
+        """The inverses of K + s M, and s; from now on a larger s where that isn't enough."""
+        while True:
+            solver = self._condensation.at(waves)
+            if solver is not None:
+                return solver, self._below
+            self._below *= 2.0
+            self._condense()
+
+    def _condense(self) -> None:
+        self.factorisations += 1
+        shifted = csr_array(self.state.stiffness + self._below * self.cell.nodal_mass)
+        self._condensation = Condensation(shifted, self.cell.reduction.outline)
+
+    def _start(self, dtype: Any, count: int, near: BlochModes | None) -> Batch:
+        """(size, count) vectors to begin with: those of ``near``, and always some noise.
+
+        Eigenvectors of one wave vector may all lack the symmetry of a mode that comes down at
+        the next; without noise the iteration would never find it.
+        """
+        shape = 2, self.cell.reduction.size, count
+        real, imaginary = np.random.default_rng(7).standard_normal(shape)
+        noise = real if dtype.kind == "f" else real + 1j * imaginary
+        if near is None or near.vectors.dtype != dtype or near.vectors.shape != noise.shape:
+            return np.asarray(noise)
+        sizes = np.linalg.norm(near.vectors, axis=0) / np.linalg.norm(noise, axis=0)
+        return np.asarray(near.vectors + _NOISE * sizes * noise)
+
+    def _translations(self) -> FloatArray:
+        """(size, 1, 2) orthonormal translations along x and y."""
+        axis = self.cell.reduction.order % 2
+        moves = np.stack([axis == 0, axis == 1], axis=1)[:, None]
+        return np.asarray(moves / math.sqrt(self.cell.filling * self.cell.cell.area))
+
+
+def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArray:
+    """(n, count) lowest eigenvalues at many wave vectors [N/mm^4].
+
+    All of them are iterated together, and each factorises but a small dense matrix.
+    """
+    phases = phases_of(points)
+    values = np.empty((len(points), count))
+    for group in _alike(phases):
+        values[group], _ = waves.iterated(phases[group], count, None, _SCAN_TOLERANCE)
+    return values
+
+
+def phases_of(points: Sequence[Wave]) -> FloatArray:
+    """(n, 2) phases [rad] of wave vectors, checked.
+
+    Raises
+    ------
+    InputError
+        If one is not two finite real numbers.
+    """
+    waves = []
+    for point in points:
+        wave = np.asarray(point)
+        if wave.shape != (2,) or wave.dtype.kind not in "iuf" or not np.isfinite(wave).all():
+            raise InputError(
+                "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers "
+                f"[rad] (the wave lies in the plane), got {point}"
+            )
+        waves.append(wave)
+    return np.array(waves, dtype=np.float64).reshape(-1, 2)
+
+
+def _alike(waves: FloatArray) -> list[NDArray[np.int64]]:
+    """Numbers of the waves that can be iterated together: Γ, other real ones, and some others."""
+    is_real, is_centre = _are_centre(2.0 * waves), _are_centre(waves)
+    others = np.flatnonzero(~is_real)
+    parts = np.array_split(others, math.ceil(len(others) / _TOGETHER) or 1)
+    groups = [np.flatnonzero(is_centre), np.flatnonzero(is_real & ~is_centre), *parts]
+    return [group for group in groups if len(group)]
+
+
+def _are_centre(waves: FloatArray) -> NDArray[np.bool_]:
+    turns = waves / (2.0 * np.pi)
+    return np.asarray(np.all(np.abs(turns - np.rint(turns)) < 1e-12, axis=1))
+
+
+Operator = Callable[[Batch], Batch]
+
+_LARGEST_SPACE = 60  # in blocks
+
+
+def largest(
+    solve: Operator, weigh: Operator, start: Batch, fixed: Batch, tolerance: float
+) -> tuple[FloatArray, Batch]:
+    """The largest eigenvalues of A^-1 M, as many for each problem as ``start`` has vectors.
+
+    Every new block is made orthogonal to all others: there are few.
+
+    Parameters
+    ----------
+    solve, weigh
+        A^-1 and M, both positive definite, applied to batches (size, w, m).
+    start
+        (size, w, m) to begin with.
+    fixed
+        (size, w, f) M-orthonormal vectors to be left out of the space.
+    tolerance
+        About the relative error of the eigenvalues that is allowed.
+
+    Returns
+    -------
+    values, vectors
+        (w, m) descending, and (size, w, m) M-orthonormal.
+    """
+    count, width = start.shape[2], start.shape[1]
+    images, spaces = [weigh(fixed)], [fixed]
+    block = start - _mixed(fixed, _products(images[0], start))
+    block, image, _ = _orthonormal(block, weigh)
+    projected: Batch = np.zeros((width, 0, 0))
+    for _ in range(_LARGEST_SPACE):
+        spaces.append(block)
+        images.append(image)
+        block = solve(image)
+        columns = [_products(weighted, block) for weighted in images]
+        for vectors, column in zip(spaces, columns, strict=True):
+            block = block - _mixed(vectors, column)
+        projected = _bordered(projected, np.concatenate(columns[1:], axis=1))
+        block, image, rest = _orthonormal(block, weigh)
+        values, mix = np.linalg.eigh(projected)
+        values, mix = values[:, ::-1][:, :count], mix[:, :, ::-1][:, :, :count]
+        residual = np.linalg.norm(rest @ mix[:, -count:], axis=1)
+        if np.all(residual**2 <= tolerance * values**2):
+            break
+    parts = np.split(mix, len(spaces) - 1, axis=1)
+    found = sum(_mixed(vectors, part) for vectors, part in zip(spaces[1:], parts, strict=True))
+    return values, np.asarray(found)
+
+
+def _products(left: Batch, right: Batch) -> Batch:
+    """(w, i, j) left_i^H right_j."""
+    return np.asarray(np.einsum("nwi,nwj->wij", left.conj(), right))
+
+
+def _mixed(vectors: Batch, factors: Batch) -> Batch:
+    """(size, w, j) sum of vectors_i factors_ij."""
+    return np.asarray(np.einsum("nwi,wij->nwj", vectors, factors))
+
+
+def _orthonormal(block: Batch, weigh: Operator) -> tuple[Batch, Batch, Batch]:
+    """The block made M-orthonormal, its image by M, and R with block = orthonormal . R."""
+    image = weigh(block)
+    R = np.linalg.cholesky(_products(block, image)).conj().transpose(0, 2, 1)
+    inverse = np.linalg.inv(R)
+    return _mixed(block, inverse), _mixed(image, inverse), R
+
+
+def _bordered(projected: Batch, column: Batch) -> Batch:
+    """The projected matrices with one block column more, Hermitian."""
+    old, new = projected.shape[1], column.shape[1]
+    result = np.zeros((len(column), new, new), dtype=column.dtype)
+    result[:, :old, :old] = projected
+    result[:, :, old:] = column
+    result[:, old:, :old] = column[:, :old].conj().transpose(0, 2, 1)
+    return result

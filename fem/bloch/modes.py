@@ -1,0 +1,313 @@
+"""Modes and branches of a lattice as plain numpy, and their files (HDF5, VTU, XDMF).
+
+Neither dolfinx nor gmsh is needed to hold, read or use these. HDF5, to be read with h5py alone;
+m modes on a cell of n nodes::
+
+    @format "modeharvest-modes-1"   @element "T6"   @normalisation (in words)
+    @load  load parameter of the state whose tangent the modes belong to [-]
+    @info  JSON: material, loading, whether and where it is critical, versions ...
+    nodes (n, 2) [mm], undeformed      cells (e, 6), nodes as in VTK, from 0
+    lattice (2, 2) [mm], rows a1, a2 of this cell      primitive (2, 2) of the lattice itself
+    waves (m, 2) [rad], phases (k . a1, k . a2) from primitive cell to primitive cell
+    eigenvalues (m,) [N/mm^4]          shapes (m, n, 2) [-]      gradient (2, 2) F̄ [-]
+    branches/0000/combination (m,)  curve (p, 2) amplitude [mm], load [-]   @outcome
+    branches/0000/states/0000/displacement (n, 2) [mm]  gradient  stress [MPa]
+                              amplitudes (m,) [mm]      @load @energy @primary_energy [MPa]
+                              @negative_eigenvalues
+
+VTU and XDMF (one file each) have the same fields as point data whose names tell what they are and
+in which unit, and the rest as JSON in a comment at the top.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+
+from modeharvest.fem.field import Mesh
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
+
+Wave = tuple[float, float]
+
+NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i = j, otherwise 0"
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSet:
+    """Real modes of a lattice on its smallest cell that has their period.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh of the commensurate cell, undeformed [mm].
+    lattice, primitive
+        (2, 2) lattice vectors of that cell and of the primitive one, as rows [mm].
+    waves
+        (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
+    eigenvalues
+        (m,) of K x = lambda M x, M of unit density [N/mm^4]; near zero at a critical point.
+    shapes
+        (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
+        delta_ij. The sign is such that the first large component is positive. Waves with phases
+        other than 0 and pi have their modes in pairs, which are the real and imaginary part.
+    load
+        Load parameter of the state whose tangent they belong to [-].
+    gradient
+        (2, 2) F̄ of that state [-].
+    info
+        Plain JSON values: lattice, material, loading, whether and where it is critical, versions.
+    """
+
+    mesh: Mesh
+    lattice: FloatArray
+    primitive: FloatArray
+    waves: tuple[Wave, ...]
+    eigenvalues: FloatArray
+    shapes: FloatArray
+    load: float
+    gradient: FloatArray
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.waves)
+        expected = {
+            "shapes": (count, len(self.mesh.nodes), 2),
+            "eigenvalues": (count,),
+            "lattice": (2, 2),
+            "primitive": (2, 2),
+            "gradient": (2, 2),
+        }
+        for name, shape in expected.items():
+            values = getattr(self, name)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise InputError(
+                    f"modes: expected finite {name} of shape {shape}, got {values.shape}"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class BranchState:
+    """An equilibrium of the commensurate cell beyond the critical point.
+
+    Parameters
+    ----------
+    load
+        [-].
+    gradient, stress
+        (2, 2) F̄ [-] and P̄ [MPa].
+    energy, primary_energy
+        Stored energy per area of the cell, here and on the primary path at the same load [MPa];
+        NaN where that path ends before. Under a stress other than 0 the lower energy minus
+        P̄ : F̄ is what is preferred.
+    negative_eigenvalues
+        Of the cell's tangent with F̄'s free components; 0: stable against its own period.
+    displacement
+        (n, 2) of the mesh's nodes [mm].
+    amplitudes
+        (m,) mean over the material of (u - affine part - primary fluctuation) . phi_i [mm].
+    """
+
+    load: float
+    gradient: FloatArray
+    stress: FloatArray
+    energy: float
+    primary_energy: float
+    negative_eigenvalues: int
+    displacement: FloatArray
+    amplitudes: FloatArray
+
+    def fluctuation(self, mesh: Mesh) -> FloatArray:
+        """(n, 2) displacement without its affine part (F̄ - I) X [mm]."""
+        return np.asarray(self.displacement - mesh.nodes @ (self.gradient - np.eye(2)).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A buckled branch: which combination of modes it started with, and its states.
+
+    Parameters
+    ----------
+    combination
+        (m,) coefficients of the modes at the start, of unit length [-].
+    states
+        By load; empty if it could not be followed. A load that the branch meets twice is there
+        twice.
+    outcome
+        In words.
+    curve
+        (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
+        the critical one first.
+    """
+
+    combination: tuple[float, ...]
+    states: tuple[BranchState, ...]
+    outcome: str
+    curve: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+
+
+FORMAT = "modeharvest-modes-1"
+_SQUEEZED = {"compression": 6, "shuffle": True}
+_NUMBERS = ("load", "energy", "primary_energy", "negative_eigenvalues")
+_ARRAYS = ("displacement", "gradient", "stress", "amplitudes")
+
+
+def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
+    """Write HDF5, atomically and without loss; the layout is in the module's docstring.
+
+    Raises
+    ------
+    InputError
+        If the file can't be written.
+    """
+    with atomic_hdf5(path) as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["element"] = modes.mesh.element
+        file.attrs["normalisation"] = NORMALISATION
+        file.attrs["load"] = modes.load
+        file.attrs["info"] = json.dumps(dict(modes.info))
+        file.create_dataset("nodes", data=modes.mesh.nodes, **_SQUEEZED)
+        file.create_dataset("cells", data=modes.mesh.cells.astype(np.int32), **_SQUEEZED)
+        file.create_dataset("shapes", data=modes.shapes, **_SQUEEZED)
+        file["waves"] = np.asarray(modes.waves, dtype=np.float64)
+        for name in ("lattice", "primitive", "eigenvalues", "gradient"):
+            file[name] = getattr(modes, name)
+        for k, branch in enumerate(branches):
+            _write_branch(file.create_group(f"branches/{k:04d}"), branch)
+
+
+def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
+    """Read what :func:`write_modes` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cut short, of another format or inconsistent.
+    """
+    with open_hdf5(path, "modes (HDF5)", "make it again with 'modeharvest modes'", FORMAT) as file:
+        modes = _read_set(file)
+        groups = file.get("branches", {})
+        branches = tuple(_read_branch(groups[name], modes) for name in sorted(groups))
+        return modes, branches
+
+
+def write_vtu(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
+    """Write modes and branches as VTU for ParaView, atomically."""
+    _write_meshio(path, modes, branches, "vtu")
+
+
+def write_xdmf(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
+    """Write modes and branches as XDMF with all numbers in the one file, atomically."""
+    _write_meshio(path, modes, branches, "xdmf", data_format="XML")
+
+
+def _read_set(file: h5py.File) -> ModeSet:
+    mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
+    return ModeSet(
+        mesh=mesh,
+        lattice=file["lattice"][:],
+        primitive=file["primitive"][:],
+        waves=tuple((float(p), float(q)) for p, q in file["waves"][:]),
+        eigenvalues=file["eigenvalues"][:],
+        shapes=file["shapes"][:],
+        load=float(file.attrs["load"]),
+        gradient=file["gradient"][:],
+        info=json.loads(file.attrs["info"]),
+    )
+
+
+def _write_branch(group: h5py.Group, branch: Branch) -> None:
+    group.attrs["outcome"] = branch.outcome
+    group["combination"] = np.asarray(branch.combination, dtype=np.float64)
+    group["curve"] = branch.curve
+    for k, state in enumerate(branch.states):
+        place = group.create_group(f"states/{k:04d}")
+        for name in _NUMBERS:
+            place.attrs[name] = getattr(state, name)
+        for name in _ARRAYS:
+            place.create_dataset(name, data=getattr(state, name), **_SQUEEZED)
+
+
+def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
+    groups = group.get("states", {})
+    states = tuple(_read_state(groups[name]) for name in sorted(groups))
+    for state in states:
+        if state.displacement.shape != modes.mesh.nodes.shape:
+            raise InputError(
+                f"displacements of shape {state.displacement.shape} on {len(modes.mesh.nodes)} "
+                "nodes"
+            )
+    combination = tuple(float(c) for c in group["combination"][:])
+    return Branch(combination, states, str(group.attrs["outcome"]), group["curve"][:])
+
+
+def _read_state(group: h5py.Group) -> BranchState:
+    values: dict[str, Any] = {name: float(group.attrs[name]) for name in _NUMBERS}
+    values["negative_eigenvalues"] = int(values["negative_eigenvalues"])
+    return BranchState(**values, **{name: group[name][:] for name in _ARRAYS})
+
+
+def _write_meshio(
+    path: Path | str, modes: ModeSet, branches: Sequence[Branch], kind: str, **options: str
+) -> None:
+    points = _in_space(modes.mesh.nodes)
+    fields = {name: _in_space(values) for name, values in _fields(modes, branches).items()}
+    mesh = meshio.Mesh(points, [("triangle6", modes.mesh.cells)], point_data=fields)
+    with atomic(path) as temporary:
+        mesh.write(temporary, file_format=kind, **options)
+        _comment(temporary, _described(modes, branches))
+
+
+def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, FloatArray]:
+    """Nodal vectors by names that tell what they are."""
+    named = {}
+    for k, (wave, shape) in enumerate(zip(modes.waves, modes.shapes, strict=True), start=1):
+        phases = "_".join(f"{phase / np.pi:.4g}pi" for phase in wave)
+        named[f"mode_{k}_phases_{phases}_unit_mean_square"] = shape
+    for k, branch in enumerate(branches, start=1):
+        for number, state in enumerate(branch.states, start=1):
+            where = f"branch_{k}_state_{number}_load_{state.load:.6g}"
+            named[f"{where}_displacement_mm"] = state.displacement
+            named[f"{where}_fluctuation_mm"] = state.fluctuation(modes.mesh)
+    return named
+
+
+def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
+    """All that isn't a nodal field, as plain JSON values."""
+    return {
+        "format": FORMAT,
+        "normalisation": NORMALISATION,
+        "load": modes.load,
+        "gradient": modes.gradient.tolist(),
+        "lattice_mm": modes.lattice.tolist(),
+        "primitive_mm": modes.primitive.tolist(),
+        "waves_rad": [list(wave) for wave in modes.waves],
+        "eigenvalues_N_per_mm4": modes.eigenvalues.tolist(),
+        "branches": [
+            {"combination": list(branch.combination), "outcome": branch.outcome}
+            for branch in branches
+        ],
+        "info": dict(modes.info),
+    }
+
+
+def _comment(path: Path, content: dict[str, Any]) -> None:
+    """Put JSON into a comment before the first element of an XML file."""
+    text = path.read_text("utf-8")
+    # Comments may not contain two hyphens; within JSON's strings they can be written otherwise.
+    words = json.dumps(content).replace("--", "-\\u002d")
+    start = text.index("?>") + 2 if text.startswith("<?xml") else 0
+    path.write_text(f"{text[:start]}\n<!-- {words} -->{text[start:]}".lstrip(), "utf-8")
+
+
+def _in_space(values: FloatArray) -> FloatArray:
+    """(n, 3) of (n, 2): VTK knows no plane."""
+    return np.hstack([values, np.zeros((len(values), 1))])

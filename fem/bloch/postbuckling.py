@@ -1,0 +1,266 @@
+"""The buckled branches of a periodic cell, from the critical load on.
+
+A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
+load is an unknown, which is regular where the branch leaves the primary path and where its load
+has a maximum or minimum; so branches along which the load falls are followed as well. The states
+at given loads are then met exactly. Contact isn't modelled: a branch ends where the material would
+run into itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
+from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
+from modeharvest.fem.lattice.options import BranchOptions
+from modeharvest.fem.lattice.periodicity import overlaps
+from modeharvest.fem.path.predictor import BranchPoint, amplitude_at, predicted, stacked
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+
+_BEFORE = 1e-4  # of the critical load: where the primary path is regular enough
+_CRITICAL = 1e-3  # of the eigenvalues' scale: what a critical mode may have
+_NEAR = 0.5  # of a step: how far from where it is expected a point may be
+_REFINEMENTS = 6
+
+
+def follow(
+    path: CellPath,
+    modes: ModeSet,
+    combination: Sequence[float],
+    loads: Sequence[float],
+    options: BranchOptions | None = None,
+    progress: Progress = silent,
+) -> Branch:
+    """Follow the branch that starts along a combination of critical modes.
+
+    Only the amplitude of the combination is prescribed; all else, other modes included, is free
+    to follow, and ``BranchState.amplitudes`` tell what became of it.
+
+    Parameters
+    ----------
+    path
+        Primary path of the commensurate cell: that of ``modes.mesh``, such as
+        ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``.
+    modes
+        Modes of a critical state.
+    combination
+        (m,) coefficients; only their ratios and signs count. The opposite is the other half of
+        the branch.
+    loads
+        At which to report states [-]. One that the branch meets twice is reported twice.
+    options, progress
+        Step lengths; called with the load reached.
+
+    Raises
+    ------
+    InputError
+        If the cell isn't that of the modes, or the combination doesn't fit them. A branch that
+        can't be followed is an outcome, not an exception.
+    """
+    _check(path.cell, modes, combination, loads)
+    mix = np.asarray(combination, dtype=np.float64)
+    return _Tracing(path, modes, mix / np.linalg.norm(mix), options or BranchOptions()).run(
+        sorted(loads), progress
+    )
+
+
+class _Tracing:
+    """One branch of one cell; ``points`` are those passed, ``stopped`` is why there are no more."""
+
+    def __init__(
+        self, path: CellPath, modes: ModeSet, mix: FloatArray, options: BranchOptions
+    ) -> None:
+        self.cell, self.loading = path.cell, path.loading
+        self.modes, self.mix, self.options = modes, mix, options
+        self.pitch = float(np.linalg.norm(modes.primitive, axis=1).min())
+        reduction, mass = self.cell.reduction, self.cell.nodal_mass
+        shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
+        # (m, size): times the fluctuation they are the amplitudes of the modes.
+        self.weights = reduction.gathered(np.asarray(mass @ shapes.T)).T / material
+        self.mass = self.cell.mass.at((0.0, 0.0)) / material
+        below = path.at((1.0 - _BEFORE) * modes.load)
+        self.primary = CellPath(self.cell, self.loading, [] if below is None else [below])
+        self.points: list[BranchPoint] = []
+        self.stopped = ""
+
+    def run(self, loads: list[float], progress: Progress) -> Branch:
+        """March along the branch, and report the loads asked for."""
+        states: list[BranchState] = []
+        for _ in self._march():
+            here, there = self.points[-2:]
+            progress(there.load, loads[-1], "buckled branch")
+            low, high = sorted((here.load, there.load))
+            met = [load for load in loads if low <= load <= high and load != here.load]
+            found = [self._at_load(here, there, load) for load in met]
+            states += [self._report(state) for state in found if state is not None]
+            is_past = there.load > loads[-1] and there.rates[0] > 0
+            if is_past or {state.load for state in states}.issuperset(loads):
+                break
+        states.sort(key=lambda state: state.load)
+        curve = np.array([(p.amplitude, p.load) for p in self.points]).reshape(-1, 2)
+        mix = tuple(float(c) for c in self.mix)
+        return Branch(mix, tuple(states), self._in_words(states, loads), curve)
+
+    def _in_words(self, states: list[BranchState], loads: list[float]) -> str:
+        if not self.points:
+            return f"not followed: {self.stopped}"
+        start, last = self.points[0], self.points[-1]
+        if len(self.points) == 1:
+            return (
+                f"not followed from the load {start.load:.6g} on: {self.stopped}; perhaps no "
+                "branch starts along this combination of the modes"
+            )
+        way = "rises" if self.points[1].load > start.load else "falls"
+        text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
+        text += f"amplitude {last.amplitude:.4g} mm"
+        text += f"; {self.stopped}" if self.stopped else ""
+        met = {state.load for state in states}
+        missing = ", ".join(f"{load:.6g}" for load in loads if load not in met)
+        return text + (f"; not met: {missing}" if missing else "")
+
+    def _march(self) -> Iterator[None]:
+        """Add to ``points`` by growing amplitude, pausing after each but the critical one."""
+        start = self._start()
+        if start is None:
+            return
+        self.points.append(start)
+        options, step = self.options, self.options.first * self.pitch
+        while self.points[-1].amplitude + step <= options.farthest * self.pitch:
+            found = self._at_amplitude(self.points[-2:], self.points[-1].amplitude + step)
+            if isinstance(found, str):
+                step *= 0.5
+                if step < 0.05 * options.first * self.pitch:
+                    self.stopped = found
+                    return
+                continue
+            if len(self.points) == 1:
+                self.points[0] = self._turned(start, found)
+            self.points.append(found)
+            yield
+            step = min(options.growth * step, options.longest * self.pitch)
+        self.stopped = f"the largest amplitude asked for is {options.farthest} of the pitch"
+
+    def _start(self) -> BranchPoint | None:
+        """The critical point, extrapolated from where the tangent is regular, and the mode."""
+        load = self.modes.load
+        if not self.primary.states:
+            self.stopped = f"no equilibrium of the primary path near the load {load:.6g}"
+            return None
+        below = self.primary.states[0]
+        scale = np.linalg.norm(below.moduli) / (self.cell.filling * self.cell.cell.area)
+        largest = float(np.abs(self.modes.eigenvalues[self.mix != 0]).max())
+        if largest > _CRITICAL * scale:
+            self.stopped = (
+                f"the modes are not critical at the load {load:.6g}, their largest eigenvalue is "
+                f"{largest:.3g} N/mm^4"
+            )
+            return None
+        values = stacked(below.load, below.gradient, below.fluctuation)
+        values += (load - below.load) * stacked(1.0, below.gradient_rate, below.fluctuation_rate)
+        self.origin = values[5:]
+        return BranchPoint(0.0, values, stacked(0.0, np.zeros((2, 2)), self._direction(self.mix)))
+
+    def _direction(self, mix: FloatArray) -> FloatArray:
+        """A combination of the modes as a fluctuation; one master is held by a translation."""
+        periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
+        at_masters = np.empty((periodicity.count, 2))
+        at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
+        return np.asarray((at_masters - at_masters[0]).ravel()[order])
+
+    def _turned(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
+        """The start with the direction in which the branch really leaves, to judge by a point."""
+        amplitudes = self.weights @ (first.values[5:] - self.origin)
+        direction = self._direction(amplitudes) * (1.0 / first.amplitude)
+        return replace(start, rates=stacked(0.0, np.zeros((2, 2)), direction))
+
+    def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
+        """The point of the branch at an amplitude, from one or two before it; or why not."""
+        weights, guess = self.mix @ self.weights, predicted(points, amplitude)
+        wanted = Amplitude(weights, amplitude + float(weights @ self.origin))
+        found = self._corrected(guess, wanted)
+        if isinstance(found, Failure):
+            return found.value
+        if self._overlaps(found):
+            return "the material would run into itself (contact is not modelled)"
+        off = found.fluctuation - guess[5:]
+        if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
+            return "another branch is nearer"
+        rates = stacked(1.0, found.gradient_rate, found.fluctuation_rate)
+        rates /= weights @ found.fluctuation_rate
+        return BranchPoint(amplitude, stacked(found.load, found.gradient, found.fluctuation), rates)
+
+    def _corrected(
+        self, guess: FloatArray, amplitude: Amplitude | None = None
+    ) -> CellState | Failure:
+        load, F, w = float(guess[0]), guess[1:5].reshape(2, 2), guess[5:]
+        return self.cell.corrected(self.loading, load, F, w, amplitude)
+
+    def _at_load(self, here: BranchPoint, there: BranchPoint, load: float) -> CellState | None:
+        """The state between two points at a load, which one of them is below and one above."""
+        for _ in range(_REFINEMENTS):
+            between = (here, there)
+            amplitude = amplitude_at(load, between)
+            guess = predicted(between, amplitude)
+            guess[0] = load
+            found = self._corrected(guess)
+            if isinstance(found, CellState):
+                got = float(self.mix @ self.weights @ (found.fluctuation - self.origin))
+                # Under a prescribed load Newton may fall back to the primary path.
+                if abs(got - amplitude) < 0.5 * min(amplitude, there.amplitude - here.amplitude):
+                    return None if self._overlaps(found) else found
+            middle = self._at_amplitude(between, amplitude)
+            if isinstance(middle, str):
+                return None
+            is_beyond = (middle.load - load) * (here.load - load) <= 0
+            here, there = (here, middle) if is_beyond else (middle, there)
+        return None
+
+    def _overlaps(self, state: CellState) -> bool:
+        cell = self.cell.cell
+        return overlaps(cell.mesh, cell.lattice, state.gradient, self.cell.displacement(state))
+
+    def _report(self, state: CellState) -> BranchState:
+        """The state as plain numpy, beside the primary path at the same load."""
+        cell, primary = self.cell, self.primary.at(state.load)
+        before = self.origin if primary is None else primary.fluctuation
+        u = cell.displacement(state)
+        return BranchState(
+            load=state.load,
+            gradient=state.gradient,
+            stress=state.stress,
+            energy=cell.body.energy(u) / cell.cell.area,
+            primary_energy=(
+                math.nan
+                if primary is None
+                else cell.body.energy(cell.displacement(primary)) / cell.cell.area
+            ),
+            negative_eigenvalues=cell.negative_eigenvalues(self.loading, state),
+            displacement=u,
+            amplitudes=self.weights @ (state.fluctuation - before),
+        )
+
+
+def _check(
+    cell: PeriodicCell, modes: ModeSet, combination: Sequence[float], loads: Sequence[float]
+) -> None:
+    if cell.cell.mesh.nodes.shape != modes.mesh.nodes.shape or not np.allclose(
+        cell.cell.mesh.nodes, modes.mesh.nodes, atol=1e-9 * np.abs(modes.lattice).max()
+    ):
+        raise InputError(
+            "branch: expected the path of the cell the modes live on, got another mesh; make it "
+            f"with cell.enlarged{tuple(modes.info.get('copies', ('m', 'n')))}"
+        )
+    if len(combination) != len(modes.waves) or not 0 < np.linalg.norm(combination) < math.inf:
+        raise InputError(
+            f"branch: expected {len(modes.waves)} coefficients of modes, not all 0, got "
+            f"{tuple(combination)}"
+        )
+    if not len(loads) or not np.isfinite(loads).all():
+        raise InputError(f"branch: expected one finite load or more, got {tuple(loads)}")

@@ -1,0 +1,188 @@
+"""Real buckling modes of a lattice, on the smallest cell that has their period.
+
+A Bloch eigenvector x of the primitive cell continues as u(X + R) = exp(i k . R) u(X). Where the
+phases of k are 2 pi times fractions, it repeats after m x n cells. If all phases are multiples
+of pi, u is real; otherwise its real and imaginary part are two modes, of the waves k and -k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from modeharvest import __version__
+from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, Wave
+from modeharvest.fem.bloch.modes import ModeSet
+from modeharvest.fem.bloch.zone import is_same
+from modeharvest.fem.lattice.cell import CellState, PeriodicCell
+from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+Turns = tuple[Fraction, Fraction]
+
+_SNAP = 1e-3  # rad: how near to a fraction a wave found by descent is
+_DEGENERATE = 1e-6  # of the eigenvalues' scale: values that far apart belong to one set
+_MULTIPLICITY = 4  # the most modes of one wave that are looked for
+_TOLERANCE = 1e-18  # of an eigenvalue; of a mode it is the root of this
+_LARGE = 0.9  # of the largest component: the first such fixes the phase
+
+
+def real_modes(
+    cell: PeriodicCell,
+    state: CellState,
+    waves: Sequence[Wave],
+    info: Mapping[str, Any] | None = None,
+    largest: int = 12,
+) -> ModeSet:
+    """The lowest modes at some waves as real fields on their smallest common m x n cell.
+
+    A wave with phases 0 or pi gives one mode (or all of a degenerate eigenvalue), any other
+    twice as many. Waves within a thousandth of a rad of a fraction are taken for it; a wave given
+    twice, or as k and -k, counts once.
+
+    Parameters
+    ----------
+    cell
+        The primitive cell.
+    state
+        Its equilibrium, usually ``LatticeCritical.state``.
+    waves
+        Phases (k . a1, k . a2) [rad], usually ``LatticeCritical.waves``.
+    info
+        Plain JSON values to be kept with the modes.
+    largest
+        The most copies along a1 or a2.
+
+    Raises
+    ------
+    InputError
+        If there is no wave (long waves are modes of no finite cell), one that isn't in the plane,
+        or one that doesn't repeat within ``largest`` cells.
+    """
+    turns = _distinct([_commensurate(wave, largest) for wave in waves])
+    if not turns:
+        raise InputError(
+            "modes: expected at least one wave, got none; waves much longer than the cell (loss of "
+            "ellipticity) are modes of no finite cell: name a commensurate wave, such as (π, π)"
+        )
+    m, n = (math.lcm(*(t[axis].denominator for t in turns)) for axis in (0, 1))
+    if max(m, n) > largest:
+        raise InputError(
+            f"modes: expected a common cell of at most {largest} x {largest} copies, got {m} x {n} "
+            "for these waves together; ask for fewer of them or a larger 'largest'"
+        )
+    enlarged, bloch = cell.cell.enlarged(m, n), BlochWaves(cell, state)
+    places = _copies(cell.cell, enlarged, (m, n))
+    found = [_lowest_set(bloch, _phases(turn)) for turn in turns]
+    shapes = [_real_fields(cell, modes, enlarged, places) for modes in found]
+    repeats = [len(s) // len(modes.eigenvalues) for s, modes in zip(shapes, found, strict=True)]
+    return ModeSet(
+        mesh=enlarged.mesh,
+        lattice=enlarged.lattice,
+        primitive=cell.cell.lattice,
+        waves=tuple(modes.wave for s, modes in zip(shapes, found, strict=True) for _ in s),
+        eigenvalues=np.concatenate(
+            [np.repeat(modes.eigenvalues, r) for modes, r in zip(found, repeats, strict=True)]
+        ),
+        shapes=np.concatenate(shapes),
+        load=state.load,
+        gradient=state.gradient,
+        info={**(info or {}), "copies": [m, n], "versions": {"modeharvest": __version__}},
+    )
+
+
+def _commensurate(wave: Wave, largest: int) -> Turns:
+    """k . a / 2 pi of both lattice vectors as fractions in [0, 1)."""
+    if np.shape(wave) != (2,) or not np.isfinite(wave).all():
+        raise InputError(
+            f"modes: expected waves as two finite phases (k . a1, k . a2) [rad], got {wave}"
+        )
+    exact = [float(phase) / (2.0 * math.pi) for phase in wave]
+    p, q = (Fraction(turn).limit_denominator(largest) for turn in exact)
+    if max(abs(p - exact[0]), abs(q - exact[1])) > _SNAP / (2.0 * math.pi):
+        raise InputError(
+            f"modes: expected a wave that repeats within {largest} cells along a1 and a2, got the "
+            f"phases ({wave[0]:.6g}, {wave[1]:.6g}) rad; take a fraction of 2π nearby, or a larger "
+            "'largest'"
+        )
+    return p % 1, q % 1
+
+
+def _phases(turns: Turns) -> Wave:
+    """Phases in (-pi, pi] [rad]."""
+    p, q = (2.0 * math.pi * float(t if t <= Fraction(1, 2) else t - 1) for t in turns)
+    return (p, q)
+
+
+def _distinct(turns: Sequence[Turns]) -> list[Turns]:
+    kept: list[Turns] = []
+    for turn in turns:
+        if not any(is_same(_phases(turn), _phases(other)) for other in kept):
+            kept.append(turn)
+    return kept
+
+
+def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
+    """The lowest eigenvalue at one wave with all of its eigenvectors."""
+    found = bloch.lowest(wave, _MULTIPLICITY, tolerance=_TOLERANCE)
+    cell = bloch.cell
+    scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
+    values = found.eigenvalues
+    count = int(np.sum(values - values[0] < _DEGENERATE * scale))
+    return BlochModes(wave, values[:count], found.vectors[:, :count])
+
+
+def canonical(vectors: NDArray[Any]) -> NDArray[Any]:
+    """The basis of a space (size, m) that depends on nothing but the space.
+
+    The first vector has the largest possible value, real and positive, at the first component
+    that is large; the others are 0 there and go on likewise.
+    """
+    sizes = np.linalg.norm(vectors, axis=1)
+    row = vectors[int(np.argmax(sizes > _LARGE * sizes.max()))]
+    Q, _ = np.linalg.qr(np.column_stack([row.conj(), np.eye(len(row))]))
+    first = vectors @ (row.conj() / np.linalg.norm(row))
+    if len(row) == 1:
+        return np.asarray(first[:, None])
+    return np.column_stack([first, canonical(vectors @ Q[:, 1 : len(row)])])
+
+
+def _copies(cell: UnitCell, enlarged: UnitCell, copies: tuple[int, int]) -> NDArray[np.int64]:
+    """(m n, nodes) numbers in the enlarged mesh of the nodes of each copy of the cell."""
+    tree = cKDTree(enlarged.mesh.nodes)
+    shifts = product(range(copies[0]), range(copies[1]))
+    moved = [cell.mesh.nodes + np.array(shift) @ cell.lattice for shift in shifts]
+    return np.stack([tree.query(nodes)[1] for nodes in moved])
+
+
+def _real_fields(
+    cell: PeriodicCell, modes: BlochModes, enlarged: UnitCell, places: NDArray[np.int64]
+) -> FloatArray:
+    """(c, n, 2) orthonormal real fields on the enlarged cell that the Bloch vectors amount to."""
+    material = cell.filling * cell.cell.area
+    copies = np.rint(
+        (enlarged.mesh.nodes[places[:, 0]] - cell.cell.mesh.nodes[0])
+        @ np.linalg.inv(cell.cell.lattice)
+    )
+    phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
+    at_nodes = np.stack(
+        [cell.reduction.displacement(vector, modes.wave).ravel() for vector in modes.vectors.T], 1
+    )
+    fields: list[FloatArray] = []
+    for field in math.sqrt(material) * canonical(at_nodes).T:
+        whole = np.empty((len(enlarged.mesh.nodes), 2), dtype=np.complex128)
+        for place, phase in zip(places, phases, strict=True):
+            whole[place] = phase * field.reshape(-1, 2)
+        if np.isrealobj(modes.vectors):
+            fields.append(whole.real)
+        else:
+            fields += [math.sqrt(2.0) * whole.real, math.sqrt(2.0) * whole.imag]
+    return np.stack(fields)

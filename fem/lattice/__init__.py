@@ -1,0 +1,1 @@
+"""Infinite lattices by one periodic cell: meshes, periodicity, macroscopic loading, equilibrium."""

@@ -1,0 +1,345 @@
+"""A periodic cell under macroscopic loading: equilibrium, effective stiffness, path.
+
+The displacement is u = (F̄ - I) X + w with a periodic fluctuation w. Unknown are the masters'
+fluctuations and those components of F̄ whose mean stress is prescribed; one master is fixed,
+because translations cost nothing. The fluctuation is condensed with one factor of its stiffness.
+What remains are the free components of F̄ and, if an amplitude is prescribed, the load: a small
+dense system, which gives the lattice's effective tangent moduli as a by-product. With an amplitude
+prescribed it is regular on a branch however near to the point where it leaves the primary path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+
+from modeharvest.fem.hyperelastic import FreeBody
+from modeharvest.fem.lattice.bloch_map import Reduction, factorise, negative_pivots
+from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.options import MacroLoading
+from modeharvest.fem.materials import Material
+from modeharvest.util.arrays import FloatArray
+
+# Forces must be smaller than what a change of the load by this would make.
+_LOAD_TOLERANCE = 1e-11
+_AMPLITUDE_TOLERANCE = 1e-11  # relative
+_AT_REST = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CellState:
+    """An equilibrium of a cell on its primary path.
+
+    Parameters
+    ----------
+    load
+        The load parameter e: for compressions the nominal strain [-].
+    gradient, gradient_rate
+        (2, 2) F̄ and dF̄/de [-].
+    fluctuation, fluctuation_rate
+        (2 count,) w of the masters in the order of ``Reduction``, and dw/de [mm].
+    stress
+        (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
+    stiffness
+        (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
+    moduli
+        (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
+    """
+
+    load: float
+    gradient: FloatArray
+    gradient_rate: FloatArray
+    fluctuation: FloatArray
+    fluctuation_rate: FloatArray
+    stress: FloatArray
+    stiffness: csr_array
+    moduli: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Amplitude:
+    """A linear measure of the fluctuation w that is prescribed, while the load is found.
+
+    Parameters
+    ----------
+    weights
+        (2 count,) in the order of ``Reduction``; not those of a translation.
+    value
+        What ``weights . w`` must be [mm].
+    """
+
+    weights: FloatArray
+    value: float
+
+
+class LinearisedCell:
+    """The equations of a cell at a trial state.
+
+    Parameters
+    ----------
+    cell, loading
+        What is loaded, and how.
+    load
+        Of the trial state [-].
+    gradient, fluctuation
+        (4,) F̄ and (2 count,) w of the trial state [-, mm].
+    amplitude
+        If prescribed, the load is an unknown.
+    """
+
+    def __init__(
+        self,
+        cell: PeriodicCell,
+        loading: MacroLoading,
+        load: float,
+        gradient: FloatArray,
+        fluctuation: FloatArray,
+        amplitude: Amplitude | None = None,
+    ) -> None:
+        self.cell, self.loading, self.load = cell, loading, load
+        self.amplitude = amplitude
+        self.gradient, self.fluctuation = gradient, fluctuation
+        self.area = cell.cell.area
+        u = cell.displaced(gradient, fluctuation)
+        forces = cell.body.forces(u)
+        self.forces = cell.reduction.gathered(forces)[cell.moving]
+        self.macro_forces = cell.affine.T @ forces
+        self.is_regular = bool(np.isfinite(forces).all())
+        if self.is_regular:
+            self._eliminate(cell.body.stiffness(u))
+
+    def _eliminate(self, stiffness: csr_array) -> None:
+        """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
+        cell, moving = self.cell, np.flatnonzero(self.cell.moving)
+        self.stiffness, self.on_affine = stiffness, stiffness @ cell.affine
+        self.coupling = cell.reduction.gathered(self.on_affine)[moving]
+        inner = cell.reduction.reduced(stiffness).at(_AT_REST)[moving][:, moving]
+        cell.factorisations += 1
+        try:
+            self._factor: Any = factorise(csc_array(inner))
+        except RuntimeError:  # SuperLU: exactly singular
+            self.is_regular = False
+            return
+        self.response = -self._factor.solve(self.coupling)
+        self.condensed = cell.affine.T @ self.on_affine + self.coupling.T @ self.response
+        free = self.loading.free
+        self.rate = self.loading.rate
+        self.rate[free] = np.linalg.solve(
+            self.condensed[np.ix_(free, free)],
+            (self.area * self.loading.dead - self.condensed @ self.rate)[free],
+        )
+
+    @property
+    def _unbalanced(self) -> FloatArray:
+        """(4,) mean stress in excess of what is prescribed, times the area [N]; 0 elsewhere."""
+        excess = self.macro_forces - self.area * self.load * self.loading.dead
+        return np.where(self.loading.free, excess, 0.0)
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether no force, inner or macroscopic, is left."""
+        inner = _LOAD_TOLERANCE * np.linalg.norm(self.on_affine @ self.rate)
+        outer = _LOAD_TOLERANCE * np.linalg.norm(self.condensed) * np.linalg.norm(self.rate)
+        return bool(
+            np.linalg.norm(self.forces) <= inner
+            and np.linalg.norm(self._unbalanced) <= outer
+            and abs(self._excess) <= _AMPLITUDE_TOLERANCE * abs(self._wanted)
+        )
+
+    @property
+    def _wanted(self) -> float:
+        return 0.0 if self.amplitude is None else self.amplitude.value
+
+    @property
+    def _excess(self) -> float:
+        """The amplitude in excess of what is prescribed [mm]."""
+        if self.amplitude is None:
+            return 0.0
+        return float(self.amplitude.weights @ self.fluctuation) - self._wanted
+
+    def step(self) -> tuple[float, FloatArray, FloatArray]:
+        """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
+        free, relaxed = np.flatnonzero(self.loading.free), -self._factor.solve(self.forces)
+        # Unknown are the free components of F̄ and, if an amplitude is prescribed, the load.
+        along: FloatArray = np.zeros((4, len(free) + 1))
+        along[free, np.arange(len(free))] = 1.0
+        along[:, -1] = self.loading.rate
+        stiffness: FloatArray = self.condensed[free] @ along
+        stiffness[:, -1] -= self.area * self.loading.dead[free]
+        rest = (self._unbalanced + self.coupling.T @ relaxed)[free]
+        if self.amplitude is None:
+            along, stiffness = along[:, :-1], stiffness[:, :-1]
+        else:
+            weights = self.amplitude.weights[self.cell.moving]
+            stiffness = np.vstack([stiffness, weights @ self.response @ along])
+            rest = np.append(rest, self._excess + weights @ relaxed)
+        unknown = np.linalg.solve(stiffness, -rest)
+        dF = along @ unknown
+        change = 0.0 if self.amplitude is None else float(unknown[-1])
+        return change, dF, self._full(relaxed + self.response @ dF)
+
+    def state(self) -> CellState:
+        """The state reached, with its rates and moduli."""
+        return CellState(
+            load=self.load,
+            gradient=self.gradient.reshape(2, 2),
+            gradient_rate=self.rate.reshape(2, 2),
+            fluctuation=self.fluctuation,
+            fluctuation_rate=self._full(self.response @ self.rate),
+            stress=np.asarray(self.macro_forces.reshape(2, 2) / self.area),
+            stiffness=self.stiffness,
+            moduli=self.condensed.reshape(2, 2, 2, 2) / self.area,
+        )
+
+    def _full(self, moving: FloatArray) -> FloatArray:
+        every = np.zeros(self.cell.reduction.size)
+        every[self.cell.moving] = moving
+        return every
+
+
+_ITERATIONS = 12
+_SMALLEST_STEP = 1e-6  # of the load
+_ZERO_WAVE = (0.0, 0.0)
+
+
+class Failure(Enum):
+    """Why there is no equilibrium, in words."""
+
+    NOT_CONVERGED = "Newton's method did not converge"
+    REVERSED = "an element would be turned inside out (det F <= 0)"
+
+
+class PeriodicCell:
+    """One cell of a lattice with a material: what its equilibrium equations need.
+
+    ``nodal_mass`` and ``mass`` are the mass matrix of unit density [mm^2], unreduced and reduced,
+    ``filling`` is the share of the cell that is material [-]; ``factorisations`` counts every
+    factorisation of an equilibrium. ``affine`` (2 n, 4) are the displacements of F̄_11, F̄_12,
+    F̄_21 and F̄_22 [mm]; ``moving`` says which reduced unknowns are not held.
+
+    Parameters
+    ----------
+    cell
+        Mesh and lattice vectors [mm]; primitive or enlarged.
+    material
+        Strain energy density [MPa].
+    """
+
+    def __init__(self, cell: UnitCell, material: Material) -> None:
+        self.cell = cell
+        self.body = FreeBody(cell.mesh, material)
+        self.nodal_mass = self.body.mass()
+        self.reduction = Reduction(self.nodal_mass, cell.periodicity)
+        self.mass = self.reduction.reduced(self.nodal_mass)
+        self.filling = float(self.nodal_mass.sum()) / (2.0 * cell.area)
+        self.factorisations = 0
+        X, zero = cell.mesh.nodes, np.zeros(len(cell.mesh.nodes))
+        modes = [(X[:, 0], zero), (X[:, 1], zero), (zero, X[:, 0]), (zero, X[:, 1])]
+        self.affine = np.stack([np.stack(m, axis=1).ravel() for m in modes], axis=1)
+        self.moving = self.reduction.order // 2 != 0  # master 0 is held
+
+    def displacement(self, state: CellState) -> FloatArray:
+        """(n, 2) displacement of the mesh's nodes, affine part included [mm]."""
+        return self.displaced(state.gradient.ravel(), state.fluctuation)
+
+    def equilibrium(
+        self, loading: MacroLoading, load: float, near: CellState | None = None
+    ) -> CellState | None:
+        """The equilibrium at a load, by Newton's method along the tangent of a state nearby.
+
+        None where Newton's method does not arrive, or arrives at a reversed element.
+        """
+        F: FloatArray = np.eye(2)
+        w: FloatArray = np.zeros(self.reduction.size)
+        if near is not None:
+            F = near.gradient + (load - near.load) * near.gradient_rate
+            w = near.fluctuation + (load - near.load) * near.fluctuation_rate
+        found = self.corrected(loading, load, F, w)
+        return found if isinstance(found, CellState) else None
+
+    def corrected(
+        self,
+        loading: MacroLoading,
+        load: float,
+        gradient: FloatArray,
+        fluctuation: FloatArray,
+        amplitude: Amplitude | None = None,
+    ) -> CellState | Failure:
+        """The equilibrium that Newton's method finds from a guess of F̄ (2, 2) and w.
+
+        With an ``amplitude`` prescribed the load is a guess, too. A reversed element is a
+        failure.
+        """
+        F: FloatArray = gradient.ravel()
+        w = fluctuation
+        for _ in range(_ITERATIONS):
+            F = np.where(loading.free, F, np.eye(2).ravel() + load * loading.rate)
+            system = LinearisedCell(self, loading, load, F, w, amplitude)
+            if not system.is_regular:
+                return Failure.NOT_CONVERGED
+            if system.is_solved:
+                u = self.displaced(F, w)
+                sound = self.body.smallest_jacobian(u) > 0
+                return system.state() if sound else Failure.REVERSED
+            try:
+                change, dF, dw = system.step()
+            except np.linalg.LinAlgError:  # exactly singular
+                return Failure.NOT_CONVERGED
+            load, F, w = load + change, F + dF, w + dw
+        return Failure.NOT_CONVERGED
+
+    def negative_eigenvalues(self, loading: MacroLoading, state: CellState) -> int:
+        """Number of negative eigenvalues of the tangent in w and the free components of F̄.
+
+        Those of w with F̄ held, and of the moduli of the free components (Haynsworth, Linear
+        Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
+        """
+        moving = np.flatnonzero(self.moving)
+        inner = self.reduction.reduced(state.stiffness).at(_ZERO_WAVE)[moving][:, moving]
+        self.factorisations += 1
+        free = loading.free
+        moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
+        outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
+        return negative_pivots(factorise(csc_array(inner))) + int(np.sum(outer < 0))
+
+    def displaced(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
+        """(n, 2) displacement of the mesh's nodes for F̄ (4,) and w (2 count,) [mm]."""
+        affine = (self.affine @ (gradient - np.eye(2).ravel())).reshape(-1, 2)
+        return np.asarray(affine + self.reduction.displacement(fluctuation, _ZERO_WAVE))
+
+
+@dataclass(eq=False)
+class CellPath:
+    """The primary path of a cell under one loading; states already found are kept."""
+
+    cell: PeriodicCell
+    loading: MacroLoading
+    states: list[CellState] = field(default_factory=list)
+
+    def at(self, load: float) -> CellState | None:
+        """The equilibrium at a load [-], from the nearest state known by as many steps as needed.
+
+        None where steps down to 1e-6 don't converge.
+        """
+        if not self.states:
+            start = self.cell.equilibrium(self.loading, 0.0)
+            if start is None:
+                return None
+            self.states.append(start)
+        here = min(self.states, key=lambda state: abs(state.load - load))
+        step = load - here.load
+        while here.load != load:
+            to = load if abs(load - here.load) <= abs(step) else here.load + step
+            found = self.cell.equilibrium(self.loading, to, here)
+            if found is None:
+                step *= 0.5
+                if abs(step) < _SMALLEST_STEP:
+                    return None
+                continue
+            self.states.append(found)
+            here = found
+        return here

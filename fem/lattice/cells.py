@@ -1,0 +1,395 @@
+"""Unit cells of infinite lattices as T6 meshes that fit exactly onto their own copies.
+
+Each is made of one small block that gmsh meshes and numpy reflects, turns and places, so
+that partner nodes agree to rounding and the mesh has the lattice's own symmetries.
+
+Chiral lattices are rings joined by ligaments that touch them tangentially. The paper shows a
+chiral metamaterial without its measures, so that geometry is this project's own choice, never the
+authors'. It is the one of Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2 (six ligaments),
+and its tetrachiral sister with four:
+
+- Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest
+  neighbours by straight ligaments of constant thickness.
+- A ligament's outer edge is tangent to the outer edge of the ring at either end, on opposite
+  sides of the line between the centres. So a ring turns when its ligaments are pushed.
+- No fillets: where a ligament's inner edge meets a ring, the boundary has a sharp notch, at
+  which strains are singular. Energies and eigenvalues therefore converge more slowly with the
+  mesh than those of round holes.
+
+:func:`refined_cell` divides each triangle into four while holes stay round: nested meshes show a
+rate of convergence undisturbed by a mesher's choices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.periodicity import Periodicity, find_periodicity
+from modeharvest.fem.meshing import (
+    MeshBlock,
+    divisions_of,
+    join,
+    mesh_block,
+    quarter_cell,
+    require_size,
+)
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+_MIRRORED = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+
+# Corners of irreducible zones as phases (k . a1, k . a2) [rad].
+SQUARE_ZONE = (
+    ("Γ", (0.0, 0.0)),
+    ("X", (math.pi, 0.0)),
+    ("M", (math.pi, math.pi)),
+    ("Y", (0.0, math.pi)),
+    ("Γ", (0.0, 0.0)),
+)
+"""Of a square lattice loaded along its axes (a quarter of the zone: x and y may differ)."""
+
+HEXAGONAL_ZONE = (
+    ("Γ", (0.0, 0.0)),
+    ("M", (math.pi, 0.0)),
+    ("K", (4 * math.pi / 3, 2 * math.pi / 3)),
+    ("Γ", (0.0, 0.0)),
+)
+"""Of a hexagonal lattice that keeps its sixfold symmetry (equibiaxial loading)."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnitCell:
+    """A piece of a lattice whose copies, moved by the lattice vectors, make up all of it.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh [mm].
+    lattice
+        (2, 2) lattice vectors a1 and a2 as rows [mm].
+
+    Raises
+    ------
+    InputError
+        If the mesh is not periodic; the message names the nodes without a partner.
+    """
+
+    mesh: Mesh
+    lattice: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lattice", np.array(self.lattice, dtype=np.float64))
+        _ = self.periodicity  # finds out, and says, what is wrong with the mesh
+
+    @cached_property
+    def periodicity(self) -> Periodicity:
+        """Which nodes are translates of which."""
+        return find_periodicity(self.mesh, self.lattice)
+
+    @property
+    def area(self) -> float:
+        """Area of the cell, holes included [mm^2]."""
+        return float(abs(np.linalg.det(self.lattice)))
+
+    def enlarged(self, m: int, n: int) -> UnitCell:
+        """The cell of m x n copies along a1 and a2.
+
+        Raises
+        ------
+        InputError
+            If there is less than one copy along either.
+        """
+        if m < 1 or n < 1:
+            raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
+        blocks = [
+            MeshBlock(self.mesh.nodes + np.array([i, j]) @ self.lattice, self.mesh.cells)
+            for i, j in product(range(m), range(n))
+        ]
+        shortest = float(np.linalg.norm(self.lattice, axis=1).min())
+        return UnitCell(join(blocks, 1e-7 * shortest), self.lattice * [[m], [n]])
+
+
+def square(pitch: float, diameter: float, size: float) -> UnitCell:
+    """The primitive cell of circular holes in square stacking, a hole's centre at the origin.
+
+    Parameters
+    ----------
+    pitch, diameter
+        Distance of the holes' centres l and diameter d [mm]; 0 < d < l.
+    size
+        Target edge length of the elements [mm].
+    """
+    _check(pitch, diameter, size)
+    quarter = quarter_cell(pitch, diameter, size)
+    mesh = join([quarter.placed(s, (0.0, 0.0)) for s in _MIRRORED], 1e-7 * pitch)
+    return UnitCell(mesh, pitch * np.eye(2))
+
+
+def hexagonal(pitch: float, diameter: float, size: float) -> UnitCell:
+    """The primitive cell of circular holes in hexagonal stacking: a hexagon about one hole.
+
+    a1 points along x, a2 stands 60 degrees from it. ``hexagonal(...).enlarged(2, 2)`` is the
+    4-hole cell, which has room for the modes of all three M points.
+
+    Parameters
+    ----------
+    pitch, diameter
+        Distance of the holes' centres and their diameter [mm]; 0 < d < pitch.
+    size
+        Target edge length of the elements [mm].
+    """
+    _check(pitch, diameter, size)
+    wedge = _wedge(pitch, diameter, size)
+    blocks = []
+    for k in range(6):
+        for sign in (1.0, -1.0):
+            blocks.append(wedge.placed((1.0, sign), (0.0, 0.0)).turned(k * math.pi / 3))
+    a2 = [0.5, 0.5 * math.sqrt(3.0)]
+    return UnitCell(join(blocks, 1e-7 * pitch), pitch * np.array([[1.0, 0.0], a2]))
+
+
+def _wedge(pitch: float, diameter: float, size: float) -> MeshBlock:
+    """A twelfth of the hexagon, from the middle of a ligament up to a junction."""
+    half, radius, angle = 0.5 * pitch, 0.5 * diameter, math.pi / 6
+    long = half / math.cos(angle)
+    arc_end = (radius * math.cos(angle), radius * math.sin(angle))
+    corners = [(radius, 0.0), (half, 0.0), (half, half * math.tan(angle)), arc_end]
+    lengths = [half - radius, half * math.tan(angle), long - radius, angle * radius]
+    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[3])
+
+
+def _check(pitch: float, diameter: float, size: float) -> None:
+    if not 0 < diameter < pitch < math.inf:
+        raise InputError(
+            "unit cell: expected 0 < diameter < pitch (holes must not touch), got "
+            f"diameter = {diameter} mm, pitch = {pitch} mm"
+        )
+    require_size(size, pitch**2)
+
+
+HANDEDNESS = ("clockwise", "counterclockwise")
+
+# Shares of the pitch. Ligaments are then 18 times as long as thick, so that they bend rather
+# than shorten, and yet thick enough for elements of pitch / 20. Rings of twice that thickness
+# turn rather than being squeezed: their squeezing is what keeps Poisson's ratio from -1.
+RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS = 0.25, 0.1, 0.05
+
+
+def chiral(
+    pitch: float,
+    size: float,
+    ligaments: int = 6,
+    ring_radius: float | None = None,
+    ring_thickness: float | None = None,
+    ligament_thickness: float | None = None,
+    handedness: str = "clockwise",
+) -> UnitCell:
+    """The primitive cell of a ring-and-ligament lattice, a ring's centre at the origin.
+
+    a1 points along x; a2 stands 90 degrees (tetrachiral) or 60 degrees (hexachiral) from it.
+    ``enlarged(2, 2)`` has room for modes that change sign from ring to ring.
+
+    Parameters
+    ----------
+    pitch
+        Distance of neighbouring rings' centres, the lattice constant [mm].
+    size
+        Target edge length of the elements [mm]; where walls are thinner than that, elements
+        are as long as the wall is thick. Half of that thickness is a good choice.
+    ligaments
+        Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
+    ring_radius
+        Outer radius of the rings [mm]; 0.25 pitch unless given.
+    ring_thickness
+        Of the rings' walls [mm]; 0.1 pitch unless given.
+    ligament_thickness
+        [mm]; 0.05 pitch unless given.
+    handedness
+        The sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
+        leaves its ring. One lattice is the mirror image of the other.
+
+    Raises
+    ------
+    InputError
+        If rings touch, or ligaments are too thick to leave their ring apart from each other or
+        to have a free length.
+    """
+    shape = _RingAndLigaments(
+        pitch,
+        RING_RADIUS * pitch if ring_radius is None else ring_radius,
+        RING_THICKNESS * pitch if ring_thickness is None else ring_thickness,
+        LIGAMENT_THICKNESS * pitch if ligament_thickness is None else ligament_thickness,
+        ligaments,
+    )
+    require_size(size, pitch**2)
+    if handedness not in HANDEDNESS:
+        raise InputError(
+            f"chiral cell: expected handedness {' or '.join(map(repr, HANDEDNESS))}, got "
+            f"{handedness!r}"
+        )
+    sector = shape.sector(min(size, shape.ring_thickness, shape.ligament_thickness))
+    if handedness == "counterclockwise":
+        sector = sector.placed((1.0, -1.0), (0.0, 0.0))
+    angle = 2 * math.pi / ligaments
+    mesh = join([sector.turned(k * angle) for k in range(ligaments)], 1e-7 * pitch)
+    a2 = [0.0, 1.0] if ligaments == 4 else [0.5, 0.5 * math.sqrt(3.0)]
+    return UnitCell(mesh, pitch * np.array([[1.0, 0.0], a2]))
+
+
+@dataclass(frozen=True)
+class _RingAndLigaments:
+    """What the outline is made of [mm].
+
+    In the ligament's own frame the ring is about the origin and the ligament runs along x
+    between y = ring_radius - ligament_thickness and y = ring_radius, up to its middle.
+    """
+
+    pitch: float
+    ring_radius: float
+    ring_thickness: float
+    ligament_thickness: float
+    ligaments: int
+
+    def __post_init__(self) -> None:
+        if self.ligaments not in (4, 6):
+            raise InputError(
+                "chiral cell: expected 4 (tetrachiral) or 6 (hexachiral) ligaments, got "
+                f"{self.ligaments}"
+            )
+        if not 0 < 2 * self.ring_radius < self.pitch < math.inf:
+            raise InputError(
+                "chiral cell: expected 0 < 2 ring_radius < pitch (rings must not touch), got "
+                f"ring_radius = {self.ring_radius} mm, pitch = {self.pitch} mm"
+            )
+        if not 0 < self.ring_thickness < self.ring_radius:
+            raise InputError(
+                "chiral cell: expected 0 < ring_thickness < ring_radius, got "
+                f"ring_thickness = {self.ring_thickness} mm, ring_radius = {self.ring_radius} mm"
+            )
+        thickest = self.ring_radius * (1.0 - math.cos(2 * math.pi / self.ligaments))
+        if not 0 < self.ligament_thickness < thickest:
+            raise InputError(
+                f"chiral cell: expected 0 < ligament_thickness < {thickest:.4g} mm (the ligaments "
+                f"of a ring must not touch), got {self.ligament_thickness} mm; make ligaments "
+                "thinner or rings larger"
+            )
+        if not self.middle > self.foot:
+            raise InputError(
+                "chiral cell: expected ligaments with a free length, got rings "
+                f"{self.pitch - 2 * self.ring_radius:.4g} mm apart with ligaments "
+                f"{self.ligament_thickness} mm thick; make rings smaller or ligaments thinner"
+            )
+
+    @property
+    def middle(self) -> float:
+        """x of the ligament's middle, half its length between tangent points."""
+        across = self.ring_radius - 0.5 * self.ligament_thickness
+        return math.sqrt((0.5 * self.pitch) ** 2 - across**2)
+
+    @property
+    def foot(self) -> float:
+        """x at which the ligament's inner edge leaves the ring."""
+        return math.sqrt((2 * self.ring_radius - self.ligament_thickness) * self.ligament_thickness)
+
+    def sector(self, size: float) -> MeshBlock:
+        """Half a ligament with its share of the ring, the ligament's middle at (pitch / 2, 0).
+
+        The ring is cut halfway between the feet of two ligaments, the ligament across its middle;
+        uniform divisions of that cut are their own image under half a turn.
+        """
+        outer, inner = self.ring_radius, self.ring_radius - self.ring_thickness
+        y = outer - self.ligament_thickness
+        leaves, touches = math.atan2(y, self.foot), 0.5 * math.pi
+        free = 2 * math.pi / self.ligaments - (touches - leaves)
+        low, high = leaves - 0.5 * free, touches + 0.5 * free
+        corners = [
+            _polar(inner, low),
+            _polar(outer, low),
+            (self.foot, y),
+            (self.middle, y),
+            (self.middle, outer),
+            (0.0, outer),
+            _polar(outer, high),
+            _polar(inner, high),
+        ]
+        lengths = [
+            self.ring_thickness,
+            0.5 * free * outer,
+            self.middle - self.foot,
+            self.ligament_thickness,
+            self.middle,
+            0.5 * free * outer,
+            self.ring_thickness,
+            2 * math.pi / self.ligaments * inner,
+        ]
+        divisions = [divisions_of(length, size) for length in lengths]
+        block = mesh_block(corners, divisions, arcs=[1, 5, 7])
+        return block.turned(-math.atan2(outer - 0.5 * self.ligament_thickness, self.middle))
+
+
+def _polar(radius: float, angle: float) -> tuple[float, float]:
+    return radius * math.cos(angle), radius * math.sin(angle)
+
+
+_REFERENCE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
+_CHILDREN = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+_SIDES = ((0, 1, 3), (1, 2, 4), (2, 0, 5))
+_NEAR = 0.02  # of the radius: what of the boundary belongs to a hole
+
+
+def refined(mesh: Mesh, onto: Callable[[FloatArray], FloatArray], tolerance: float) -> Mesh:
+    """The mesh with every element divided into four along its own curved coordinates.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh [mm].
+    onto
+        Moves nodes (n, 2) of the mesh's boundary onto the true one [mm].
+    tolerance
+        Nodes closer than this become one [mm].
+    """
+    blocks = []
+    for child in _CHILDREN:
+        corners = _REFERENCE[list(child)]
+        places = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
+        nodes = np.einsum("kn,end->ekd", _shape_functions(places), mesh.nodes[mesh.cells])
+        blocks.append(MeshBlock(nodes.reshape(-1, 2), np.arange(6 * len(nodes)).reshape(-1, 6)))
+    result = join(blocks, tolerance)
+    boundary = np.unique(_boundary_sides(result))
+    result.nodes[boundary] = onto(result.nodes[boundary])
+    return result
+
+
+def refined_cell(cell: UnitCell, diameter: float) -> UnitCell:
+    """A unit cell refined, with its circular hole about the origin [mm]."""
+    shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
+
+    def onto(nodes: FloatArray) -> FloatArray:
+        stretch = 0.5 * diameter / np.linalg.norm(nodes, axis=1)
+        return np.where(np.abs(stretch - 1.0) < _NEAR, stretch, 1.0)[:, None] * nodes
+
+    return UnitCell(refined(cell.mesh, onto, 1e-7 * shortest), cell.lattice)
+
+
+def _boundary_sides(mesh: Mesh) -> NDArray[np.int64]:
+    """(s, 3) nodes of the sides that belong to one element only."""
+    sides = mesh.cells[:, _SIDES].reshape(-1, 3)
+    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
+    return np.asarray(sides[first[count == 1]])
+
+
+def _shape_functions(places: FloatArray) -> FloatArray:
+    """(k, 6) of the T6 at reference coordinates (k, 2)."""
+    x, y = places.T
+    z = 1.0 - x - y
+    corners = [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1)]
+    return np.stack([*corners, 4 * x * z, 4 * x * y, 4 * y * z], axis=1)

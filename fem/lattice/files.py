@@ -1,0 +1,382 @@
+"""Unit cells of one's own: from a mesh that meshio reads, or from a gmsh model.
+
+Lengths are millimetres. Triangles become a plane T6 mesh, counter-clockwise, neither flat nor
+folded. What the copies of a cell must do to fit together is checked by ``periodicity``, which
+names the nodes that don't.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import gmsh
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.fem.field import Mesh, read_any_mesh
+from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.meshing import REVERSED_T6, gmsh_options, quiet_gmsh, require_size
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import reading, require_file
+
+Cells = dict[str, IntArray]  # by meshio's names of the elements
+
+GEOMETRY = (".geo", ".geo_unrolled", ".step", ".stp", ".brep", ".iges", ".igs")
+"""Suffixes of the files that gmsh meshes."""
+
+_PROBE = """
+import gmsh, sys
+gmsh.initialize(interruptible=False)
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.merge(sys.argv[1])
+"""
+_PROBE_SECONDS = 300.0
+_FARTHEST = 1e9
+"""From the origin [mm]; a damaged file's nodes are anywhere."""
+_LOWER = ("vertex", "line")  # what meshes hold besides their elements
+
+
+def read_cell(
+    path: Path | str, lattice: ArrayLike | None = None, size: float | None = None
+) -> UnitCell:
+    """Read the unit cell of a lattice from a file.
+
+    Parameters
+    ----------
+    path
+        A mesh of six-node triangles in the x-y plane, in any format of meshio or gmsh; three-node
+        triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
+        (suffixes ``GEOMETRY``), whose opposite sides are divided alike. [mm] If a gmsh
+        file names physical surfaces, these are the material.
+    lattice
+        (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x and
+        y, as wide and as high as its material.
+    size
+        Largest edge length of the elements that gmsh makes of a geometry [mm]; None: what the
+        geometry itself says.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it can't be read; has no triangles, or other elements as
+        well; isn't plane; has elements inside out, or is not periodic.
+    """
+    path = Path(path)
+    require_file(path, "a cell (mesh or geometry)", "draw or export one")
+    is_geometry = path.suffix.lower() in GEOMETRY
+    if size is not None and not is_geometry:
+        raise InputError(
+            f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not for meshes"
+        )
+    if is_geometry or path.suffix.lower() == ".msh":
+        _require_readable(path)
+        with quiet_gmsh():
+            _merge(path)
+            return _from_model(lattice, size, is_geometry, str(path))
+    source = read_any_mesh(path)
+    cells: Cells = {}
+    for block in source.cells:
+        rows = [cells[block.type]] if block.type in cells else []
+        cells[block.type] = np.vstack([*rows, np.asarray(block.data, dtype=np.int64)])
+    return _unit_cell(np.asarray(source.points, dtype=np.float64), cells, lattice, str(path))
+
+
+def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) -> UnitCell:
+    """The unit cell in gmsh's current model, which stays open.
+
+    If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
+    divided alike. Parameters and errors are those of :func:`read_cell`.
+
+    Raises
+    ------
+    InputError
+        If there is no model; and as :func:`read_cell` does.
+    """
+    if not gmsh.isInitialized():
+        raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")
+    with gmsh_options({"General.Terminal": 0, "Mesh.MeshSizeMax": 1e22}):
+        to_mesh = not gmsh.model.mesh.getElementTypes(2).size
+        return _from_model(lattice, size, to_mesh, "gmsh model")
+
+
+def _require_readable(path: Path) -> None:
+    """Let a child read the file first: gmsh aborts the process on some damaged ones."""
+    with reading(path, "a file that gmsh reads", "export it again"):
+        command = [sys.executable, "-P", "-c", _PROBE, str(path)]
+        done = subprocess.run(command, capture_output=True, timeout=_PROBE_SECONDS, check=False)
+        if done.returncode < 0:
+            raise ValueError(f"a file that makes gmsh crash (signal {-done.returncode})")
+
+
+def _merge(path: Path) -> None:
+    unit = gmsh.option.getString("Geometry.OCCTargetUnit")
+    gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
+    try:
+        gmsh.merge(str(path))
+    except Exception as error:  # gmsh raises nothing else
+        raise InputError(
+            f"expected a file that gmsh reads at {path}, got: {_message(error)}"
+        ) from error
+    finally:
+        gmsh.option.setString("Geometry.OCCTargetUnit", unit)
+
+
+def _from_model(
+    lattice: ArrayLike | None, size: float | None, to_mesh: bool, source: str
+) -> UnitCell:
+    """The cell in gmsh's current model."""
+    if size is not None:
+        low, high = np.reshape(gmsh.model.getBoundingBox(-1, -1), (2, 3))[:, :2]
+        require_size(size, float(np.prod(high - low)))
+        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    if to_mesh:
+        try:
+            _mesh_periodically(lattice)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from error
+        except Exception as error:  # gmsh raises nothing else
+            raise InputError(
+                f"{source}: gmsh can't mesh it ({_message(error)}); holes must neither overlap nor "
+                "touch each other"
+            ) from error
+    return _unit_cell(*_current_mesh(), lattice, source)
+
+
+def _message(error: Exception) -> str:
+    return " ".join((str(error) or gmsh.logger.getLastError()).split())
+
+
+def _mesh_periodically(lattice: ArrayLike | None) -> None:
+    """T6 mesh of the current model whose sides are divided alike where a translation maps them."""
+    mesh = gmsh.model.mesh
+    mesh.clear()
+    mesh.generate(1)
+    surfaces = gmsh.model.getEntities(2)
+    _refuse_crossing({tag for _, tag in gmsh.model.getBoundary(surfaces, False, False)})
+    curves = [tag for _, tag in gmsh.model.getBoundary(surfaces, combined=True, oriented=False)]
+    outline = [_marks(tag) for tag in curves]
+    if outline:
+        vectors = _lattice(lattice, mesh.getNodes()[1].reshape(-1, 3)[:, :2])
+        for a, b, shift in _translates(outline, vectors):
+            if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set by the user
+                affine = np.eye(4)
+                affine[:2, 3] = shift
+                mesh.setPeriodic(1, [curves[b]], [curves[a]], affine.ravel())
+    mesh.clear()
+    mesh.generate(2)
+    mesh.setOrder(2)
+
+
+def _refuse_crossing(curves: set[int]) -> None:
+    """Curves must not cross: gmsh would try to mesh what they enclose, and never end."""
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    order = np.argsort(tags)
+    points = coordinates.reshape(-1, 3)[order, :2]
+    ends = [nodes for curve in curves for nodes in gmsh.model.mesh.getElements(1, curve)[2]]
+    lines = np.searchsorted(tags[order], np.concatenate([[], *ends])).reshape(-1, 2)
+    start, along = points[lines[:, 0]], points[lines[:, 1]] - points[lines[:, 0]]
+    for p, d in zip(start, along, strict=True):
+        near = 1e-6 * (d @ d)  # what is that near only touches
+
+        def apart(a: FloatArray, b: FloatArray, near: float = near) -> NDArray[np.bool_]:
+            return np.asarray((np.minimum(a, b) < -near) & (np.maximum(a, b) > near))
+
+        crossed = apart(_cross(d, start - p), _cross(d, start + along - p))
+        crossed &= apart(_cross(along, p - start), _cross(along, p + d - start))
+        if crossed.any():
+            raise InputError(
+                f"expected curves that don't cross, got some that do near ({p[0]:.5g}, {p[1]:.5g}) "
+                "mm; holes must neither overlap each other nor leave their surface"
+            )
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n,) cross products of vectors (n, 2) or (2,)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _marks(curve: int) -> FloatArray:
+    """(3, 2) ends, in the order of x and y, and middle of a curve of the current model [mm]."""
+    low, high = (float(bound[0]) for bound in gmsh.model.getParametrizationBounds(1, curve))
+    at = [low, high, 0.5 * (low + high)]
+    points = np.array(gmsh.model.getValue(1, curve, at)).reshape(3, 3)[:, :2]
+    if tuple(points[1]) < tuple(points[0]):
+        points = points[[1, 0, 2]]
+    return points
+
+
+def _translates(
+    outline: list[FloatArray], lattice: FloatArray
+) -> list[tuple[int, int, FloatArray]]:
+    """Pairs of curves, the second being the first moved by a vector; each is in one pair."""
+    near = 1e-6 * float(np.linalg.norm(lattice, axis=1).min())
+    found: list[tuple[int, int, FloatArray]] = []
+    paired: set[int] = set()
+    for shift in np.array([[1, 0], [0, 1], [1, 1], [-1, 1]]) @ lattice:
+        for a, start in enumerate(outline):
+            for b, end in enumerate(outline):
+                if not {a, b} & paired and np.abs(start + shift - end).max() < near:
+                    found.append((a, b, shift))
+                    paired |= {a, b}
+    return found
+
+
+def _current_mesh() -> tuple[FloatArray, Cells]:
+    """Nodes (n, 3) [mm] and elements of gmsh's current model: of its material, if it names one."""
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    order = np.argsort(tags)
+    groups = gmsh.model.getPhysicalGroups(2)
+    named = [
+        int(e) for _, group in groups for e in gmsh.model.getEntitiesForPhysicalGroup(2, group)
+    ]
+    cells: dict[str, list[IntArray]] = {}
+    for entity in named or [tag for _, tag in gmsh.model.getEntities(2)]:
+        for kind, _, nodes in zip(*gmsh.model.mesh.getElements(2, entity), strict=True):
+            _, _, degree, count, *_ = gmsh.model.mesh.getElementProperties(kind)
+            name = {(1, 3): "triangle", (2, 6): "triangle6"}.get((degree, count), f"{count}-node")
+            place = np.searchsorted(tags[order], nodes).reshape(-1, count)
+            cells.setdefault(name, []).append(place.astype(np.int64))
+    points = coordinates.reshape(-1, 3)[order]
+    return points, {name: np.vstack(blocks) for name, blocks in cells.items()}
+
+
+def _unit_cell(
+    points: FloatArray, cells: Mapping[str, IntArray], lattice: ArrayLike | None, source: str
+) -> UnitCell:
+    """Check a mesh as files hold it, put it in order, and find its periodicity."""
+    kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
+    if kinds not in (["triangle"], ["triangle6"]):
+        raise InputError(
+            f"{source}: expected triangles of three or of six nodes and nothing else, got "
+            f"{' and '.join(kinds) or 'no elements'}"
+        )
+    if not np.abs(points).max(initial=0.0) < _FARTHEST:
+        raise InputError(f"{source}: expected finite nodes less than {_FARTHEST:g} mm from 0")
+    try:
+        mesh = sound_t6(points, cells[kinds[0]])
+        if lattice is None:
+            _refuse_unless_rectangular(mesh)
+        return UnitCell(mesh, _lattice(lattice, mesh.nodes))
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def _refuse_unless_rectangular(mesh: Mesh) -> None:
+    """On each side of the rectangle around a mesh there must lie sides of elements."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    middles = mesh.nodes[np.unique(mesh.cells[:, 3:])]
+    near = 1e-6 * (high - low).min()
+    gaps = [np.abs(middles - bound).min(axis=0) for bound in (low, high)]
+    if np.max(gaps) > near:
+        raise InputError(
+            "expected lattice vectors as two rows, because the cell does not fill a rectangle of "
+            f"{high[0] - low[0]:.5g} x {high[1] - low[1]:.5g} mm along x and y, got none"
+        )
+
+
+def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:
+    """The lattice vectors given, or those of a rectangle around the nodes."""
+    if given is None:
+        return np.diag(np.ptp(nodes, axis=0))
+    try:
+        vectors = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        vectors = np.empty(0)
+    if vectors.shape != (2, 2) or not np.isfinite(vectors).all():
+        raise InputError(f"expected two lattice vectors of two numbers [mm] as rows, got {given}")
+    return vectors
+
+
+_SIDES = ((0, 1), (1, 2), (2, 0))
+
+
+def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:
+    """A plane T6 mesh, counter-clockwise, without unused nodes.
+
+    Parameters
+    ----------
+    points
+        (n, 2) or (n, 3) with z = const [mm].
+    cells
+        (m, 3) or (m, 6) node numbers, corners first; sides of three-node triangles get a node in
+        their middle.
+
+    Raises
+    ------
+    InputError
+        If the mesh isn't plane, elements lie upon each other, or one is flat or folded.
+    """
+    used, numbers = np.unique(cells, return_inverse=True)
+    nodes, cells = _in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)
+    if cells.shape[1] == 3:
+        nodes, cells = _with_mid_sides(nodes, cells)
+    a, b, c = (nodes[cells[:, k]] for k in range(3))
+    clockwise = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0
+    cells = np.where(clockwise[:, None], cells[:, REVERSED_T6], cells)
+    mesh = Mesh(nodes, cells, "T6")
+    _refuse_stacked(mesh)
+    _refuse_folded(mesh)
+    return mesh
+
+
+def _in_plane(points: FloatArray) -> FloatArray:
+    if not np.isfinite(points).all():
+        raise InputError("expected finite node positions, got NaN or infinity")
+    if points.shape[1] == 3 and np.ptp(points[:, 2]) > 1e-9 * np.ptp(points[:, :2]):
+        raise InputError(
+            f"expected a plane mesh, z = const, got z from {points[:, 2].min():.5g} to "
+            f"{points[:, 2].max():.5g} mm"
+        )
+    return points[:, :2]
+
+
+def _with_mid_sides(nodes: FloatArray, cells: IntArray) -> tuple[FloatArray, IntArray]:
+    ends = np.sort(np.stack([cells[:, side] for side in _SIDES], axis=1), axis=2)
+    sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    middles = nodes[sides].mean(axis=1)
+    return np.vstack([nodes, middles]), np.hstack([cells, len(nodes) + number.reshape(-1, 3)])
+
+
+def _refuse_stacked(mesh: Mesh) -> None:
+    middle, count = np.unique(mesh.cells[:, 3:], return_counts=True)
+    if count.max() > 2:
+        x, y = mesh.nodes[middle[np.argmax(count)]]
+        raise InputError(
+            f"expected sides of one or two elements, got one of {count.max()} at ({x:.5g}, "
+            f"{y:.5g}) mm; elements must not lie upon each other"
+        )
+
+
+def _refuse_folded(mesh: Mesh) -> None:
+    bad = np.flatnonzero(_smallest_jacobians(mesh) <= 0)
+    if len(bad):
+        x, y = mesh.nodes[mesh.cells[bad[0], :3]].mean(axis=0)
+        raise InputError(
+            f"expected elements that are neither flat nor folded, got {len(bad)}, the first at "
+            f"({x:.5g}, {y:.5g}) mm"
+        )
+
+
+def _smallest_jacobians(mesh: Mesh) -> FloatArray:
+    """(m,) lower bounds of the Jacobians [mm^2]: their smallest Bernstein coefficients."""
+    at = np.linalg.det(np.einsum("pna,mnb->mpab", _GRADIENTS, mesh.nodes[mesh.cells]))
+    sides = [2 * at[:, 3 + k] - 0.5 * (at[:, p] + at[:, q]) for k, (p, q) in enumerate(_SIDES)]
+    return np.asarray(np.minimum(at[:, :3].min(axis=1), np.min(sides, axis=0)))
+
+
+def _gradients(xi: float, eta: float) -> FloatArray:
+    """(6, 2) derivatives of the shape functions."""
+    z = 1.0 - xi - eta
+    by_xi = [1 - 4 * z, 4 * xi - 1, 0.0, 4 * (z - xi), 4 * eta, -4 * eta]
+    by_eta = [1 - 4 * z, 0.0, 4 * eta - 1, -4 * xi, 4 * xi, 4 * (z - eta)]
+    return np.stack([by_xi, by_eta], axis=1)
+
+
+# At the element's own nodes, which determine a Jacobian that is quadratic.
+_GRADIENTS = np.array(
+    [_gradients(*p) for p in [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)]]
+)

@@ -1,0 +1,155 @@
+"""Options of a lattice's analysis: macroscopic loading, search of the critical point, branches.
+
+Plain dataclasses, checked where they are built; neither dolfinx nor gmsh is needed for them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+
+@dataclass(frozen=True)
+class CriticalSearch:
+    """How the first critical point is looked for.
+
+    Parameters
+    ----------
+    largest
+        Load up to which to look [-].
+    divisions
+        Of each axis of the zone; an even number has the points M and X on the grid.
+    first_step, largest_step
+        Steps of the load [-].
+    tolerance
+        To which the critical load is located [-].
+    """
+
+    largest: float = 0.3
+    divisions: int = 8
+    first_step: float = 1e-3
+    largest_step: float = 0.02
+    tolerance: float = 1e-10
+
+    def __post_init__(self) -> None:
+        lengths = (self.largest, self.first_step, self.largest_step, self.tolerance)
+        if not all(0 < length < math.inf for length in lengths) or self.divisions < 2:
+            raise InputError(
+                "search for a critical point: expected positive loads, steps and tolerance and at "
+                f"least 2 divisions, got {self}"
+            )
+
+
+@dataclass(frozen=True)
+class BranchOptions:
+    """How a branch is followed; lengths are shares of the primitive cell's shorter vector.
+
+    Parameters
+    ----------
+    first, longest
+        First and largest step of the amplitude, the rms displacement in the mode [-].
+    growth
+        Of the step from one point to the next.
+    farthest
+        The amplitude where to give up [-].
+    """
+
+    # At small amplitudes the directions of a degenerate set are all but equivalent.
+    first: float = 0.01
+    longest: float = 0.02
+    growth: float = 1.6
+    farthest: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.first <= self.longest <= self.farthest < math.inf or self.growth < 1:
+            raise InputError(
+                f"branch: expected 0 < first <= longest <= farthest and growth >= 1, got {self}"
+            )
+
+
+Rates = tuple[tuple[float | None, float | None], tuple[float | None, float | None]]
+
+
+@dataclass(frozen=True)
+class MacroLoading:
+    """For each component either of F̄ or of P̄ a value proportional to the load e.
+
+    F̄_ij = δ_ij + e · gradient_ij where that is given; where it is None, P̄_ij = e · stress_ij
+    (first Piola-Kirchhoff, over the whole cell, holes included) and F̄_ij is found.
+
+    Parameters
+    ----------
+    gradient
+        dF̄/de, row by row [-]; None where the stress is prescribed.
+    stress
+        dP̄/de [MPa]; 0 (a free side) unless given. Of no account where ``gradient`` is given.
+    """
+
+    gradient: Rates
+    stress: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+
+    def __post_init__(self) -> None:
+        if not all(len(x) == 2 == len(x[0]) == len(x[1]) for x in (self.gradient, self.stress)):
+            raise InputError(
+                "macroscopic loading: expected gradient and stress as two rows of two, got "
+                f"{self.gradient} and {self.stress}"
+            )
+        given = [g for row in self.gradient for g in row if g is not None]
+        if not np.isfinite([*given, *np.ravel(self.stress)]).all():
+            raise InputError(f"macroscopic loading: expected finite rates, got {self}")
+        if self.gradient[0][1] is None and self.gradient[1][0] is None:
+            raise InputError(
+                "macroscopic loading: expected F̄_12 or F̄_21 to be prescribed (otherwise the "
+                "lattice is free to rotate), got neither; set one of them to 0"
+            )
+        if not any(given) and not np.any(self.dead):
+            raise InputError(f"macroscopic loading: expected a rate other than 0, got {self}")
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(4,) where F̄ (11, 12, 21, 22) is not prescribed but P̄ is."""
+        return np.array([g is None for row in self.gradient for g in row])
+
+    @property
+    def rate(self) -> FloatArray:
+        """(4,) dF̄/de, 0 where not prescribed."""
+        return np.array([g or 0.0 for row in self.gradient for g in row])
+
+    @property
+    def dead(self) -> FloatArray:
+        """(4,) dP̄/de [MPa], 0 where F̄ is prescribed."""
+        return np.where(self.free, np.ravel(self.stress), 0.0)
+
+
+def uniaxial(axis: int = 0) -> MacroLoading:
+    """Compression by the nominal strain e along an axis (0: x, 1: y), the other side free."""
+    return _compression(axis, None)
+
+
+def uniaxial_strain(axis: int = 0) -> MacroLoading:
+    """Compression by the nominal strain e along an axis (0: x, 1: y), no lateral strain."""
+    return _compression(axis, 0.0)
+
+
+def equibiaxial() -> MacroLoading:
+    """Compression by the nominal strain e along both axes."""
+    return MacroLoading(((-1.0, 0.0), (0.0, -1.0)))
+
+
+def simple_shear() -> MacroLoading:
+    """F̄ = I + e · (x ⊗ y): planes y = const slide along x."""
+    return MacroLoading(((0.0, 1.0), (0.0, 0.0)))
+
+
+def _compression(axis: int, lateral: float | None) -> MacroLoading:
+    if axis not in (0, 1):
+        raise InputError(f"macroscopic loading: expected the axis 0 (x) or 1 (y), got {axis}")
+    if axis == 0:
+        return MacroLoading(((-1.0, 0.0), (0.0, lateral)))
+    return MacroLoading(((lateral, 0.0), (0.0, -1.0)))

@@ -1,0 +1,261 @@
+"""Periodicity of a cell's mesh: nodes that a lattice vector carries into each other.
+
+The copies of a cell, moved by all integer combinations of two lattice vectors, must fit
+together: nodes upon nodes wherever material meets material. The cell may have any boundary (a
+parallelogram, a hexagon, one that cuts through holes), as long as its copies tile the lattice.
+Of a deformed cell :func:`overlaps` tells whether it has run into itself: contact isn't modelled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.field import Mesh
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+# Neighbours that can touch a cell whose outline reaches no further than two cells.
+_NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
+# The three sides of a T6: two corners and the node between them.
+_SIDES = np.array([[0, 1, 3], [1, 2, 4], [2, 0, 5]])
+
+
+@dataclass(frozen=True, eq=False)
+class Periodicity:
+    """The nodes of a cell as translates of independent ones ("masters").
+
+    Parameters
+    ----------
+    lattice
+        (2, 2) lattice vectors a1 and a2 as rows [mm].
+    master
+        (n,) number of each node's master, 0 ... count - 1.
+    shift
+        (n, 2) integers R: a node is at its master's position + R1 a1 + R2 a2.
+    """
+
+    lattice: FloatArray
+    master: IntArray
+    shift: IntArray
+
+    @property
+    def count(self) -> int:
+        """Number of masters."""
+        return int(self.master.max()) + 1
+
+
+def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -> Periodicity:
+    """Pair the nodes of a T6 mesh that a lattice translation carries into each other.
+
+    Parameters
+    ----------
+    mesh
+        One cell [mm].
+    lattice
+        (2, 2) lattice vectors a1 and a2 as rows [mm].
+    tolerance
+        Largest distance of partners, as a share of the shorter lattice vector [-].
+
+    Raises
+    ------
+    InputError
+        If the vectors are parallel; if copies of the cell overlap, touch without common nodes,
+        or don't hold together along both vectors. The message names the nodes.
+    """
+    lattice = np.asarray(lattice, dtype=np.float64)
+    if mesh.element != "T6":
+        raise InputError(f"periodic cell: expected a T6 mesh, got {mesh.element}")
+    lengths = np.linalg.norm(lattice, axis=1) if lattice.shape == (2, 2) else np.zeros(2)
+    if lattice.shape != (2, 2) or not (
+        1e-6 * np.prod(lengths) < abs(np.linalg.det(lattice)) < np.inf
+    ):
+        raise InputError(
+            "periodic cell: expected two lattice vectors that are not parallel, as rows [mm], "
+            f"got {lattice.tolist()}"
+        )
+    distance = tolerance * float(lengths.min())
+    pairs = _pairs(mesh.nodes, lattice, distance)
+    sides = _boundary_sides(mesh)
+    _refuse_overlap(mesh, lattice, np.unique(sides))
+    _refuse_hanging(mesh, lattice, sides, pairs)
+    found = _classes(mesh.nodes, lattice, pairs)
+    _refuse_loose(mesh, found, sides)
+    return found
+
+
+def _pairs(nodes: FloatArray, lattice: FloatArray, distance: float) -> IntArray:
+    """(p, 2) numbers of nodes that a nonzero translation carries from one to the other."""
+    tree, found = cKDTree(nodes), []
+    for r in _NEIGHBOURS:
+        near, partner = tree.query(nodes + np.array(r) @ lattice, distance_upper_bound=distance)
+        mine = np.flatnonzero(np.isfinite(near))
+        found.append(np.stack([mine, partner[mine]], axis=1))
+    return np.vstack(found).astype(np.int64)
+
+
+def _classes(nodes: FloatArray, lattice: FloatArray, pairs: IntArray) -> Periodicity:
+    n = len(nodes)
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(n, n))
+    _, master = connected_components(links, directed=False)
+    _, first = np.unique(master, return_index=True)
+    shift = np.rint((nodes - nodes[first[master]]) @ np.linalg.inv(lattice))
+    return Periodicity(lattice, master.astype(np.int64), shift.astype(np.int64))
+
+
+def _boundary_sides(mesh: Mesh) -> IntArray:
+    """(s, 3) corner, corner, mid-side of the sides with one element, material to their left."""
+    sides = mesh.cells[:, _SIDES].reshape(-1, 3)
+    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
+    return np.asarray(sides[first[count == 1]])
+
+
+def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None:
+    inner = np.setdiff1d(mesh.cells[:, :3], boundary)
+    covered = _covered(mesh, lattice, mesh.nodes[inner])
+    if covered.any():
+        raise InputError(
+            "periodic cell: expected copies of the cell to meet at its boundary only, but they "
+            f"overlap at {_named(inner[covered], mesh.nodes)}; check the lattice vectors"
+        )
+
+
+def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: IntArray) -> None:
+    """Material may meet another copy's material only where all three nodes of a side agree."""
+    matched = np.isin(sides, pairs).all(axis=1)
+    a, b, middle = mesh.nodes[sides[~matched]].transpose(1, 0, 2)
+    along = b - a
+    # A little outside of the side: in the void if the surface is free.
+    outside = middle + 0.02 * np.stack([along[:, 1], -along[:, 0]], axis=1)
+    covered = _covered(mesh, lattice, outside)
+    if covered.any():
+        lost = np.setdiff1d(sides[~matched][covered], pairs)
+        lost = lost if len(lost) else np.unique(sides[~matched][covered])
+        raise InputError(
+            "periodic cell: expected a partner, one lattice translation away, for every node on "
+            f"the cell's outline, got none for {_named(lost, mesh.nodes)}; divide opposite sides "
+            "alike or check the lattice vectors"
+        )
+
+
+def _covered(mesh: Mesh, lattice: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    """Whether each point (n, 2) lies in the material of another copy of the cell."""
+    triangles = mesh.nodes[mesh.cells[:, :3]]
+    covered = np.zeros(len(points), dtype=bool)
+    for r in _NEIGHBOURS:
+        covered |= _inside_any(points + np.array(r) @ lattice, triangles)
+    return covered
+
+
+def _inside_any(points: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
+    """Whether each point (n, 2) lies in one of the triangles (m, 3, 2)."""
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    near = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
+    inside = np.zeros(len(points), dtype=bool)
+    for chunk in _chunks(near, 64):
+        corners = triangles[None] - points[chunk][:, None, None]
+        following = np.roll(corners, -1, axis=2)
+        area = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
+        inside[chunk] = np.any(np.all(area > 0, axis=2), axis=1)
+    return inside
+
+
+def _chunks(numbers: IntArray, size: int) -> Iterator[IntArray]:
+    return (numbers[k : k + size] for k in range(0, len(numbers), size))
+
+
+def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
+    """The lattice must be one body that holds together along both lattice vectors."""
+    piece = _pieces(found.master[mesh.cells], found.count)[found.master]
+    if piece.max() > 0:
+        largest = np.argmax(np.bincount(piece))
+        raise InputError(
+            "periodic cell: expected one body, got parts that nothing holds: "
+            f"{_named(np.flatnonzero(piece != largest), mesh.nodes)}; connect or remove them"
+        )
+    shifts = _cycle_shifts(mesh, found)
+    rank = np.linalg.matrix_rank(shifts) if len(shifts) else 0
+    if rank < 2:
+        outline = np.unique(sides)
+        alone = outline[np.bincount(found.master)[found.master[outline]] == 1]
+        raise InputError(
+            "periodic cell: expected the lattice to hold together along both lattice vectors, but "
+            f"{'no' if rank == 0 else 'only one'} direction has partners; without one are "
+            f"{_named(alone, mesh.nodes)}; check the lattice vectors"
+        )
+
+
+def _pieces(cells: IntArray, count: int) -> IntArray:
+    """(count,) which connected piece each node belongs to."""
+    start, end = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    links = coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def _cycle_shifts(mesh: Mesh, found: Periodicity) -> IntArray:
+    """(p, 2) differing shifts of nodes that are the same master and in the same piece."""
+    piece = _pieces(mesh.cells, len(mesh.nodes))
+    order = np.lexsort((piece, found.master))
+    same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
+    return np.asarray(np.unique(np.diff(found.shift[order], axis=0)[same], axis=0))
+
+
+def _named(numbers: IntArray, nodes: FloatArray, most: int = 4) -> str:
+    """'3 nodes: 5 at (0, 1.2) mm, ...' for a message."""
+    places = (f"{k} at ({nodes[k, 0]:.5g}, {nodes[k, 1]:.5g}) mm" for k in numbers[:most])
+    more = ", ..." if len(numbers) > most else ""
+    return f"{len(numbers)} nodes: {', '.join(places)}{more}"
+
+
+# A T6 as four triangles with straight sides, and its sides as corner, corner, middle.
+_PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+_T6_SIDES = np.array([[0, 1, 3], [1, 2, 4], [2, 0, 5]])
+_DEPTH = 1e-3  # of a triangle's height: what doesn't count as overlap
+
+
+def overlaps(
+    mesh: Mesh, lattice: FloatArray, gradient: FloatArray, displacement: FloatArray
+) -> bool:
+    """Whether material of a periodic cell lies upon itself or upon its copies.
+
+    Parameters
+    ----------
+    mesh, lattice
+        T6 mesh of the cell, and its lattice vectors as rows, undeformed [mm].
+    gradient
+        (2, 2) F̄, which carries the copies along.
+    displacement
+        (n, 2) of the nodes [mm].
+    """
+    nodes, vectors = mesh.nodes + displacement, lattice @ gradient.T
+    triangles = nodes[mesh.cells[:, _PARTS].reshape(-1, 3)]
+    points = nodes[_boundary(mesh)]
+    images = [points + np.array(r) @ vectors for r in product((-1, 0, 1), repeat=2)]
+    return _any_inside(np.vstack(images), triangles)
+
+
+def _boundary(mesh: Mesh) -> NDArray[np.int64]:
+    """Nodes of the sides that belong to one element only."""
+    sides = mesh.cells[:, _T6_SIDES].reshape(-1, 3)
+    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
+    return np.asarray(np.unique(sides[first[count == 1]]))
+
+
+def _any_inside(points: FloatArray, triangles: FloatArray) -> bool:
+    """Whether any of the points (n, 2) lies within one of the triangles (m, 3, 2)."""
+    centres = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    points = points[np.all((points > low) & (points < high), axis=1)]
+    near = cKDTree(points).sparse_distance_matrix(cKDTree(centres), reach, output_type="ndarray")
+    corners = triangles[near["j"]] - points[near["i"]][:, None]
+    following = np.roll(corners, -1, axis=1)
+    areas = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
+    return bool(np.any(areas.min(axis=1) > _DEPTH * areas.sum(axis=1)))

@@ -1,0 +1,187 @@
+"""The primary path, followed by nominal strain: equilibria, their stability, the next step.
+
+On a mesh with the specimen's symmetries the first bifurcation is a pitchfork: the primary
+path keeps the symmetry and goes on, unstable; two branches that break it leave sideways.
+``critical`` finds that point, ``branching`` follows the branches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from petsc4py import PETSc
+
+from modeharvest.fem.experiment import PathOptions
+from modeharvest.fem.path.equilibrium import Structure, SymmetricFactor
+from modeharvest.fem.path.newton import Constraint, NewtonOutcome, correct, path_tangent
+from modeharvest.fem.path.predictor import hermite_weights
+from modeharvest.fem.path.stability import Mode, lowest_modes
+from modeharvest.util.progress import Progress, silent
+
+_SMALLEST_STEP = 1e-5  # of nominal strain
+_MISS = 0.2  # of a step, by which a prediction may be off on a path without a bifurcation
+_STRETCH = 0.1  # of a step, by which steps may be longer if one is saved
+_MODES = 3  # computed, or all that are negative and one more
+_RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """An equilibrium state: strain, displacement, its rate along the path, stability.
+
+    Parameters
+    ----------
+    strain
+        Nominal strain [-].
+    u, tangent
+        Displacement and du/d(strain) [mm].
+    negative_pivots
+        Of the tangent stiffness there.
+    eigenvalues
+        The lowest ones [N/mm^4], ascending; empty where none were computed.
+    """
+
+    strain: float
+    u: PETSc.Vec
+    tangent: PETSc.Vec
+    negative_pivots: int
+    eigenvalues: tuple[float, ...] = ()
+
+
+@dataclass(eq=False)
+class PathFollower:
+    """Follows the paths of one structure; the last state's factor serves the next step.
+
+    ``factor`` and ``modes`` (the lowest ones) belong to the state found last.
+    """
+
+    structure: Structure
+    options: PathOptions = field(default_factory=PathOptions)
+    progress: Progress = silent
+    factor: SymmetricFactor | None = None
+    modes: list[Mode] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.mass = self.structure.mass()
+
+    # -- one equilibrium ----------------------------------------------------------------
+
+    def start(self) -> State:
+        """The undeformed state."""
+        u = self.structure.zero()
+        return self._settle(u, 0.0, self.structure.load(u))
+
+    def equilibrium(
+        self,
+        strain: float,
+        guess: PETSc.Vec,
+        constraint: Constraint | None = None,
+        with_modes: bool = True,
+    ) -> State | None:
+        """The equilibrium near ``guess``, at ``strain`` or where the constraint holds.
+
+        None if Newton does not get there, or gets to a state with a reversed element.
+        """
+        found = correct(self.structure, guess, strain, self.factor, constraint)
+        if (
+            found.outcome is not NewtonOutcome.CONVERGED
+            or self.structure.smallest_jacobian(found.u) <= 0.0
+        ):
+            self.factor = None  # it may be that of a state astray
+            return None
+        return self._settle(found.u, found.strain, found.load, with_modes)
+
+    def _settle(
+        self, u: PETSc.Vec, strain: float, load: PETSc.Vec, with_modes: bool = True
+    ) -> State:
+        """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
+        eigenvalues: tuple[float, ...] = ()
+        self.factor = self.structure.factor(u)
+        if with_modes:
+            self.modes = lowest_modes(self.factor, self.mass, _MODES, self.modes, _RESIDUAL)
+            eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
+        tangent = path_tangent(self.structure, self.factor, load)
+        return State(strain, u, tangent, self.factor.negative_pivots, eigenvalues)
+
+    # -- the primary path ---------------------------------------------------------------
+
+    def primary(
+        self,
+        states: list[State],
+        targets: Sequence[float],
+        until_unstable: bool = False,
+        refuse_unstable: bool = False,
+    ) -> bool:
+        """Extend ``states`` through all ``targets`` (ascending strains), each met exactly.
+
+        Parameters
+        ----------
+        states
+            Equilibria so far, at least one; the new ones are appended.
+        targets
+            Nominal strains to pass through [-]; those already passed are left out.
+        until_unstable
+            Stop after the first state with negative pivots.
+        refuse_unstable
+            Take a step that lands on an unstable state, or far from where it was expected, for a
+            slip off a stable path (that of an imperfect specimen) and shorten it.
+
+        Returns
+        -------
+        bool
+            False where no step down to 1e-5 of strain converges.
+        """
+        step = self.options.first_step
+        for target in (t for t in targets if t > states[-1].strain + 1e-12):
+            while states[-1].strain < target - 1e-12:
+                here = states[-1].strain
+                pieces = max(1, int(np.ceil((target - here) / step - _STRETCH)))
+                strain = target if pieces == 1 else here + (target - here) / pieces
+                guess = _extrapolate(states, strain)
+                state = self.equilibrium(strain, guess)
+                if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
+                    self.factor = None  # it may be that of the state refused
+                    step = 0.5 * (strain - here)
+                    if step < _SMALLEST_STEP:
+                        return False
+                    continue
+                states.append(state)
+                step = min(1.5 * step, self.options.largest_step)
+                self.progress(state.strain, targets[-1], "primary path")
+                if until_unstable and state.negative_pivots > 0:
+                    return True
+        return True
+
+
+def _is_slip(before: State, state: State, guess: PETSc.Vec) -> bool:
+    step, miss = state.u - before.u, state.u - guess
+    return bool(state.negative_pivots > 0 or miss.norm() > _MISS * step.norm())
+
+
+def _extrapolate(states: Sequence[State], strain: float) -> PETSc.Vec:
+    if len(states) == 1:
+        return along(states[-1], strain)
+    return interpolate(states[-2], states[-1], strain)
+
+
+def interpolate(a: State, b: State, strain: float) -> PETSc.Vec:
+    """Cubic Hermite interpolation (or extrapolation) between two states of a path."""
+    return combine(hermite_weights(a.strain, b.strain, strain), (a.u, a.tangent, b.u, b.tangent))
+
+
+def along(state: State, strain: float) -> PETSc.Vec:
+    """Linear extrapolation along the path's tangent."""
+    u = state.u.copy()
+    u.axpy(strain - state.strain, state.tangent)
+    return u
+
+
+def combine(weights: Sequence[float], vectors: Sequence[PETSc.Vec]) -> PETSc.Vec:
+    """Sum of vectors times weights."""
+    result = vectors[0].copy()
+    result.scale(weights[0])
+    for weight, vector in zip(weights[1:], vectors[1:], strict=True):
+        result.axpy(weight, vector)
+    return result

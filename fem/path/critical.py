@@ -1,0 +1,163 @@
+"""The first critical point of a path: where the critical eigenvalue is zero, and the proof."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+from petsc4py import PETSc
+from scipy.optimize import brentq
+
+from modeharvest.fem.path.continuation import PathFollower, State, along, interpolate
+from modeharvest.fem.path.stability import Mode
+
+_SEARCHES = 20  # equilibria tried on the way to one critical point
+_NEAR = 1e-3  # of strain: the next estimate is right
+_ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to become
+
+
+@dataclass(frozen=True, eq=False)
+class Critical:
+    """The first critical point of the primary path.
+
+    Parameters
+    ----------
+    strain
+        Critical nominal strain [-].
+    u
+        Displacement there.
+    modes
+        The modes whose eigenvalues are nearest to zero, the critical one(s) first.
+    eigenvalues
+        (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.
+    below, above
+        Negative pivots at strain - tolerance and strain + tolerance: the proof.
+    """
+
+    strain: float
+    u: PETSc.Vec
+    modes: list[Mode]
+    eigenvalues: list[tuple[float, float]]
+    below: int
+    above: int
+
+
+def locate_critical(walker: PathFollower, low: State, high: State) -> Critical | None:
+    """The first critical point between a stable state and the unstable one reached last.
+
+    Any field's curvature x . K x is above the lowest eigenvalue, by the square of what it is off
+    the mode. So the strain where it passes zero on the interpolated path, the least one for the
+    modes known, is an estimate from above. An equilibrium there gives better modes, and the next
+    estimate's error goes with the square of this one's. Two equilibria a tolerance below and
+    above are the proof; where the inertia below isn't zero, another mode became critical
+    earlier, and the search goes on.
+
+    None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the
+    two states are not on one path.
+    """
+    search = _CriticalBracket(walker, low, high)
+    for k in range(_SEARCHES):
+        walker.progress(k, 4, "critical point")
+        estimate = search.estimate()
+        is_near = estimate is not None and abs(estimate - search.latest) < _NEAR
+        if estimate is None or (k % 3 == 2 and not is_near):
+            estimate = 0.5 * (search.low.strain + search.high.strain)
+        if not is_near:
+            if search.step(estimate) is None:
+                return None
+            continue
+        critical = search.prove(estimate)
+        if critical is not None or search.is_over:
+            return critical
+    return None
+
+
+class _CriticalBracket:
+    """A bracket of the first critical point, and the modes that may become critical in it.
+
+    ``latest`` is the strain of the state reached last; ``is_over`` says that there is no point.
+    """
+
+    def __init__(self, walker: PathFollower, low: State, high: State) -> None:
+        self.walker, self.low, self.high = walker, low, high
+        self.latest, self.is_over = high.strain, False
+        self._visited = [(high, walker.modes)]
+        self._offs: list[float] = []  # of the unstable states reached, from the next estimate
+        self._candidates = [mode for mode in walker.modes if mode.eigenvalue < 0]
+
+    def estimate(self) -> float | None:
+        """Where the curvature of a candidate first passes zero; None if none does."""
+        low, strain = self.low.strain, self.high.strain
+        tolerance = 0.1 * self.walker.options.critical_tolerance
+        curvature = cache(self._curvature)
+        for mode in self._candidates:
+            if curvature(strain, mode) < 0 < curvature(low, mode):
+                strain = float(brentq(curvature, low, strain, (mode,), tolerance))
+        if strain == self.high.strain:
+            return None
+        if self.latest == self.high.strain:
+            self._offs.append(self.latest - strain)
+            if len(self._offs) > 1:
+                before, off = sum(self._offs[-2:]), self._offs[-1]
+                strain -= off * (off / before) ** 2
+        return strain
+
+    def _curvature(self, strain: float, mode: Mode) -> float:
+        u = interpolate(self.low, self.high, strain)
+        return self.walker.structure.curvature(u, mode.vector)
+
+    def step(self, strain: float) -> State | None:
+        """An equilibrium within the bracket, which becomes one of its ends; None if not found."""
+        state = self.walker.equilibrium(strain, interpolate(self.low, self.high, strain))
+        if state is None:
+            return None
+        modes, self.latest = self.walker.modes, strain
+        self._visited.append((state, modes))
+        negative = [mode for mode in modes if mode.eigenvalue < 0]
+        if state.negative_pivots:
+            self.high, self._candidates = state, negative
+        else:
+            self.low, self._candidates = state, [*self._candidates, *modes[:1]]
+        return state
+
+    def prove(self, strain: float) -> Critical | None:
+        """The critical point near a strain, if the inertia on both sides says that it is the first.
+
+        If not, the bracket is smaller, or there is nothing more to look for.
+        """
+        walker, tolerance = self.walker, self.walker.options.critical_tolerance
+        below = self.step(strain - tolerance)
+        if below is None or below.negative_pivots:
+            self.is_over = below is None
+            return None
+        mode, *_ = modes = walker.modes
+        guess = along(below, strain + tolerance)
+        above = walker.equilibrium(strain + tolerance, guess, with_modes=False)
+        if above is None or not above.negative_pivots:
+            self.low, self.is_over = above or below, above is None
+            return None
+        beyond = walker.structure.curvature(above.u, mode.vector)
+        values = [(s.strain, _alike(mode, known).eigenvalue) for s, known in self._visited]
+        values.append((above.strain, beyond))
+        (last, final), (far, first) = values[-2], values[0]
+        # In proportion to the distance, unless the two states are not on one path.
+        share = 10 * tolerance / (far - last)
+        if final > max(share, _ZERO) * abs(first):
+            self.is_over = True
+            return None
+        if beyond < 0:
+            strain = last + 2 * tolerance * final / (final - beyond)
+        return Critical(
+            strain,
+            along(below, strain),
+            modes,
+            values,
+            below.negative_pivots,
+            above.negative_pivots,
+        )
+
+
+def _alike(mode: Mode, modes: Sequence[Mode]) -> Mode:
+    """That one of the modes of another state which is most like a mode."""
+    return max(modes, key=lambda other: abs(mode.overlap(other.vector)))

@@ -1,0 +1,312 @@
+"""Total-Lagrangian equilibrium of a loaded specimen (dolfinx): forms and LDL^T factor.
+
+The nominal strain e is the only load: constrained displacements are e * d with a fixed
+direction d. Everything a path follower asks of the structure is here: residual, tangent,
+load direction, energy, reaction, mass; how the path is followed is in ``continuation``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import dolfinx
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from modeharvest.fem import dolfinx_api
+from modeharvest.fem.experiment import EDGES
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.hyperelastic import Hyperelastic
+from modeharvest.fem.materials import Material
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+_ROOMS = (60, 200, 600)  # to try, for the pivoting of an indefinite matrix [%]
+_TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
+
+
+@dataclass(frozen=True)
+class EdgeCompression:
+    """Compression along x by displacing the two edges x = +-half_width towards each other.
+
+    Parameters
+    ----------
+    half_width
+        Position of the loaded edges [mm].
+    length
+        The length that nominal strain refers to [mm]; e * length is the shortening.
+    edges
+        "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
+        for one node at mid-height, which keeps the specimen in place.
+    tilt
+        Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
+        strain [rad]: -e tilt y is added to its u_x.
+    pins
+        Points (x, y) whose u_y is held [mm]; nodes have to be there.
+    """
+
+    half_width: float
+    length: float
+    edges: str = "clamped"
+    tilt: float = 0.0
+    pins: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.edges not in EDGES:
+            raise InputError(
+                f"loaded edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}"
+            )
+
+
+class SymmetricFactor:
+    """The LDL^T factorisation of a symmetric matrix by MUMPS: solutions and inertia.
+
+    The order of elimination is found once; ``update`` factorises what the matrix is now.
+
+    Parameters
+    ----------
+    matrix
+        Assembled, symmetric; its pattern must stay.
+    """
+
+    def __init__(self, matrix: PETSc.Mat) -> None:
+        self._matrix, self._pc = matrix, PETSc.PC().create(matrix.comm)
+        self._pc.setOperators(matrix)
+        self._pc.setType(PETSc.PC.Type.CHOLESKY)
+        self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+        self._pc.setFactorSetUpSolverType()
+        # Solved with directly: a PC would first factorise a matrix that has changed.
+        self._factor = self._pc.getFactorMatrix()
+        self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
+        self._factor.setMumpsIcntl(24, 1)  # null pivots are detected instead of divided by
+        self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
+        self.update()
+
+    def update(self) -> None:
+        """Factorise anew, after the matrix has been assembled anew."""
+        for room in _ROOMS:
+            self._factor.setMumpsIcntl(14, room)
+            self._pc.setUp()
+            if self._factor.getMumpsInfog(1) not in _TOO_SMALL:
+                break
+            self._matrix.stateIncrease()  # or it would be taken for factorised
+        if self._factor.getMumpsInfog(1) < 0:
+            raise ArithmeticError(f"MUMPS failed with INFOG(1) = {self._factor.getMumpsInfog(1)}")
+
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues of the matrix, by Sylvester's law of inertia."""
+        return int(self._factor.getInertia()[0])
+
+    def solve(self, rhs: PETSc.Vec) -> PETSc.Vec:
+        """The solution for one right-hand side."""
+        solution = rhs.duplicate()
+        self._factor.solve(rhs, solution)
+        return solution
+
+    def solve_block(self, rhs: PETSc.Mat) -> PETSc.Mat:
+        """The solutions for the columns of a dense matrix: a quarter of the time for each."""
+        solutions = rhs.duplicate()
+        self._factor.matSolve(rhs, solutions)
+        return solutions
+
+
+class Structure:
+    """A meshed hyperelastic body under one loading: what its equilibrium equations need.
+
+    Vectors are PETSc vectors over all displacement components; ``u`` includes the
+    constrained ones. ``factorisations`` counts every numerical factorisation.
+
+    Parameters
+    ----------
+    mesh
+        T6 mesh [mm] (needed on rank 0 only).
+    material
+        Strain energy density [MPa].
+    loading
+        What is prescribed where.
+    comm
+        The communicator to distribute over.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        material: Material,
+        loading: EdgeCompression,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+    ) -> None:
+        self.mesh, self.comm = mesh, comm
+        self._forms = Hyperelastic(mesh, material, comm)
+        self.V = self._forms.V
+        self._u = self._forms.u
+        self._direction = dolfinx.fem.Function(self.V)
+        self._constrain(loading)
+        self._load_form = self._forms.stiffness_along(self._direction)
+        self._along = dolfinx.fem.Function(self.V)
+        self._along_form = self._forms.stiffness_along(self._along)
+        self.factorisations = 0
+        self.tangent: Any = None
+        self._factor: SymmetricFactor | None = None
+
+    def _constrain(self, loading: EdgeCompression) -> None:
+        tolerance = 1e-8 * loading.half_width
+
+        def on_edge(x: FloatArray) -> NDArray[np.bool_]:
+            return np.asarray(np.abs(np.abs(x[0]) - loading.half_width) < tolerance)
+
+        def anchor(x: FloatArray) -> NDArray[np.bool_]:
+            return np.asarray(
+                (np.abs(x[0] + loading.half_width) < tolerance) & (np.abs(x[1]) < tolerance)
+            )
+
+        def held_y(x: FloatArray) -> NDArray[np.bool_]:
+            held = on_edge(x) if loading.edges == "clamped" else anchor(x)
+            for pin in loading.pins:
+                held |= np.hypot(x[0] - pin[0], x[1] - pin[1]) < tolerance
+            return held
+
+        dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, held_y)
+        if self.comm.allreduce(len(dofs_x)) == 0 or self.comm.allreduce(len(dofs_y)) == 0:
+            raise InputError(
+                f"loading: expected nodes on the edges x = +-{loading.half_width} mm"
+                " (and one at mid-height for sliding edges), found none"
+            )
+        x = self.V.tabulate_dof_coordinates()
+        target = self._direction.x.array.reshape(-1, 2)
+        target[dofs_x // 2, 0] = -0.5 * loading.length * np.sign(x[dofs_x // 2, 0])
+        self._stroke = self._direction.x.array.copy()
+        if loading.tilt != 0.0:
+            turning = dofs_x[x[dofs_x // 2, 0] > 0.0] // 2
+            target[turning, 0] -= loading.tilt * x[turning, 1]
+        self._direction.x.scatter_forward()
+        self._held = np.union1d(dofs_x, dofs_y)
+        # Only the matrices use these, and there the value is of no account.
+        self._bcs = [
+            dolfinx.fem.dirichletbc(PETSc.ScalarType(0), dofs.astype(np.int32), self.V.sub(i))
+            for i, dofs in enumerate((dofs_x, dofs_y))
+        ]
+        owned = self.V.dofmap.index_map.size_local * 2
+        self._held_owned = self._held[self._held < owned]
+
+    def _component_dofs(
+        self, component: int, where: Callable[[FloatArray], NDArray[np.bool_]]
+    ) -> NDArray[np.int64]:
+        """Local numbers of the constrained displacement components, ghosts included."""
+        x = self.V.tabulate_dof_coordinates()
+        return 2 * np.flatnonzero(where(x.T)).astype(np.int64) + component
+
+    # -- states -------------------------------------------------------------------------
+
+    def zero(self) -> PETSc.Vec:
+        """The undeformed state."""
+        vector = self._u.x.petsc_vec.duplicate()
+        vector.set(0.0)
+        return vector
+
+    def prescribe(self, u: PETSc.Vec, strain: float) -> None:
+        """Set the constrained components of ``u`` to what the strain demands."""
+        u.array[self._held_owned] = strain * self._direction.x.array[self._held_owned]
+
+    def nodal(self, u: PETSc.Vec) -> FloatArray:
+        """(n, 2) displacement at the mesh's nodes, in their order [mm]; on every rank."""
+        self._load(u)
+        count = self.comm.bcast(len(self.mesh.nodes))
+        return dolfinx_api.gather_nodes(self.V, self._u.x.array, count)
+
+    def from_function(self, field: Callable[[FloatArray], FloatArray]) -> PETSc.Vec:
+        """The vector of a displacement field: (n, 2) values at points (n, 2) [mm]."""
+        vector = self.zero()
+        count = self.V.dofmap.index_map.size_local
+        points = self.V.tabulate_dof_coordinates()[:count, :2]
+        vector.array[:] = field(points).ravel()
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def largest(self, u: PETSc.Vec) -> float:
+        """The largest nodal displacement of ``u`` [mm]."""
+        length = np.linalg.norm(u.array.reshape(-1, 2), axis=1)
+        return float(self.comm.allreduce(float(np.max(length, initial=0.0)), MPI.MAX))
+
+    # -- operators at a state -----------------------------------------------------------
+
+    def residual(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Internal forces [N/mm], zero at the constrained components."""
+        vector = self._assemble(self._forms.forces, u)
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def load(self, u: PETSc.Vec) -> PETSc.Vec:
+        """d(internal forces)/d(strain) at fixed free components [N/mm]."""
+        vector = self._assemble(self._load_form, u)
+        vector.array[self._held_owned] = 0.0
+        return vector
+
+    def curvature(self, u: PETSc.Vec, direction: PETSc.Vec) -> float:
+        """direction . K(u) direction [N], without a matrix: cheap for a single vector."""
+        self._set(self._along, direction)
+        return float(direction.dot(self._assemble(self._along_form, u)))
+
+    def stiffness(self, u: PETSc.Vec) -> PETSc.Mat:
+        """Tangent stiffness at ``u`` [N/mm^2], constrained rows replaced by identity.
+
+        The matrix is the same object at every call, assembled anew.
+        """
+        self._load(u)
+        self.tangent = dolfinx_api.assemble_matrix(
+            self._forms.stiffness, self._bcs, 1.0, self.tangent
+        )
+        self.tangent.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return self.tangent
+
+    def factor(self, u: PETSc.Vec) -> SymmetricFactor:
+        """Factorise the tangent stiffness at ``u``; as the matrix, always the same object."""
+        self.factorisations += 1
+        tangent = self.stiffness(u)
+        if self._factor is None:
+            self._factor = SymmetricFactor(tangent)
+        else:
+            self._factor.update()
+        return self._factor
+
+    def mass(self) -> PETSc.Mat:
+        """Mass matrix of unit density, constrained rows zero [mm^2]."""
+        return dolfinx_api.assemble_matrix(self._forms.mass, self._bcs, 0.0)
+
+    def energy(self, u: PETSc.Vec) -> float:
+        """Stored energy per unit thickness [N]."""
+        self._load(u)
+        return float(self.comm.allreduce(dolfinx.fem.assemble_scalar(self._forms.energy)))
+
+    def reaction(self, u: PETSc.Vec, length: float) -> float:
+        """Compressive force on a loaded edge per unit thickness [N/mm].
+
+        By virtual work: d(energy)/d(strain) = force * length (+ moment * tilt) at equilibrium.
+        """
+        forces = self._assemble(self._forms.forces, u)
+        held = self._held_owned
+        work = float(forces.array[held] @ self._stroke[held])
+        return float(self.comm.allreduce(work)) / length
+
+    def smallest_jacobian(self, u: PETSc.Vec) -> float:
+        """Smallest det F at the corners and mid-sides of all elements [-]."""
+        self._load(u)
+        return float(self.comm.allreduce(self._forms.smallest_jacobian(), MPI.MIN))
+
+    def _load(self, u: PETSc.Vec) -> None:
+        self._set(self._u, u)
+
+    @staticmethod
+    def _set(function: dolfinx.fem.Function, vector: PETSc.Vec) -> None:
+        function.x.array[: len(vector.array)] = vector.array
+        function.x.scatter_forward()
+
+    def _assemble(self, form: Any, u: PETSc.Vec) -> PETSc.Vec:
+        self._load(u)
+        vector = u.duplicate()
+        dolfinx_api.assemble_vector(form, vector)
+        return vector

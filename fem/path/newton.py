@@ -1,0 +1,213 @@
+"""Newton's method to equilibrium, with as few factorisations as it takes.
+
+An iteration with a factor that is there costs an eighth of a new one, so the tangent
+is kept ("chord" iterations) as long as that is the shorter way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from petsc4py import PETSc
+
+from modeharvest.fem.path.equilibrium import Structure, SymmetricFactor
+
+_PATIENCE = 12  # chord iterations still to come for which a new factor isn't worth its cost
+_MAX_FACTORS = 8
+_SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
+_MAX_ITERATIONS = 60
+# The residual must be smaller than what a change of the nominal strain by this would make.
+STRAIN_TOLERANCE = 1e-11
+
+
+class NewtonOutcome(Enum):
+    """Why a Newton iteration ended; the value says it in words."""
+
+    CONVERGED = "the residual is below the tolerance"
+    DIVERGED = "the residual kept growing or is not a number"
+    SLOW = "the residual did not fall below the tolerance in the iterations allowed"
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """The one equation that picks a point of the path: weights . (u - origin) = amplitude.
+
+    The alternative, used where the constraint is None, is to prescribe the strain.
+    """
+
+    weights: PETSc.Vec
+    origin: PETSc.Vec
+    amplitude: float
+
+    def value(self, u: PETSc.Vec) -> float:
+        """weights . (u - origin) - amplitude."""
+        return float(self.weights.dot(u) - self.weights.dot(self.origin)) - self.amplitude
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """Where Newton's method arrived, the load there (see ``Structure.load``), why it stopped."""
+
+    u: PETSc.Vec
+    strain: float
+    load: PETSc.Vec
+    outcome: NewtonOutcome
+
+
+def correct(
+    structure: Structure,
+    guess: PETSc.Vec,
+    strain: float,
+    factor: SymmetricFactor | None = None,
+    constraint: Constraint | None = None,
+) -> Correction:
+    """Find the equilibrium near ``guess``.
+
+    Parameters
+    ----------
+    structure
+        What is to be in equilibrium.
+    guess
+        Start (left as it is); its constrained components are set from ``strain``.
+    strain
+        Nominal strain: prescribed, or with a constraint the start of it.
+    factor
+        Factor of the tangent at a state nearby, if there is one.
+    constraint
+        Prescribe an amplitude instead of the strain.
+    """
+    iterate = _Iterate(structure, guess, strain, factor, constraint)
+    outcome = NewtonOutcome.SLOW
+    for _ in range(_MAX_ITERATIONS):
+        iterate.evaluate()
+        if iterate.is_solved:
+            outcome = NewtonOutcome.CONVERGED
+            break
+        if not iterate.advance():
+            outcome = NewtonOutcome.DIVERGED
+            break
+    return Correction(iterate.u, iterate.strain, iterate.load, outcome)
+
+
+class _Iterate:
+    """A Newton iteration under way: where it is, and the step that led there.
+
+    A step is judged by the next one that the same factor would make from there, which is
+    a measure of the error in millimetres (natural monotonicity: Deuflhard, Newton Methods for
+    Nonlinear Problems, Springer 2011, section 2.1); residuals are governed by what is stiff.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        guess: PETSc.Vec,
+        strain: float,
+        factor: SymmetricFactor | None,
+        constraint: Constraint | None,
+    ) -> None:
+        self.structure, self.constraint, self.factor = structure, constraint, factor
+        self.u, self.strain = guess.copy(), strain
+        structure.prescribe(self.u, strain)
+        self.tangent: PETSc.Vec | None = None
+        self._weigh()
+        self.factors = 0
+        self.last: _NewtonStep | None = None
+
+    def evaluate(self) -> None:
+        """Residual and the constraint's miss at the present state."""
+        self.residual = self.structure.residual(self.u)
+        self.miss = 0.0 if self.constraint is None else self.constraint.value(self.u)
+        self.size = float(self.residual.norm())
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the residual and the constraint are within tolerance."""
+        if not (self.size <= self.small and abs(self.miss) <= 1e-9):
+            return False
+        self._weigh()  # the tolerance was that of the guess
+        return self.size <= self.small
+
+    def _weigh(self) -> None:
+        """The load at the present state, which says how small a residual has to be."""
+        self.load = self.structure.load(self.u)
+        self.small = STRAIN_TOLERANCE * float(self.load.norm())
+
+    def advance(self) -> bool:
+        """Take the next step, with a new factor where that pays; False to give up."""
+        last, step = self.last, None
+        if self.factor is not None and math.isfinite(self.size):
+            step = self._step(is_fresh=False)
+        rate = 0.0 if last is None else math.inf
+        if last is not None and step is not None:
+            rate = step.length / last.length
+        if last is not None and not rate < 1.0:
+            self.u, self.strain = last.start.copy(), last.strain
+            if last.is_fresh:
+                step = last.halved()
+                if step.share < _SMALLEST_SHARE:
+                    return False
+            else:
+                self.evaluate()
+                step = None
+        elif self._iterations_left(rate) > _PATIENCE:
+            step = None
+        if step is None:
+            if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
+                return False
+            self.factor, self.tangent = self.structure.factor(self.u), None
+            self.factors += 1
+            if self.constraint is not None:
+                self._weigh()
+            step = self._step(is_fresh=True)
+        self._take(step)
+        return True
+
+    def _iterations_left(self, rate: float) -> float:
+        """How many more it will take if each leaves this much of the error."""
+        left = max(math.log(self.size / self.small), 0.0)
+        return left / -math.log(rate) if rate > 0.0 else 0.0
+
+    def _step(self, is_fresh: bool) -> _NewtonStep:
+        """The Newton step with the factor at hand, along the constraint if there is one."""
+        assert self.factor is not None
+        step, change = self.factor.solve(self.residual), 0.0
+        step.scale(-1.0)
+        if self.constraint is not None:
+            if self.tangent is None:
+                self.tangent = path_tangent(self.structure, self.factor, self.load)
+            weights = self.constraint.weights
+            change = -(self.miss + float(weights.dot(step))) / float(weights.dot(self.tangent))
+            step.axpy(change, self.tangent)
+        return _NewtonStep(self.u, self.strain, step, change, float(step.norm()), is_fresh)
+
+    def _take(self, step: _NewtonStep) -> None:
+        self.u, self.last = step.start.copy(), step
+        self.u.axpy(step.share, step.direction)
+        self.strain = step.strain + step.share * step.change
+        self.structure.prescribe(self.u, self.strain)
+
+
+@dataclass(frozen=True, eq=False)
+class _NewtonStep:
+    """A step from a state, and whether the tangent there was factorised for it."""
+
+    start: PETSc.Vec
+    strain: float
+    direction: PETSc.Vec
+    change: float
+    length: float
+    is_fresh: bool
+    share: float = 1.0
+
+    def halved(self) -> _NewtonStep:
+        return replace(self, share=0.5 * self.share)
+
+
+def path_tangent(structure: Structure, factor: SymmetricFactor, load: PETSc.Vec) -> PETSc.Vec:
+    """du/d(strain) along the equilibrium path [mm], constrained components included."""
+    tangent = factor.solve(load)
+    tangent.scale(-1.0)
+    structure.prescribe(tangent, 1.0)
+    return tangent

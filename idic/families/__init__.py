@@ -1,1 +1,0 @@
-"""From spectra to waves, from waves to families of modes."""

@@ -1,1 +1,0 @@
-"""Displacements at points: those of any DIC code, and their spectra."""

@@ -1,0 +1,1 @@
+"""Local DIC: displacement fields at points, their files, and subsets by pyvale."""

@@ -1,0 +1,393 @@
+"""Displacement fields at points, read from the files of any DIC code and written.
+
+A point that failed stays in the field, marked as not valid: what was lost is counted, not hidden.
+
+The frame of the project is x right, y up, in mm. What a file uses is said by its columns' names or
+by the caller; a field is never guessed to be in millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from modeharvest.idic.local.tables import ROLES, Column, Table, choose, read_table
+from modeharvest.idic.slow_fields import Box
+from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic
+
+
+def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:
+    """The field that an ideal lens would have shown: both ends of every displacement put right.
+
+    Parameters
+    ----------
+    field
+        Measured on photographs as they are.
+    grid
+        Their pixels.
+    distortion
+        Of the lens.
+    """
+    u = np.where(field.good[:, None], field.u, 0.0)
+    row, col = distortion.ideal(*grid.to_px(field.x, field.y))
+    row2, col2 = distortion.ideal(*grid.to_px(field.x + u[:, 0], field.y + u[:, 1]))
+    x, y = grid.to_mm(row, col)
+    x2, y2 = grid.to_mm(row2, col2)
+    return replace(field, x=x, y=y, u=np.column_stack([x2 - x, y2 - y]))
+
+
+@dataclass(frozen=True, eq=False)
+class LocalField:
+    """Displacements at points of the reference image.
+
+    Parameters
+    ----------
+    x, y
+        (n,) positions in the physical frame, y up [mm].
+    u
+        (n, 2) displacements along x and y [mm]; anything where not ``valid``.
+    valid
+        (n,) True where the displacement counts; by default wherever it is finite.
+    sd
+        (n, 2) standard deviations of u [mm]; None if not known.
+    source
+        Where the field comes from, in a few words.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    u: FloatArray
+    valid: BoolArray | None = None
+    sd: FloatArray | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "u", "sd"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+        n = self.x.size
+        if self.x.shape != (n,) or self.y.shape != (n,) or self.u.shape != (n, 2) or n == 0:
+            raise InputError(
+                f"local field{self._named}: expected x (n,), y (n,) and u (n, 2) with n > 0, got "
+                f"{self.x.shape}, {self.y.shape} and {self.u.shape}"
+            )
+        if self.sd is not None and self.sd.shape != (n, 2):
+            raise InputError(f"local field{self._named}: expected sd ({n}, 2), got {self.sd.shape}")
+        finite = np.isfinite(np.column_stack([self.x, self.y, self.u])).all(axis=1)
+        given = finite if self.valid is None else np.asarray(self.valid, dtype=np.bool_)
+        if given.shape != (n,):
+            raise InputError(f"local field{self._named}: expected valid ({n},), got {given.shape}")
+        object.__setattr__(self, "valid", given & finite)
+        if not self.good.any():
+            raise InputError(
+                f"local field{self._named}: expected at least one valid point, got {n} points "
+                "without a finite displacement; measure again with a looser threshold"
+            )
+
+    @property
+    def _named(self) -> str:
+        return f" {self.source}" if self.source else ""
+
+    @property
+    def good(self) -> BoolArray:
+        """(n,) True at valid points."""
+        assert self.valid is not None  # set when the field was made
+        return self.valid
+
+    @property
+    def lost(self) -> int:
+        """Number of points that are not valid."""
+        return int((~self.good).sum())
+
+    @property
+    def valid_share(self) -> float:
+        """Share of the points that are valid [-]."""
+        return float(self.good.mean())
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of a component of u over the valid points [mm]."""
+        return float(np.sqrt(np.mean(self.u[self.good] ** 2)))
+
+    @property
+    def sd_rms(self) -> float:
+        """Root mean square of the standard deviations over the valid points [mm]; NaN if none."""
+        if self.sd is None:
+            return float("nan")
+        return float(np.sqrt(np.mean(self.sd[self.good] ** 2)))
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of a point from its nearest neighbour [mm]; infinite for one point."""
+        points = np.column_stack([self.x, self.y])[np.isfinite(self.x) & np.isfinite(self.y)]
+        if len(points) < 2:
+            return float("inf")
+        return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+
+    @property
+    def box(self) -> Box:
+        """The smallest box around the valid points [mm]."""
+        x, y = self.x[self.good], self.y[self.good]
+        return Box(float(x.min()), float(x.max()), float(y.min()), float(y.max()))
+
+    def valid_points(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(m,) x, (m,) y and (m, 2) u of the valid points [mm]."""
+        return self.x[self.good], self.y[self.good], self.u[self.good]
+
+    def within(self, region: Box) -> LocalField:
+        """The part of the field inside a box; raises InputError if no valid point is there."""
+        inside = (self.x >= region.x_min) & (self.x <= region.x_max)
+        inside &= (self.y >= region.y_min) & (self.y <= region.y_max)
+        return self.selected(inside, "the box")
+
+    def selected(self, keep: BoolArray, what: str = "the selection") -> LocalField:
+        """The points that ``keep`` (n,) names; raises InputError if none of them is valid."""
+        if not (keep & self.good).any():
+            raise InputError(
+                f"local field{self._named}: expected valid points in {what}, got none; the field "
+                f"covers x = {self.box.x_min:.2f} to {self.box.x_max:.2f} and "
+                f"y = {self.box.y_min:.2f} to {self.box.y_max:.2f} mm"
+            )
+        sd = None if self.sd is None else self.sd[keep]
+        return LocalField(
+            self.x[keep], self.y[keep], self.u[keep], self.good[keep], sd, self.source
+        )
+
+    def less(self, displacement: Callable[[FloatArray], FloatArray]) -> LocalField:
+        """What a model leaves over: w = u − model, with the field's own standard deviations.
+
+        Parameters
+        ----------
+        displacement
+            From (n, 2) points to (n, 2) displacements [mm], as
+            ``partial(ansatz.displacement_at, unknowns)``.
+        """
+        points = np.column_stack([self.x, self.y])
+        where = np.isfinite(points).all(axis=1)
+        model = np.full(self.u.shape, np.nan)
+        model[where] = displacement(points[where])
+        return replace(self, u=self.u - model)
+
+    @property
+    def rms_beyond_noise(self) -> float:
+        """√(rms² − sd²) [mm]: what is there beyond the field's own errors; 0 if nothing is.
+
+        NaN if the standard deviations are not known.
+        """
+        return float(np.sqrt(np.maximum(0.0, self.rms**2 - self.sd_rms**2)))
+
+
+def sampled_field(
+    displacement: ArrayLike, grid: PixelGrid, mask: ArrayLike, step: int, source: str = "sampled"
+) -> LocalField:
+    """Take a field known at pixels at every ``step``-th of them, where there is material.
+
+    Parameters
+    ----------
+    displacement
+        (rows, cols, 2) [mm].
+    grid
+        Its pixels.
+    mask
+        (rows, cols) True where the displacement counts.
+    step
+        Distance of the points [px].
+    source
+        What to call it.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ from the grid's, or the step is less than 1 px.
+    """
+    u, inside = np.asarray(displacement, np.float64), np.asarray(mask, np.bool_)
+    if u.shape != (*grid.shape, 2) or inside.shape != grid.shape or step < 1:
+        raise InputError(
+            f"expected a displacement {(*grid.shape, 2)}, a mask {grid.shape} and a step of at "
+            f"least 1 px, got {u.shape}, {inside.shape} and {step}"
+        )
+    row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
+    row, col = (i[inside[row, col]] for i in (row, col))
+    x, y = grid.to_mm(row, col)
+    return LocalField(x, y, u[row, col], source=source)
+
+
+_WRITTEN = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]", "sd_u [mm]", "sd_v [mm]", "valid")
+
+
+def read_field(
+    path: Path | str,
+    grid: PixelGrid | None = None,
+    *,
+    units: str | None = None,
+    displacement_units: str | None = None,
+    y_axis: str | None = None,
+    first_pixel: int = 0,
+    columns: Mapping[str, str | int] | None = None,
+) -> LocalField:
+    """Read a displacement field of any DIC code.
+
+    Parameters
+    ----------
+    path
+        CSV, TXT, NPZ, HDF5 or MAT with x, y, u and v: points (n,), grids (rows, cols), or x
+        (cols,) and y (rows,) as axes of grids u and v.
+    grid
+        Pixels to millimetres, needed if anything is in pixels.
+    units
+        "px" or "mm", of positions and displacements; None: as the columns' names say.
+    displacement_units
+        Of u and v, if they are not those of x and y.
+    y_axis
+        "up" or "down": where y grows and v is positive; None: as the columns' names say. In
+        pixels, "up" counts from the lowest row.
+    first_pixel
+        What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
+    columns
+        Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma" and
+        "valid", where they can't be known by themselves.
+
+    Returns
+    -------
+    LocalField
+        With the file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC
+        and DICe mark failure) kept as not valid. ``sigma`` in pixels is taken for the standard
+        deviation of both components.
+
+    Raises
+    ------
+    InputError
+        If a column, the units or the axis are not known, or shapes don't agree.
+    """
+    table = read_table(path)
+    chosen = choose(list(table), columns or {}, units, str(path))
+    position = _unit(chosen, ("x", "y"), units, str(path))
+    same = units or ("px" if chosen["x"].of_image_code else None)
+    motion = _unit(chosen, ("u", "v"), displacement_units or same, str(path))
+    down = _axis(chosen, y_axis, str(path)) == "down"
+    if "px" in (position, motion) and grid is None:
+        raise InputError(f"{path}: expected a grid for a field in pixels; give the pixel size")
+    x, y, u, v = _same_shape([table[chosen[role].name] for role in ROLES], chosen, str(path))
+    sign = -1.0 if down else 1.0
+    if position == "px" and grid is not None:
+        x, y = _from_pixels(x - first_pixel, y - first_pixel, down, grid)
+    else:
+        y = sign * y
+    scale = grid.pixel_size if motion == "px" and grid is not None else 1.0
+    sd, ok = _quality(table, chosen, x.size, scale, motion == "px", str(path))
+    u = scale * np.column_stack([u, sign * v])
+    return LocalField(x, y, u, ok, sd, source=Path(path).name)
+
+
+def _from_pixels(
+    x: FloatArray, y: FloatArray, down: bool, grid: PixelGrid
+) -> tuple[FloatArray, FloatArray]:
+    """Positions [mm] of pixels counted from 0; y from the lowest row unless it grows downwards."""
+    return grid.to_mm(y if down else grid.rows - 1 - y, x)
+
+
+def write_field(path: Path | str, field: LocalField) -> None:
+    """Write a field as CSV or NPZ, which :func:`read_field` reads without being told anything.
+
+    Raises
+    ------
+    InputError
+        If the name does not end in .csv or .npz.
+    """
+    sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
+    data = np.column_stack([field.x, field.y, field.u, sd, field.good])
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".csv", ".npz"):
+        raise InputError(f"expected a field to be written as .csv or .npz, got {path}")
+    with atomic(path) as part:
+        if suffix == ".npz":
+            with open(part, "wb") as file:
+                np.savez(file, **dict(zip(_WRITTEN, data.T, strict=True)))
+        else:
+            formats = ["%.9g"] * 6 + ["%d"]
+            np.savetxt(part, data, formats, ",", header=",".join(_WRITTEN), comments="")
+
+
+def _unit(
+    chosen: dict[str, Column], roles: tuple[str, ...], declared: str | None, where: str
+) -> str:
+    if declared not in (None, "px", "mm"):
+        raise InputError(f"{where}: expected units 'px' or 'mm', got {declared!r}")
+    named = {chosen[role].unit for role in roles} - {None}
+    if len(named) > 1 or (declared and named and named != {declared}):
+        names = ", ".join(repr(chosen[role].name) for role in roles)
+        raise InputError(
+            f"{where}: expected {names} in {declared or 'one unit'}, but they are named as "
+            f"{' and '.join(sorted(map(str, named)))}; leave units out, or name other columns"
+        )
+    unit = declared or next(iter(named), None)
+    if unit is None:
+        names = " and ".join(repr(chosen[role].name) for role in roles)
+        raise InputError(f"{where}: expected units for {names}, got none; give units='px' or 'mm'")
+    return unit
+
+
+def _axis(chosen: dict[str, Column], declared: str | None, where: str) -> str:
+    if declared not in (None, "up", "down"):
+        raise InputError(f"{where}: expected y_axis 'up' or 'down', got {declared!r}")
+    named = {chosen[role].y_axis for role in ("x", "y", "v")} - {None}
+    if len(named) > 1 or (declared and named and named != {declared}):
+        raise InputError(
+            f"{where}: expected y_axis {declared or 'one way'!r}, but by the columns' names it is "
+            f"{' and '.join(sorted(map(str, named)))}; leave y_axis out, or name other columns"
+        )
+    axis = declared or next(iter(named), None)
+    if axis is None:
+        raise InputError(
+            f"{where}: expected to know where y grows, got nothing; give y_axis='up' or 'down'"
+        )
+    return axis
+
+
+def _same_shape(
+    arrays: list[FloatArray], chosen: dict[str, Column], where: str
+) -> list[FloatArray]:
+    """(n,) each, from points, grids, or axes and grids; a single frame may lead."""
+    x, y, u, v = (np.squeeze(a) for a in arrays)
+    if x.ndim == 1 and y.ndim == 1 and u.ndim == 2 and u.shape == (y.size, x.size):
+        x, y = np.meshgrid(x, y)
+    if not x.shape == y.shape == u.shape == v.shape:
+        got = ", ".join(
+            f"{chosen[r].name} {a.shape}" for r, a in zip(ROLES, (x, y, u, v), strict=True)
+        )
+        raise InputError(f"{where}: expected x, y, u and v of one shape, got {got}")
+    return [a.ravel() for a in (x, y, u, v)]
+
+
+def _quality(
+    table: Table, chosen: dict[str, Column], n: int, scale: float, in_px: bool, where: str
+) -> tuple[FloatArray | None, NDArray[np.bool_]]:
+    """(n, 2) standard deviations [mm] or None, and (n,) what the file itself says is valid."""
+    values = {}
+    for role in ("sd_u", "sd_v", "sigma", "valid"):
+        if role in chosen:
+            values[role] = table[chosen[role].name].ravel()
+            if values[role].size != n:
+                raise InputError(
+                    f"{where}: expected {chosen[role].name} for {n} points, got {values[role].size}"
+                )
+    ok = np.ones(n, dtype=np.bool_)
+    if "valid" in values:
+        ok &= values["valid"] > 0
+    if "sigma" in values:
+        ok &= values["sigma"] >= 0
+    sd = None
+    if "sd_u" in values and "sd_v" in values:
+        sd = scale * np.column_stack([values["sd_u"], values["sd_v"]])
+    elif "sigma" in values and in_px:
+        sd = scale * np.column_stack([values["sigma"]] * 2)
+    return (None if sd is None or not np.isfinite(sd[ok]).any() else sd), ok

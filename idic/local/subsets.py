@@ -1,0 +1,308 @@
+"""Subset DIC by pyvale, an optional library, with predicted standard deviations.
+
+pyvale (https://github.com/Computer-Aided-Validation-Laboratory/pyvale, MIT) matches subsets by
+their zero-normalised difference, starts from Fourier correlations of windows that become smaller,
+and goes from the best matched subset to its neighbours. It is installed apart: with the libraries
+for windows and meshes that it asks for it weighs 2 GB. It runs in a process of its own, so that
+neither its threads nor a crash in it are felt here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from modeharvest.idic.local.field import LocalField, read_field
+from modeharvest.idic.local.tables import read_table
+from modeharvest.idic.pair import CheckedImages
+from modeharvest.idic.photograph.motion import CELL_PX, coarse_field, first_motion
+from modeharvest.idic.slow_fields import Box
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError, MissingDependencyError
+
+
+def predicted_sd(
+    reference: NDArray[Any],
+    mask: BoolArray,
+    grid: PixelGrid,
+    field: LocalField,
+    correlation: FloatArray,
+    subset_px: int,
+) -> FloatArray:
+    """Standard deviations that the grey levels left over predict, (n, 2) [mm].
+
+    The zero-normalised correlation C of a subset tells what is left between its two images,
+    2 (1 − C) of their variance. Were it white noise, the displacement's covariance would be that
+    times (Σ ∇f ∇fᵀ)⁻¹ over the subset. Much of it is not white: it is what an affine subset can't
+    follow, and is alike over a speckle. It is counted as one independent value per
+    ``speckle_area`` pixels, the area of f's autocorrelation.
+
+    Parameters
+    ----------
+    reference
+        (rows, cols) f.
+    mask
+        (rows, cols) True on material.
+    grid
+        The pixels.
+    field
+        The subsets' centres.
+    correlation
+        (n,) C of each [-]; NaN where lost.
+    subset_px
+        Edge of a subset [px].
+    """
+    f = np.where(mask, np.asarray(reference, np.float64) - float(reference[mask].mean()), 0.0)
+
+    def summed(image: FloatArray) -> FloatArray:
+        return np.asarray(ndimage.uniform_filter(image, subset_px, mode="constant")) * subset_px**2
+
+    down, right = np.gradient(f)
+    down, right = np.where(mask, down, 0.0), np.where(mask, right, 0.0)
+    row, col = (np.rint(i).astype(int) for i in grid.to_px(field.x, field.y))
+    xx, xy, yy, count, one, two = (
+        summed(i)[row, col] for i in (right**2, right * down, down**2, mask.astype(float), f, f**2)
+    )
+    variance = np.maximum(two / count - (one / count) ** 2, 0.0)
+    left = 2.0 * np.clip(1.0 - correlation, 0.0, None) * variance * speckle_area(f, mask)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = xx * yy - xy**2
+        cov = left[:, None] * np.column_stack([yy, xx]) / determinant[:, None]
+        return np.asarray(grid.pixel_size * np.sqrt(cov))
+
+
+def speckle_area(image: FloatArray, mask: BoolArray) -> float:
+    """Area of the autocorrelation of a mean-free image over a mask, to its half height [px]."""
+    size = 32
+    product = np.zeros(size)
+    for k in range(size):
+        both = mask[:, k:] & mask[:, : mask.shape[1] - k]
+        product[k] = float(np.mean((image[:, k:] * image[:, : image.shape[1] - k])[both]))
+    below = np.flatnonzero(product < 0.5 * product[0])
+    radius = float(below[0]) if len(below) else float(size)
+    return float(max(1.0, np.pi * radius**2))
+
+
+WHERE = "MODEHARVEST_PYVALE"
+"""Environment variable: the Python that has pyvale, if it isn't this one."""
+HOW_TO_GET = (
+    f"pyvale is not installed; give it an environment of its own and set {WHERE} to the Python "
+    "there (docs/fields.md says how), or read the field of another code"
+)
+_TRIES = 3
+"""Seeds that are tried."""
+_SHARES = (1.0, 0.8, 1.25)
+"""Of the largest motion, that are tried with each: some sizes of the first window fail."""
+_MOST, _MARGIN = 0.998, 1.1
+"""Share of a rough field's points that move less than its largest motion, and what that lacks."""
+_COARSE_PX = 400
+"""Pixels across that are enough for a rough field."""
+_SIDE = Path(__file__).with_name("pyvale_side.py")
+
+
+@dataclass(frozen=True)
+class SubsetOptions:
+    """How to correlate subsets.
+
+    Parameters
+    ----------
+    subset_px
+        Edge of a subset, odd [px]: at least three speckles across.
+    step_px
+        Distance of the subsets [px].
+    shape
+        Shape function: "affine", "quad" or "rigid".
+    threshold
+        Least zero-normalised correlation of a subset that counts [-].
+    filling
+        Least share of a subset that is material [-]. pyvale takes the pixels of a hole for
+        speckle, so at less than 1 there are more subsets at holes, and they are worse.
+    largest_px
+        Largest motion along either axis [px]; None: looked up in a rough field of the images
+        (``coarse_field``). pyvale's first windows are twice as large, and fail if they are much
+        larger than need be.
+    threads
+        For pyvale; None: all cores.
+    """
+
+    subset_px: int = 21
+    step_px: int = 5
+    shape: str = "affine"
+    threshold: float = 0.9
+    filling: float = 1.0
+    largest_px: int | None = None
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.subset_px < 5 or self.subset_px % 2 == 0 or not 1 <= self.step_px <= self.subset_px:
+            raise InputError(
+                "subset DIC: expected an odd subset of at least 5 px and a step of 1 px up to it, "
+                f"got {self.subset_px} and {self.step_px} px"
+            )
+        if self.shape not in ("affine", "quad", "rigid"):
+            raise InputError(
+                f"subset DIC: expected shape 'affine', 'quad' or 'rigid', got {self.shape!r}"
+            )
+        if not (0 < self.threshold < 1 and 0 < self.filling <= 1):
+            raise InputError(
+                "subset DIC: expected a threshold in (0, 1) and a filling in (0, 1], got "
+                f"{self.threshold} and {self.filling}"
+            )
+
+
+def pyvale_python() -> str:
+    """Path of the Python that has pyvale; raises MissingDependencyError if none is known."""
+    given = os.environ.get(WHERE)
+    if given:
+        path = Path(given).expanduser()
+        if not path.is_file():
+            raise MissingDependencyError(f"expected a Python in {WHERE}, found no file {path}")
+        return str(path.absolute())  # not resolved: a venv is known by its link
+    if importlib.util.find_spec("pyvale") is None:
+        raise MissingDependencyError(HOW_TO_GET)
+    return sys.executable
+
+
+def subset_field(
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    grid: PixelGrid,
+    mask: ArrayLike | None = None,
+    deformed_mask: ArrayLike | None = None,
+    options: SubsetOptions | None = None,
+) -> LocalField:
+    """Measure a displacement field by subsets.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels.
+    grid
+        Their pixels.
+    mask, deformed_mask
+        (rows, cols) True on material; the second only helps to find the largest motion.
+    options
+        Subsets.
+
+    Returns
+    -------
+    LocalField
+        Subsets below the threshold are kept as not valid. The standard deviations are those of
+        :func:`modeharvest.idic.local.subsets.predicted_sd`.
+
+    Raises
+    ------
+    MissingDependencyError
+        If pyvale is not installed.
+    InputError
+        If images and mask don't fit together, no subset fits into the material, or pyvale fails.
+    """
+    options = options or SubsetOptions()
+    python = pyvale_python()
+    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
+    f, g, inside = images.f, images.g, images.f_mask
+    inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
+    seeds = _seeds(inside, options.subset_px)
+    largest = options.largest_px or _largest_motion(f, g, grid, inside, images.g_mask)
+    reason = ""
+    with tempfile.TemporaryDirectory(prefix="modeharvest-pyvale-") as name:
+        folder = Path(name)
+        for seed, share in product(seeds, _SHARES):
+            arguments = _arguments(options, grid, seed, round(share * largest))
+            reason = _run(python, folder, f, g, inside, arguments)
+            results = sorted(folder.glob("subsets_*.csv"))
+            if results:
+                field = read_field(results[0], grid)
+                correlation = read_table(results[0])["cost_zncc"]
+                sd = predicted_sd(f, inside, grid, field, correlation, options.subset_px)
+                return replace(field, sd=sd, source=f"pyvale, subsets of {options.subset_px} px")
+    raise InputError(f"subset DIC: expected a result of pyvale, got none: {reason}")
+
+
+def _largest_motion(
+    f: NDArray[Any], g: NDArray[Any], grid: PixelGrid, mask: BoolArray, landing: BoolArray | None
+) -> int:
+    """Largest motion along either axis [px], by a rough field, with a margin."""
+    known, _ = first_motion(Box(*grid.extent), grid, mask, landing, None)
+    cell = CELL_PX * max(1, round(min(grid.shape) / _COARSE_PX)) * grid.pixel_size
+    rough = coarse_field(f, g, grid, cell, known, mask, landing)
+    most = float(np.quantile(np.abs(rough.u).max(axis=1), _MOST)) / grid.pixel_size
+    return int(np.ceil(_MARGIN * most)) + 4
+
+
+def _seeds(mask: BoolArray, subset_px: int) -> list[tuple[int, int]]:
+    """(col, row) of places with most material around, far from each other; the best first."""
+    padded = np.pad(mask, 1)
+    room = np.asarray(ndimage.distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1].copy()
+    seeds = []
+    for _ in range(_TRIES):
+        row, col = np.unravel_index(int(np.argmax(room)), room.shape)
+        if 2 * room[row, col] - 1 < subset_px:
+            break
+        seeds.append((int(col), int(row)))
+        reach = max(mask.shape) // 6
+        room[max(0, row - reach) : row + reach, max(0, col - reach) : col + reach] = 0
+    if not seeds:
+        raise InputError(
+            f"subset DIC: expected material wide enough for a subset of {subset_px} px, got none; "
+            "take smaller subsets"
+        )
+    return seeds
+
+
+def _arguments(
+    options: SubsetOptions, grid: PixelGrid, seed: tuple[int, int], largest: int
+) -> dict[str, Any]:
+    """Arguments of pyvale's ``calculate_2d``."""
+    return {
+        "seed": list(seed),
+        "subset_size": options.subset_px,
+        "subset_step": options.step_px,
+        "shape_function": options.shape.upper(),
+        "threshold": options.threshold,
+        "partial_subset": options.filling,
+        "max_displacement": min(max(largest, options.subset_px), (min(grid.shape) - 1) // 2),
+        "num_threads": options.threads,
+        "image_filter_kernel": 1,  # no blur: the images are taken as they are
+    }
+
+
+def _run(
+    python: str,
+    folder: Path,
+    f: NDArray[Any],
+    g: NDArray[Any],
+    mask: BoolArray,
+    arguments: dict[str, Any],
+) -> str:
+    """Run pyvale once; the last line of what it says if it fails."""
+    low, high = min(f.min(), g.min()), max(f.max(), g.max())
+    f, g = ((255.0 * (i - low) / (high - low)).astype(np.float32) for i in (f, g))
+    np.savez(folder / "request.npz", f=f, g=g, mask=mask, arguments=json.dumps(arguments))
+    quiet = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
+    done = subprocess.run(
+        [python, str(_SIDE), str(folder)],
+        cwd=folder,  # pyvale leaves a log where it is run
+        capture_output=True,
+        text=True,
+        env=quiet,
+        check=False,
+    )
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    named = [line for line in lines if "Error" in line]
+    if done.returncode < 0:
+        return f"it was ended by signal {-done.returncode}"
+    return (named or lines or [f"exit code {done.returncode}"])[-1].strip()

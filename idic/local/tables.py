@@ -1,0 +1,355 @@
+"""Named columns of CSV, NPZ, HDF5 and MAT files, and what the names used by DIC codes mean.
+
+Known: x, y, u, v with or without a unit, the lower and upper case of VIC-2D and VIC-3D (pixels and
+millimetres), DICe's COORDINATE_X and DISPLACEMENT_X, pyvale's subset_x and disp_u, GOM's and
+ZEISS's dx or displacement x.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import open_hdf5, read_in_child, reading, require_plausible
+from modeharvest.util.machine import require_memory
+
+Table = dict[str, FloatArray]
+
+_MISSING = {"", "-", "--", "---", "na", "n/a", "nan", "null", "none"}
+_WHAT, _REMEDY = "a displacement field", "export it again, best as CSV"
+_BYTES_OF_TEXT = 10.0
+"""Most that a character of a table of numbers becomes in memory."""
+_HEAD = 1000
+"""Lines of a text among which the first line of numbers is looked for."""
+_LOGICAL = {"true": 1.0, "false": 0.0}
+
+
+def read_table(path: Path | str) -> Table:
+    """Read all the numeric variables of a file, each under its name.
+
+    Parameters
+    ----------
+    path
+        ``.csv``, ``.txt``, ``.dat`` or ``.tsv`` with columns; ``.npz``; ``.h5`` or ``.hdf5``;
+        ``.mat`` of any version. Variables in groups or structures are found by their last name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, not of its kind, or holds no numbers.
+    """
+    path = Path(path)
+    with reading(path, f"{_WHAT} ({path.suffix})", _REMEDY):
+        reader = _READERS.get(path.suffix.lower())
+        if reader is None:
+            raise InputError(
+                f"{path}: expected one of {', '.join(sorted(_READERS))}, got {path.suffix!r}; "
+                "save the field as CSV"
+            )
+        table = reader(path)
+        if not table:
+            raise InputError(f"{path}: expected numeric variables, found none")
+        return table
+
+
+def _read_text(path: Path) -> Table:
+    """Read columns under a line of names; lines before it are skipped, '#' may precede it."""
+    require_memory(_BYTES_OF_TEXT * path.stat().st_size, f"the table {path}", "thin it out")
+    numbered = _numbered(path)
+    first = next((i for i, (_, line) in enumerate(numbered) if _looks_numeric(line)), None)
+    if first is None:
+        raise InputError(f"{path}: expected lines of numbers, found none")
+    separator, decimal = _dialect(numbered[first][1])
+    names = _split(numbered[first - 1][1], separator) if first else []
+    while names and not names[-1]:
+        names.pop()  # of a separator at the end of the line
+    row = _split(numbered[first][1], separator)
+    if len(names) != len(row) - (not row[-1]) and len(names) != len(row):
+        names = [str(k + 1) for k in range(len(row))]  # to be called by their number
+    values = _numbers_at_once(path, numbered[first][0], separator)
+    if values is None or values.shape[1] != len(names):
+        values = _numbers_by_line(path, numbered[first][0], separator, decimal, len(names))
+    return {name: values[:, k] for k, name in enumerate(names)}
+
+
+def _numbered(path: Path, begin: int = 1, end: int | None = _HEAD) -> list[tuple[int, str]]:
+    """Numbers and content of the lines that hold something, from one to another."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        lines = islice(enumerate(file, start=1), begin - 1, end)
+        stripped = ((k, line.strip().lstrip("#%").strip()) for k, line in lines)
+        return [(k, line) for k, line in stripped if line]
+
+
+def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArray | None:
+    """(n, m) of a table of nothing but numbers, fast; None if there is anything else."""
+    try:
+        return np.loadtxt(
+            path, delimiter=separator, comments=None, skiprows=begin - 1, ndmin=2,
+            encoding="utf-8-sig",
+        )  # fmt: skip
+    except ValueError:  # words, gaps, decimal commas, or lines of different lengths
+        return None
+
+
+def _numbers_by_line(
+    path: Path, begin: int, separator: str | None, decimal: str, width: int
+) -> FloatArray:
+    """(n, width) line by line, to say in which of them something else stands."""
+    rows = [(k, _split(line, separator)) for k, line in _numbered(path, begin, None)]
+    for k, row in rows:
+        if len(row) - width not in (0, 1) or any(row[width:]):
+            raise InputError(f"{path}, line {k}: expected {width} values, got {len(row)}")
+    return np.array([[_number(v, decimal, path, k) for v in row[:width]] for k, row in rows])
+
+
+def _looks_numeric(line: str) -> bool:
+    """Whether at least two fields are there, and all are numbers or missing."""
+    separator, decimal = _dialect(line)
+    fields = _split(line, separator)
+    numbers = sum(_is_number(f, decimal) for f in fields)
+    others = _MISSING | set(_LOGICAL)
+    return numbers >= 2 and all(_is_number(f, decimal) or f.lower() in others for f in fields)
+
+
+def _dialect(line: str) -> tuple[str | None, str]:
+    """Separator (None: blanks) and decimal sign of a line of numbers."""
+    if ";" in line:
+        return ";", "," if "," in line else "."
+    if "\t" in line:
+        return "\t", "," if "," in line and "." not in line else "."
+    return ("," if "," in line else None), "."
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    # Blanks separate, except before a unit: x [mm].
+    fields = re.split(r"\s+(?!\[)", line) if separator is None else line.split(separator)
+    return [f.strip().strip("\"'").strip() for f in fields]
+
+
+def _is_number(text: str, decimal: str) -> bool:
+    try:
+        float(text.replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _number(text: str, decimal: str, path: Path, line: int) -> float:
+    if text.lower() in _MISSING:
+        return float("nan")
+    if text.lower() in _LOGICAL:
+        return _LOGICAL[text.lower()]
+    if not _is_number(text, decimal):
+        raise InputError(f"{path}, line {line}: expected a number, got {text!r}")
+    return float(text.replace(decimal, "."))
+
+
+def _read_npz(path: Path) -> Table:
+    with path.open("rb") as stream:  # which numpy doesn't close if the archive is damaged
+        with ZipFile(stream) as archive:
+            require_plausible(path, float(sum(part.file_size for part in archive.infolist())))
+        stream.seek(0)
+        file = np.load(stream, allow_pickle=False)
+        return _numeric({name: file[name] for name in file.files})
+
+
+def _read_hdf5(path: Path) -> Table:
+    found: dict[str, Any] = {}
+    with open_hdf5(path, _WHAT, _REMEDY) as file:
+        file.visititems(
+            lambda n, o: found.update({n: o[()]}) if isinstance(o, h5py.Dataset) else None
+        )
+    return _numeric(_by_last_name(found))
+
+
+def _read_mat(path: Path) -> Table:
+    if h5py.is_hdf5(path):  # version 7.3, in which MATLAB's columns are HDF5's rows
+        return {name: array.T for name, array in _read_hdf5(path).items()}
+    return _numeric(_by_last_name(read_mat(path)))
+
+
+def read_mat(path: Path) -> dict[str, NDArray[Any]]:
+    """Numbers and texts of a MAT file before version 7.3, by their path in structures."""
+    return read_in_child("mat", path, "a MAT file", _REMEDY)
+
+
+def _by_last_name(found: dict[str, Any]) -> dict[str, Any]:
+    """Short names where they are unique; whole paths where they are not."""
+    last = [path.rsplit("/", 1)[-1] for path in found]
+    return {
+        name if last.count(name) == 1 else path: value
+        for (path, value), name in zip(found.items(), last, strict=True)
+    }
+
+
+def _numeric(found: dict[str, Any]) -> Table:
+    """The arrays of numbers among them, as floats."""
+    table = {}
+    for name, value in found.items():
+        array = np.asarray(value)
+        if array.dtype.kind in "fiub":
+            table[name] = array.astype(np.float64)
+    return table
+
+
+_READERS: dict[str, Callable[[Path], Table]] = {
+    ".csv": _read_text,
+    ".txt": _read_text,
+    ".dat": _read_text,
+    ".tsv": _read_text,
+    ".npz": _read_npz,
+    ".h5": _read_hdf5,
+    ".hdf5": _read_hdf5,
+    ".mat": _read_mat,
+}
+
+
+ROLES = ("x", "y", "u", "v")
+ALL_ROLES = (*ROLES, "sd_u", "sd_v", "sigma", "valid")
+
+_BASES: dict[str, set[str]] = {
+    "x": {"x", "ss x", "subset x", "coordinate x", "coord x", "pos x", "position x", "x c", "xc",
+          "x coordinate", "x pos", "subset coordinates x"},
+    "u": {"u", "ux", "u x", "disp u", "disp x", "dx", "displacement x", "displacement u", "u c",
+          "x displacement", "displacements u", "d x"},
+    "sd_u": {"sd u", "sigma u", "std u", "u std", "u sd"},
+}  # fmt: skip
+_TURNED = {"y": "x", "v": "u", "sd_v": "sd_u"}
+_ALONE = {"sigma": "sigma", "valid": "valid"}
+_IMAGE_CODES = {"subset x", "ss x", "coordinate x", "subset coordinates x"}
+"""Names of codes that always write pixels, y down: pyvale and DICe."""
+_UNITS = {"px": "px", "pixel": "px", "pixels": "px", "pix": "px", "mm": "mm"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a column's name says.
+
+    Parameters
+    ----------
+    name
+        As in the file.
+    role
+        "x", "y", "u", "v", "sd_u", "sd_v", "sigma" or "valid"; None for any other.
+    unit
+        "px" or "mm", None if the name doesn't say.
+    y_axis
+        "up" or "down", None if the name doesn't say.
+    of_image_code
+        Whether only codes that measure everything in pixels use this name.
+    """
+
+    name: str
+    role: str | None
+    unit: str | None
+    y_axis: str | None
+    of_image_code: bool = False
+
+
+def column(name: str) -> Column:
+    """Read a column's name."""
+    words = re.sub(r"[\[\](){}_.,:/]+", " ", re.sub(r"(?<=[a-z])(?=[XYUV]$)", " ", name))
+    parts = words.strip().lower().split()
+    unit = next((_UNITS[p] for p in parts if p in _UNITS), None)
+    y_axis = next((p for p in parts if p in ("up", "down")), None)
+    base = " ".join(p for p in parts if p not in _UNITS and p not in ("up", "down"))
+    role = _role(base)
+    if _as_x(base) in _IMAGE_CODES and unit is None:
+        return Column(name, role, "px", "down", of_image_code=True)
+    return Column(name, role, unit, y_axis)
+
+
+def _role(base: str) -> str | None:
+    for role, bases in _BASES.items():
+        if base in bases:
+            return role
+    for role, like in _TURNED.items():
+        if _as_x(base) in _BASES[like] and _as_x(base) != base:
+            return role
+    return _ALONE.get(base)
+
+
+def _as_x(base: str) -> str:
+    """The name that the x component would have."""
+    turn = {"y": "x", "v": "u", "uy": "ux", "dy": "dx", "yc": "xc"}
+    return " ".join(turn.get(word, word) for word in base.split())
+
+
+def choose(
+    names: list[str], given: Mapping[str, str | int], units: str | None, where: str
+) -> dict[str, Column]:
+    """Decide which column plays which role.
+
+    Parameters
+    ----------
+    names
+        All columns of the file.
+    given
+        Names, or numbers from 1, of roles that the user knows.
+    units
+        "px" or "mm", to choose between a field in pixels and one in millimetres; or None.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, or several could be meant.
+    """
+    columns = [column(name) for name in names]
+    chosen: dict[str, Column] = {}
+    for role, key in given.items():
+        if role not in ALL_ROLES:
+            raise InputError(
+                f"{where}: expected columns to be given for {', '.join(ALL_ROLES)}, got {role!r}"
+            )
+        name = names[key - 1] if isinstance(key, int) and 0 < key <= len(names) else str(key)
+        if name not in names:
+            raise InputError(f"{where}: expected a column {key!r} for {role}, got {_listed(names)}")
+        chosen[role] = column(name)
+    for role in ALL_ROLES:
+        candidates = [c for c in columns if c.role == role]
+        if role in chosen or not candidates:
+            continue
+        best = _narrowed(candidates, units)
+        if len(best) > 1:
+            raise InputError(
+                f"{where}: expected one column for {role}, got {_listed([c.name for c in best])}; "
+                f"say which in columns, or give units"
+            )
+        chosen[role] = best[0]
+    missing = [role for role in ROLES if role not in chosen]
+    if missing:
+        raise InputError(
+            f"{where}: expected columns for {', '.join(missing)}, got {_listed(names)}; "
+            "name them in columns"
+        )
+    return chosen
+
+
+def _narrowed(candidates: list[Column], units: str | None) -> list[Column]:
+    """Drop what is in another unit; VIC writes pixels in lower and millimetres in upper case."""
+    if len(candidates) == 1 or units is None:
+        return candidates
+    fitting = [c for c in candidates if c.unit in (units, None)] or candidates
+    named = [c for c in fitting if c.unit == units]
+    if len(named) == 1:
+        return named
+    cased = [c for c in fitting if c.name[:1].isupper() == (units == "mm")]
+    return cased if len(cased) == 1 else fitting
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(repr(n) for n in names[:12])
+    return shown + (f" and {len(names) - 12} more" if len(names) > 12 else "")

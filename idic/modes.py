@@ -1,0 +1,328 @@
+"""Patterning modes: truncated Fourier series, their families of parameters, and their support.
+
+A mode is phi(x) = s tau(x) sum_w (A_w, B_w) sin(pi/l (kx_w x + ky_w y + c_w)): k is
+dimensionless (1 is a wavelength of 2 l), c is in mm, s is a fixed scale and tau the support.
+A family says how the few parameters a of the mode make the five of each wave, P = C a + P0;
+the paper's Eq. (mode) is one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.idic.slow_fields import Box, sum_of_products
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+
+@dataclass(frozen=True)
+class Taper:
+    """The factor tau(x) = tau_x(x) tau_y(y) of a mode.
+
+    Parameters
+    ----------
+    cellular
+        Region where tau = 1 [mm].
+    width
+        Distance over which tau falls linearly to 0 outside it [mm]; the paper takes half the
+        size of the unit cell.
+    """
+
+    cellular: Box
+    width: float
+
+    def __post_init__(self) -> None:
+        if not self.width > 0:
+            raise InputError(f"expected a taper wider than 0 mm, got {self.width} mm")
+
+    def along_x(self, x: ArrayLike) -> FloatArray:
+        """tau_x [-] at x [mm]."""
+        return _ramp(x, self.cellular.x_min, self.cellular.x_max, self.width)
+
+    def along_y(self, y: ArrayLike) -> FloatArray:
+        """tau_y [-] at y [mm]."""
+        return _ramp(y, self.cellular.y_min, self.cellular.y_max, self.width)
+
+
+def _ramp(t: ArrayLike, low: float, high: float, width: float) -> FloatArray:
+    t = np.asarray(t, dtype=np.float64)
+    outside = np.maximum(low - t, t - high)
+    return np.clip(1.0 - outside / width, 0.0, 1.0)
+
+
+PER_WAVE = 5
+"""Parameters of a wave, in this order: A, B [-], kx, ky [-], c [mm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModeFamily:
+    """A linear map from a mode's parameters to its waves.
+
+    Parameters
+    ----------
+    name
+        What to call the family, e.g. "square, origin at a junction".
+    matrix
+        (5 w, m): C, from the m parameters to A, B, kx, ky, c of each of the w waves.
+    offset
+        (5 w,): P0, what the parameters can't change.
+    start
+        (m,): where a correlation begins.
+    names, units
+        Of the parameters, m each; by default a1, a2, ... and "-".
+    """
+
+    name: str
+    matrix: FloatArray
+    offset: FloatArray
+    start: FloatArray
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for key in ("matrix", "offset", "start"):
+            object.__setattr__(self, key, np.array(getattr(self, key), dtype=np.float64))
+        if self.matrix.ndim != 2 or len(self.matrix) % PER_WAVE or not len(self.matrix):
+            raise InputError(
+                f"mode family {self.name!r}: expected a matrix of shape (5 waves, parameters), "
+                f"got {self.matrix.shape}"
+            )
+        rows, m = self.matrix.shape
+        if self.offset.shape != (rows,) or self.start.shape != (m,):
+            raise InputError(
+                f"mode family {self.name!r}: expected offset ({rows},) and start ({m},), got "
+                f"{self.offset.shape} and {self.start.shape}"
+            )
+        if not self.names:
+            object.__setattr__(self, "names", tuple(f"a{k + 1}" for k in range(m)))
+        if not self.units:
+            object.__setattr__(self, "units", ("-",) * m)
+        if len(self.names) != m or len(self.units) != m:
+            raise InputError(
+                f"mode family {self.name!r}: expected {m} names and units, got "
+                f"{len(self.names)} and {len(self.units)}"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of parameters m."""
+        return len(self.start)
+
+    @property
+    def wave_count(self) -> int:
+        """Number of waves w."""
+        return len(self.matrix) // PER_WAVE
+
+    def waves(self, parameters: ArrayLike) -> FloatArray:
+        """(w, 5): A, B, kx, ky [-] and c [mm] of every wave."""
+        full = self.matrix @ np.asarray(parameters, dtype=np.float64) + self.offset
+        return full.reshape(-1, PER_WAVE)
+
+    def held(self) -> ModeFamily:
+        """The family whose only mode is this one's start: no parameters are left.
+
+        For images without a pattern, in which the mode's parameters can't be seen.
+        """
+        waves = self.waves(self.start).ravel()
+        return ModeFamily(f"{self.name}, held", np.zeros((waves.size, 0)), waves, np.zeros(0))
+
+    def moved(self, shift: ArrayLike) -> ModeFamily:
+        """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
+
+        For a specimen whose origin isn't where the mode was found to have its own.
+
+        Raises
+        ------
+        InputError
+            If the family's phases can't follow.
+        """
+        change = np.zeros((self.wave_count, PER_WAVE))
+        change[:, 4] = -self.waves(self.start)[:, 2:4] @ np.asarray(shift, dtype=np.float64)
+        step = np.linalg.lstsq(self.matrix, change.ravel(), rcond=None)[0]
+        start = np.asarray(self.start + step, np.float64)
+        if not np.allclose(self.matrix @ step, change.ravel(), atol=1e-9):
+            raise InputError(f"mode family {self.name!r}: expected free phases, to move the mode")
+        return replace(self, start=start)
+
+
+def square_family(origin: str = "junction") -> ModeFamily:
+    """Make the paper's Eq. (mode): two waves along the diagonals, seven parameters.
+
+    phi_x = a1 [-sin t1 - sin t2], phi_y = sin t1 - sin t2 with t1 = pi/l (a2 x + a3 y + a6) and
+    t2 = pi/l (a4 x + a5 y + a7); a6 and a7 are in mm.
+
+    Parameters
+    ----------
+    origin
+        What the physical origin is: "junction", the solid between four holes, where a mode
+        starts from [1, 1, 1, -1, 1, 0, 0], or "hole", the centre of a hole,
+        [1, 1, 1, 1, -1, 0, 0].
+
+    Raises
+    ------
+    InputError
+        If the origin is neither.
+    """
+    starts = {"junction": [1, 1, 1, -1, 1, 0, 0], "hole": [1, 1, 1, 1, -1, 0, 0]}
+    if origin not in starts:
+        raise InputError(f"expected an origin among {list(starts)}, got {origin!r}")
+    matrix, offset = np.zeros((10, 7)), np.zeros(10)
+    matrix[[0, 5], 0] = -1.0  # A1 = A2 = -a1
+    offset[[1, 6]] = 1.0, -1.0  # B1 = 1, B2 = -1
+    for row, column in ((2, 1), (3, 2), (4, 5), (7, 3), (8, 4), (9, 6)):
+        matrix[row, column] = 1.0
+    units = ("-",) * 5 + ("mm",) * 2
+    return ModeFamily(
+        f"square, origin at a {origin}", matrix, offset, np.array(starts[origin]), units=units
+    )
+
+
+def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
+    """Make the family in which every wave has its own five parameters.
+
+    An amplitude common to all waves is what v_i already describes, so the largest amplitude
+    of the start is held fixed.
+
+    Parameters
+    ----------
+    waves
+        (w, 5): A, B, kx, ky, c to start from.
+    name
+        What to call the family.
+
+    Raises
+    ------
+    InputError
+        If the waves are not of shape (w, 5).
+    """
+    full = np.atleast_2d(np.asarray(waves, dtype=np.float64))
+    if full.ndim != 2 or full.shape[1] != PER_WAVE:
+        raise InputError(f"expected waves of shape (w, 5), got {full.shape}")
+    flat = full.ravel()
+    amplitudes = np.where(np.tile([1, 1, 0, 0, 0], len(full)) == 1, np.abs(flat), -1.0)
+    held = int(np.argmax(amplitudes))
+    kept = np.delete(np.arange(flat.size), held)
+    offset = np.zeros(flat.size)
+    offset[held] = flat[held]
+    names = [f"{p}{w + 1}" for w in range(len(full)) for p in ("A", "B", "kx", "ky", "c")]
+    units = ["-", "-", "-", "-", "mm"] * len(full)
+    return ModeFamily(
+        name,
+        np.eye(flat.size)[:, kept],
+        offset,
+        flat[kept],
+        tuple(names[k] for k in kept),
+        tuple(units[k] for k in kept),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FourierMode:
+    """A mode phi: a family, its length, its scale and its support.
+
+    Parameters
+    ----------
+    family
+        How the mode's parameters make its waves.
+    half_wavelength
+        l [mm], half the wavelength at k = 1; the paper takes the size of the unit cell.
+    scale
+        s [-].
+    taper
+        Where the mode lives.
+    """
+
+    family: ModeFamily
+    half_wavelength: float
+    scale: float
+    taper: Taper
+
+    def __post_init__(self) -> None:
+        if not (self.half_wavelength > 0 and self.scale > 0):
+            raise InputError(
+                "expected a positive half-wavelength and scale, got "
+                f"{self.half_wavelength} mm and {self.scale}"
+            )
+
+    @classmethod
+    def scaled(
+        cls, family: ModeFamily, half_wavelength: float, taper: Taper, maximum: float = 0.04
+    ) -> FourierMode:
+        """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start.
+
+        Parameters
+        ----------
+        family
+            What is free of the waves.
+        half_wavelength
+            l [mm].
+        taper
+            The mode's support.
+        maximum
+            max ||phi|| [-]; the paper's is 0.04.
+
+        Raises
+        ------
+        InputError
+            If that start gives a mode that is zero.
+        """
+        unit = cls(family, half_wavelength, 1.0, taper)
+        # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
+        # with k near 1 to well under 1 %; the square one is hit exactly.
+        t = np.asarray(half_wavelength * np.arange(-192, 193) / 16.0, dtype=np.float64)
+        phi = unit.waves_sum(family.start, t[None, :], t[:, None])
+        largest = float(np.sqrt((phi**2).sum(axis=-1).max()))
+        if not largest > 0:
+            raise InputError(f"mode family {family.name!r}: the start gives a mode that is zero")
+        return cls(family, half_wavelength, maximum / largest, taper)
+
+    def phases(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(w, ...): theta_w [rad] at positions [mm] that broadcast together."""
+        waves = self.family.waves(parameters)
+        per_mm = np.pi / self.half_wavelength
+        return np.stack([per_mm * (w[2] * x + w[3] * y + w[4]) for w in waves])
+
+    def waves_sum(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(..., 2): sum of (A, B) sin theta [-], without scale and support."""
+        return self._weighted_sum(parameters, x, y, np.ones_like(x), np.ones_like(y))
+
+    def evaluate(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(..., 2): phi [-] along x and y, at positions [mm] that broadcast together."""
+        taper_x, taper_y = self.scale * self.taper.along_x(x), self.taper.along_y(y)
+        return self._weighted_sum(parameters, x, y, taper_x, taper_y)
+
+    def _weighted_sum(
+        self, parameters: ArrayLike, x: FloatArray, y: FloatArray, of_x: FloatArray,
+        of_y: FloatArray,
+    ) -> FloatArray:  # fmt: skip
+        """(..., 2): sum of (A, B) sin theta, times a function of x and one of y."""
+        per_mm = np.pi / self.half_wavelength
+        waves = self.family.waves(parameters)
+        tx = [per_mm * kx * x for kx in waves[:, 2]]
+        ty = [per_mm * (ky * y + c) for ky, c in waves[:, 3:]]
+        # sin(tx + ty) in products of one-dimensional tables: on an open grid no sine per pixel.
+        along_x = of_x * np.stack([*np.sin(tx), *np.cos(tx)])
+        along_y = of_y * np.stack([*np.cos(ty), *np.sin(ty)])
+        twice = np.vstack([waves, waves]).reshape(-1, PER_WAVE, *(1,) * np.ndim(y))
+        components = np.empty((2, *np.broadcast_shapes(np.shape(x), np.shape(y))))
+        for c in (0, 1):
+            sum_of_products(along_x, twice[:, c] * along_y, components[c])
+        return np.moveaxis(components, 0, -1)
+
+    def sensitivities(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(..., 2, m): derivatives of phi with respect to the mode's parameters."""
+        x, y = np.broadcast_arrays(x, y)
+        waves = self.family.waves(parameters)
+        per_mm = np.pi / self.half_wavelength
+        full = np.zeros((*x.shape, 2, PER_WAVE * len(waves)))
+        for w, theta in enumerate(self.phases(parameters, x, y)):
+            k = PER_WAVE * w
+            full[..., 0, k] = full[..., 1, k + 1] = np.sin(theta)
+            slope = per_mm * np.cos(theta)[..., None] * waves[w, :2]
+            full[..., k + 2], full[..., k + 3] = slope * x[..., None], slope * y[..., None]
+            full[..., k + 4] = slope
+        envelope = self.scale * self.taper.along_x(x) * self.taper.along_y(y)
+        return np.asarray(envelope[..., None, None] * full @ self.family.matrix)

@@ -1,0 +1,1 @@
+"""Photographs of a cellular specimen: material, holes, region, initial guess and measurement."""

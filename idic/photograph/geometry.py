@@ -1,0 +1,313 @@
+"""Geometry of a photographed specimen: hole lattice, cellular parts, and where they have moved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
+from modeharvest.idic.photograph.matching import (
+    BlockMatch,
+    Expected,
+    HoleMotion,
+    match_blocks,
+    possible_motions,
+    require_same_surface,
+)
+from modeharvest.idic.photograph.region import (
+    Region,
+    region_of_lattice,
+    region_of_mask,
+    region_of_polygon,
+)
+from modeharvest.idic.slow_fields import Box
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import read_mask, require_same_shape
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+
+Corners = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class RegionTable:
+    """A part of the specimen with a pattern, and modes, of its own.
+
+    Parameters
+    ----------
+    name
+        In the report.
+    polygon
+        Corners (column, row) in the reference image [px]; the modes live in the box around them.
+    """
+
+    name: str = ""
+    polygon: Corners = ()
+
+    def __post_init__(self) -> None:
+        if not self.name or len(self.polygon) < 3:
+            raise InputError(
+                "specimen.regions: expected a name and a polygon of at least three corners "
+                f"[column, row], got name = {self.name!r} and {len(self.polygon)} corners"
+            )
+
+
+@dataclass(frozen=True)
+class SpecimenTable:
+    """What is known of the specimen beforehand.
+
+    Parameters
+    ----------
+    cell_size
+        l [mm], the distance of neighbouring holes.
+    polygon
+        Corners (column, row) of the cellular part in the reference image [px]; found from the
+        holes otherwise.
+    cells
+        Or a mask image of the cellular part, white inside.
+    material
+        Mask image of the reference's material, white on it; found from the image otherwise.
+    deformed_material
+        The same of each deformed image, in their order; names may hold wildcards.
+    regions
+        Parts of the cellular part whose patterns differ; by default it has one pattern.
+    """
+
+    cell_size: float = math.nan
+    polygon: Corners = ()
+    cells: str = ""
+    material: str = ""
+    deformed_material: tuple[str, ...] = ()
+    regions: tuple[RegionTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.cell_size > 0:
+            raise InputError(
+                f"specimen: expected a cell_size above 0 mm, got {self.cell_size}; it is the "
+                "distance of neighbouring holes"
+            )
+        if self.polygon and (self.cells or len(self.polygon) < 3):
+            raise InputError(
+                "specimen: expected a polygon of at least three corners or a mask image 'cells', "
+                f"got {len(self.polygon)} corners and cells = {self.cells!r}"
+            )
+        names = [region.name for region in self.regions]
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"specimen.regions: expected names that differ, got {', '.join(names)}"
+            )
+
+
+_UPRIGHT_DEG = 1.0
+_OVERLAP = 0.5
+"""Cells by which the boxes of two parts may overlap; so wide are the tapers of their modes."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Where modes live.
+
+    Parameters
+    ----------
+    name
+        Of a part with a pattern of its own; "" for the whole cellular part.
+    box
+        Around it [mm].
+    """
+
+    name: str
+    box: Box
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """The specimen as the reference shows it.
+
+    Parameters
+    ----------
+    grid
+        The pixels.
+    mask
+        (rows, cols) True on material.
+    lattice
+        Of the holes; None where there is none and the region was given.
+    region
+        The cellular part.
+    parts
+        Of the cellular part, each with modes of its own; one by default.
+    """
+
+    grid: PixelGrid
+    mask: BoolArray
+    lattice: HoleLattice | None
+    region: Region
+    parts: tuple[Part, ...]
+
+    @property
+    def lattice_mm(self) -> FloatArray | None:
+        """(2, 2) vectors of the lattice as rows, along x and y [mm]; None for a square one.
+
+        A square lattice along the image's axes is what the paper's family is written for; a
+        specimen turned by less than a degree is followed by the mode's own wave vectors.
+        """
+        if self.lattice is None or self._is_upright:
+            return None
+        row, col = self.lattice.vectors.T
+        return np.asarray(np.column_stack([col, -row]) * self.grid.pixel_size)
+
+    @property
+    def _is_upright(self) -> bool:
+        assert self.lattice is not None
+        return self.lattice.kind == "square" and abs(self.lattice.rotation_deg) < _UPRIGHT_DEG
+
+    def motions_in(self, mask: BoolArray) -> tuple[tuple[HoleMotion, ...], str]:
+        """How the holes may have moved in a deformed image, the likeliest first.
+
+        Nothing where they can't be followed; the sentence says why. See
+        :func:`modeharvest.idic.photograph.matching.possible_motions`.
+
+        Parameters
+        ----------
+        mask
+            (rows, cols) True on material of the deformed image.
+        """
+        if self.lattice is None:
+            return (), "The reference shows no lattice of holes to follow."
+        try:
+            return possible_motions(self.lattice, find_hole_lattice(mask)), ""
+        except InputError as error:
+            return (), f"The holes could not be followed: {error}."
+
+
+def find_geometry(prepared: PreparedPhotographs, table: SpecimenTable, base: Path) -> Geometry:
+    """Find holes, lattice and cellular part in the reference.
+
+    Raises
+    ------
+    InputError
+        If the holes contradict the cell size, there is no lattice and no region is given, or
+        given parts lie outside the image or on one another.
+    """
+    grid, mask = prepared.grid, prepared.mask()
+    lattice: HoleLattice | None = None
+    try:
+        lattice = find_hole_lattice(mask, table.cell_size / grid.pixel_size)
+    except InputError:
+        if not (table.polygon or table.cells or table.regions):
+            raise
+    given = tuple(
+        Part(r.name, _polygon(r.polygon, mask, grid, f"specimen.regions {r.name!r}").cellular)
+        for r in table.regions
+    )
+    _require_apart(given, table.cell_size)
+    region = _region(table, lattice, mask, grid, base)
+    return Geometry(grid, mask, lattice, region, given or (Part("", region.cellular),))
+
+
+def _region(
+    table: SpecimenTable,
+    lattice: HoleLattice | None,
+    mask: BoolArray,
+    grid: PixelGrid,
+    base: Path,
+) -> Region:
+    """The cellular part: drawn, given as an image, or where the holes or the parts are."""
+    if table.polygon:
+        return _polygon(table.polygon, mask, grid, "specimen.polygon")
+    if table.cells:
+        cells = read_mask(base / table.cells)
+        require_same_shape(mask, cells, "the photographs", str(base / table.cells))
+        return region_of_mask(cells, mask, grid)
+    if lattice is not None:
+        return region_of_lattice(lattice, mask, grid)
+    corners = np.array([corner for region in table.regions for corner in region.polygon])
+    (left, top), (right, bottom) = corners.min(axis=0), corners.max(axis=0)
+    around = ((left, top), (right, top), (right, bottom), (left, bottom))
+    return _polygon(around, mask, grid, "specimen.regions")
+
+
+def _polygon(polygon: Corners, mask: BoolArray, grid: PixelGrid, where: str) -> Region:
+    """The region of corners (column, row), its faults told with the table that they come from."""
+    try:
+        return region_of_polygon([(row, col) for col, row in polygon], mask, grid)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _require_apart(parts: tuple[Part, ...], cell_size: float) -> None:
+    """Raise InputError if two parts share more than their modes' tapers do."""
+    for one, other in combinations(parts, 2):
+        a, b = one.box, other.box
+        shared = min(
+            min(a.x_max, b.x_max) - max(a.x_min, b.x_min),
+            min(a.y_max, b.y_max) - max(a.y_min, b.y_min),
+        )
+        if shared > _OVERLAP * cell_size:
+            raise InputError(
+                f"specimen.regions: expected parts beside each other, got {one.name!r} and "
+                f"{other.name!r}, whose boxes overlap by {shared:.3g} mm; draw them apart"
+            )
+
+
+def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | None, str]:
+    """How the holes have moved, and a sentence about it; None where they can't be followed.
+
+    Where a column of holes has left the image, the holes alone allow several answers, and the
+    speckle between them tells which is right.
+
+    Raises
+    ------
+    InputError
+        If the images don't show the same surface.
+    """
+    motions, why_not = geometry.motions_in(pair.deformed_mask)
+    if not motions:
+        return None, why_not
+    motion, seen = _likeliest(pair, motions)
+    require_same_surface(seen, "the reference", "the deformed one")
+    said = [*motion.sentences, seen.sentence]
+    if motion is not motions[0] or motion.rivals:
+        said.append("Which hole is which was told by the speckle between them.")
+    return motion, " ".join(said)
+
+
+def confirmed_by_speckle(pair: ImagePair, expected: Expected) -> str:
+    """A sentence about blocks of the reference that were found where they are expected.
+
+    Raises
+    ------
+    InputError
+        If the images don't show the same surface.
+    """
+    seen = match_blocks(pair.reference, pair.deformed, pair.mask, expected)
+    require_same_surface(seen, "the reference", "the deformed one")
+    return seen.sentence
+
+
+def _likeliest(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
+    """The motion that the speckle agrees with best.
+
+    Those that match as many holes come first, all others only if none of these is right.
+    """
+    tied = motions[0].rivals + 1
+    best = _best(pair, motions[:tied])
+    if best[1].is_same or len(motions) == tied:
+        return best
+    return max(best, _best(pair, motions[tied:]), key=_share)
+
+
+def _best(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
+    return max(
+        ((m, match_blocks(pair.reference, pair.deformed, pair.mask, m.at)) for m in motions),
+        key=_share,
+    )
+
+
+def _share(found: tuple[HoleMotion, BlockMatch]) -> float:
+    return found[1].share

@@ -1,0 +1,404 @@
+"""Holes in a mask of the material, and the lattice on which they lie.
+
+Neighbours repeat: the vectors from hole to hole gather around the lattice's own. The two that are
+met most often and are not parallel are reduced to the shortest. Going from each hole to its
+neighbours then counts every hole, (i, j), also where the lattice is bent or holes are missing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import center_of_mass, label
+from scipy.spatial import Delaunay, KDTree
+
+from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+_MUCH_SMALLER = 0.25
+"""Openings below this share of the typical area are scratches, bubbles and noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Holes:
+    """Holes of one image.
+
+    Parameters
+    ----------
+    centres
+        (n, 2) centroids, (row, col) [px].
+    areas
+        (n,) [px^2].
+    too_small
+        Number of openings left out because the others are much larger.
+    at_border
+        Number of openings that reach the image's border: background, or holes cut off.
+    """
+
+    centres: FloatArray
+    areas: FloatArray
+    too_small: int
+    at_border: int
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def diameters(self) -> FloatArray:
+        """(n,) diameters of circles of the same area [px]."""
+        return np.asarray(2.0 * np.sqrt(self.areas / np.pi))
+
+
+def find_holes(mask: ArrayLike) -> Holes:
+    """Find the holes in a mask.
+
+    Parameters
+    ----------
+    mask
+        (rows, cols) True on material.
+
+    Raises
+    ------
+    InputError
+        If the mask is not plane, or has no material or nothing else in it.
+    """
+    material = np.asarray(mask, dtype=np.bool_)
+    if material.ndim != 2:
+        raise InputError(f"expected a mask of rows x columns, got shape {material.shape}")
+    if not material.any() or material.all():
+        raise InputError(
+            "expected material and holes in the mask, got a mask with nothing in it: "
+            f"{'True' if material.any() else 'False'} everywhere"
+        )
+    parts, count = label(~material)
+    border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    border = border[border > 0]
+    areas = np.bincount(parts.ravel(), minlength=count + 1).astype(np.float64)
+    inner = np.setdiff1d(np.arange(1, count + 1), border)
+    typical = _typical(areas[inner]) if inner.size else 0.0
+    large = inner[areas[inner] >= _MUCH_SMALLER * typical]
+    centres = np.array(center_of_mass(~material, parts, large), dtype=np.float64)
+    return Holes(
+        centres=centres.reshape(-1, 2),
+        areas=areas[large],
+        too_small=int(inner.size - large.size),
+        at_border=int(border.size),
+    )
+
+
+def _typical(areas: FloatArray) -> float:
+    """The area above which half of all the hole area lies: many specks don't change it."""
+    ordered = np.sort(areas)[::-1]
+    return float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())])
+
+
+_ALIKE = 0.25
+"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's:
+locally, strain differs from the mean by 10 %, and holes are moulded a little off."""
+
+
+def spanning_vectors(spots: FloatArray) -> FloatArray | None:
+    """The two shortest vectors that span the lattice on which most of some points lie.
+
+    Parameters
+    ----------
+    spots
+        (n, 2) positions, (up, right) [px].
+
+    Returns
+    -------
+    ndarray or None
+        (2, 2) vectors as rows, (up, right) [px], the first to the right and the second upwards;
+        None if the points lie in one row.
+    """
+    tree = KDTree(spots)
+    distance, neighbour = tree.query(spots, k=min(9, len(spots)))
+    nearest = float(np.median(distance[:, 1]))
+    steps = (spots[neighbour] - spots[:, None])[(distance > 0) & (distance < 1.7 * nearest)]
+    steps = np.concatenate([steps, -steps])
+    gathered = KDTree(steps)
+    near = gathered.query_ball_point(steps, _ALIKE * nearest)
+    crowd = np.array([len(k) for k in near])
+    # Of two equally frequent steps, the shorter one.
+    order = np.lexsort([np.linalg.norm(steps, axis=1).round(6), -crowd])
+    first = steps[near[order[0]]].mean(axis=0)
+    for k in order:
+        second = steps[near[k]].mean(axis=0)
+        if _sine(first, second) > 0.5:
+            return _oriented(_reduced(first, second))
+    return None
+
+
+def _sine(a: FloatArray, b: FloatArray) -> float:
+    return abs(float(_cross(a, b))) / float(np.linalg.norm(a) * np.linalg.norm(b))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _reduced(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lagrange's reduction: the shortest two vectors that span the same lattice."""
+    while True:
+        if a @ a > b @ b:
+            a, b = b, a
+        turns = np.round((a @ b) / (a @ a))
+        if turns == 0.0:
+            return a, b
+        b = b - turns * a
+
+
+def _oriented(basis: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Choose i to the right and j upwards; of three directions 60 degrees apart, the best two."""
+    a, b = basis
+    third = a - b if a @ b > 0 else a + b
+    candidates = [a, b]
+    if np.linalg.norm(third) < 1.2 * np.linalg.norm(b):
+        candidates.append(third)
+    candidates += [-v for v in candidates]
+    unit = [v / np.linalg.norm(v) for v in candidates]
+    # A slight preference for the upper one settles ties.
+    i = int(np.argmax([u[1] + 1e-3 * u[0] for u in unit]))
+    j = int(np.argmax([u[0] + 1e-3 * u[1] if _sine(u, unit[i]) > 0.5 else -1.0 for u in unit]))
+    return np.stack([candidates[i], candidates[j]])
+
+
+Kind = Literal["square", "hexagonal", "rectangular", "oblique"]
+
+_NEAR = 0.25
+"""A neighbour is where the lattice says within this share of the pitch; locally, strain differs
+from the mean by 10 %, and holes are moulded a little off."""
+_BENT = 0.25
+"""Rms distance from a straight lattice, as a share of the pitch, that is no lattice any more."""
+_MOST = 0.5
+"""Share of the holes that must be on the lattice."""
+_EQUAL, _RIGHT_DEG = 0.06, 4.0
+"""Tolerances of "equally long" and of angles."""
+_WRONG_CELL = 0.1
+"""Relative difference from which on a given cell size is contradicted by the holes."""
+_FLIP = np.array([-1.0, 1.0])
+"""(row, col) times this is (up, right)."""
+
+
+@dataclass(frozen=True, eq=False)
+class HoleLattice:
+    """Holes and the lattice they lie on.
+
+    The centre of hole (i, j) is ``origin + i vectors[0] + j vectors[1]`` within ``misfit_px``.
+
+    Parameters
+    ----------
+    centres
+        (n, 2) hole centres on the lattice, (row, col) [px].
+    index
+        (n, 2) integers (i, j) from 0: i to the right, j upwards.
+    vectors
+        (2, 2) lattice vectors as rows, each (row, col) [px], of the best straight lattice.
+    origin
+        (2,) (row, col) of (0, 0) [px].
+    diameters
+        (n,) of circles with the holes' areas [px].
+    missing
+        (m, 2) indices of lattice points amid the others without a hole.
+    extra
+        (k, 2) centres of holes that are not on the lattice, (row, col) [px].
+    misfit_px
+        Rms distance of the centres from the straight lattice [px].
+    kind
+        "square", "hexagonal", "rectangular" or "oblique".
+    sentences
+        What was found.
+    """
+
+    centres: FloatArray
+    index: IntArray
+    vectors: FloatArray
+    origin: FloatArray
+    diameters: FloatArray
+    missing: IntArray
+    extra: FloatArray
+    misfit_px: float
+    kind: Kind
+    sentences: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def pitch_px(self) -> float:
+        """Cell size: mean length of the two lattice vectors [px]."""
+        return float(np.linalg.norm(self.vectors, axis=1).mean())
+
+    @property
+    def rotation_deg(self) -> float:
+        """Angle from the image's rows to the first lattice vector, anticlockwise [degrees]."""
+        up, right = self.vectors[0] * _FLIP
+        return float(np.degrees(np.arctan2(up, right)))
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of different i and of different j."""
+        i, j = np.ptp(self.index, axis=0) + 1
+        return int(i), int(j)
+
+    def position(self, index: ArrayLike) -> FloatArray:
+        """(..., 2) (row, col) [px] of lattice points (i, j), which need not be whole numbers."""
+        return np.asarray(self.origin + np.asarray(index, dtype=np.float64) @ self.vectors)
+
+
+def find_hole_lattice(mask: ArrayLike, cell_px: float | None = None) -> HoleLattice:
+    """Find the lattice in a mask.
+
+    Parameters
+    ----------
+    mask
+        (rows, cols) True on material.
+    cell_px
+        The cell size if it is known [px], to be compared with what is found.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than four holes, no lattice in them, or another cell size.
+    """
+    return lattice_of(find_holes(mask), cell_px)
+
+
+def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
+    """Find the lattice of given holes; see :func:`find_hole_lattice`."""
+    if len(holes) < 4:
+        raise InputError(
+            f"expected holes on a lattice, at least 2 x 2, got a mask with {len(holes)} "
+            f"{'hole' if len(holes) == 1 else 'holes'} ({holes.at_border} openings at the image's "
+            "border don't count): a mask with no lattice in it; give the cellular region instead"
+        )
+    spots = holes.centres * _FLIP
+    vectors = spanning_vectors(spots)
+    if vectors is None:
+        raise _no_lattice(len(holes), "they lie in one row")
+    index, known = _counted(spots, vectors)
+    if known.mean() < _MOST or known.sum() < 4 or np.ptp(index[known], axis=0).min() == 0:
+        raise _no_lattice(len(holes), f"only {known.sum()} are where neighbours say")
+    origin, vectors, misfit = _straight(spots[known], index[known])
+    pitch = float(np.linalg.norm(vectors, axis=1).mean())
+    if misfit > _BENT * pitch:
+        raise _no_lattice(len(holes), f"they are {misfit:.0f} px off one of {pitch:.0f} px")
+    kind = _kind(vectors)
+    found = HoleLattice(
+        centres=holes.centres[known],
+        index=index[known],
+        vectors=vectors * _FLIP,
+        origin=origin * _FLIP,
+        diameters=holes.diameters[known],
+        missing=_missing(index[known]),
+        extra=holes.centres[~known],
+        misfit_px=misfit,
+        kind=kind,
+        sentences=(),
+    )
+    if cell_px is not None:
+        require_cell_size(found, cell_px)
+    return _with_sentences(found, holes)
+
+
+def require_cell_size(lattice: HoleLattice, cell_px: float) -> None:
+    """Raise InputError if a given cell size [px] is not that of the holes."""
+    off = cell_px / lattice.pitch_px - 1.0
+    if not cell_px > 0 or abs(off) > _WRONG_CELL:
+        raise InputError(
+            f"expected a cell size near {lattice.pitch_px:.1f} px, the distance of the holes in "
+            f"the image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or the "
+            "pixel size"
+        )
+
+
+def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+    """(index from 0, known): count from neighbour to neighbour, in the largest connected part."""
+    steps = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+    tree, reach = KDTree(spots), _NEAR * float(np.linalg.norm(vectors, axis=1).min())
+    distance, there = tree.query(spots[:, None] + steps @ vectors, distance_upper_bound=reach)
+    best: dict[int, tuple[int, int]] = {}
+    free = set(range(len(spots)))
+    while len(free) > len(best):
+        part = _connected(min(free), there, np.isfinite(distance), steps)
+        free -= set(part)
+        best = max(best, part, key=len)
+    taken = Counter(best.values())
+    index, known = np.zeros((len(spots), 2), dtype=np.int64), np.zeros(len(spots), dtype=np.bool_)
+    for spot, ij in best.items():
+        index[spot], known[spot] = ij, taken[ij] == 1  # two holes can't be one lattice point
+    if known.any():
+        index -= index[known].min(axis=0)
+    return index, known
+
+
+def _connected(
+    start: int, there: IntArray, exists: NDArray[np.bool_], steps: IntArray
+) -> dict[int, tuple[int, int]]:
+    """Index of every hole that can be reached from one."""
+    index, queue = {start: (0, 0)}, deque([start])
+    while queue:
+        here = queue.popleft()
+        i, j = index[here]
+        for k in np.flatnonzero(exists[here]):
+            neighbour = int(there[here, k])
+            if neighbour not in index:
+                index[neighbour] = i + int(steps[k, 0]), j + int(steps[k, 1])
+                queue.append(neighbour)
+    return index
+
+
+def _straight(spots: FloatArray, index: IntArray) -> tuple[FloatArray, FloatArray, float]:
+    """(origin, vectors, rms distance) of the straight lattice nearest to the holes."""
+    matrix: FloatArray = np.column_stack([np.ones(len(index)), index])
+    found = np.asarray(np.linalg.lstsq(matrix, spots, rcond=None)[0], dtype=np.float64)
+    off = spots - matrix @ found
+    return found[0], found[1:], float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def _missing(index: IntArray) -> IntArray:
+    """Lattice points inside the hull of the others that have no hole."""
+    size = np.ptp(index, axis=0) + 1
+    every = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1).reshape(-1, 2)
+    inside = every[Delaunay(index).find_simplex(every) >= 0]
+    present = {(int(i), int(j)) for i, j in index}
+    return np.array([(i, j) for i, j in inside if (int(i), int(j)) not in present]).reshape(-1, 2)
+
+
+def _kind(vectors: FloatArray) -> Kind:
+    a, b = np.linalg.norm(vectors, axis=1)
+    angle = np.degrees(np.arccos(np.clip(vectors[0] @ vectors[1] / (a * b), -1.0, 1.0)))
+    equal = abs(a / b - 1.0) < _EQUAL
+    if abs(angle - 90.0) < _RIGHT_DEG:
+        return "square" if equal else "rectangular"
+    if equal and min(abs(angle - 60.0), abs(angle - 120.0)) < _RIGHT_DEG:
+        return "hexagonal"
+    return "oblique"
+
+
+def _with_sentences(lattice: HoleLattice, holes: Holes) -> HoleLattice:
+    d = lattice.diameters
+    (i, j), (a, b) = lattice.counts, np.linalg.norm(lattice.vectors, axis=1)
+    said = [
+        f"{len(lattice)} holes on a {lattice.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
+        f"turned by {lattice.rotation_deg:+.2f} degrees, {lattice.misfit_px:.2f} px rms off it; "
+        f"diameters {d.mean():.1f} +- {d.std():.1f} px."
+    ]
+    if len(lattice.missing):
+        said.append(f"Holes are missing at {len(lattice.missing)} lattice points amid them.")
+    if len(lattice.extra):
+        said.append(f"{len(lattice.extra)} holes are not on the lattice and were left out.")
+    if holes.too_small:
+        said.append(f"{holes.too_small} much smaller openings were left out.")
+    return replace(lattice, sentences=tuple(said))
+
+
+def _no_lattice(holes: int, why: str) -> InputError:
+    return InputError(
+        f"expected holes on a lattice, got a mask with no lattice in it: of {holes} holes {why}; "
+        "check the mask, or give the cellular region"
+    )

@@ -1,0 +1,384 @@
+"""Holes, and blocks of speckle, of the reference matched with those of a deformed photograph.
+
+Holes are told apart by their place in the lattice, not by their distance, so displacements may be
+larger than half the pitch.
+
+Blocks of the reference are looked for where they should have moved to, and as a comparison
+where they surely are not. If they correlate no better in the first place, the reference is not
+the reference, or the motion is larger than expected.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.interpolate import RBFInterpolator
+from scipy.ndimage import distance_transform_cdt, map_coordinates
+
+from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
+from modeharvest.util.errors import InputError
+
+_ALIKE = 0.4
+"""Relative change of the lattice vectors beyond which two lattices are not the same specimen's."""
+_RIVAL = 0.8
+"""Share of the most matched holes with which another way to lay one lattice on the other counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class HoleMotion:
+    """The same holes in two images.
+
+    Parameters
+    ----------
+    index
+        (n, 2) their (i, j) in the reference's lattice.
+    before, after
+        (n, 2) centres in the reference and in the deformed image, (row, col) [px].
+    rivals
+        Number of other ways to lay the lattices on each other that match as many holes.
+    sentences
+        What was matched.
+    """
+
+    index: IntArray
+    before: FloatArray
+    after: FloatArray
+    rivals: int
+    sentences: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def in_mm(self, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
+        """(positions, displacements), both (n, 2) along x and y [mm]."""
+        x, y = grid.to_mm(self.before[:, 0], self.before[:, 1])
+        x2, y2 = grid.to_mm(self.after[:, 0], self.after[:, 1])
+        return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+
+    def at(self, points: ArrayLike) -> FloatArray:
+        """Where positions (n, 2) (row, col) of the reference have moved to, from the holes around.
+
+        Between the holes the displacement is interpolated by linear radial functions and a plane
+        [px].
+        """
+        where = np.asarray(points, dtype=np.float64)
+        between = RBFInterpolator(self.before, self.after - self.before, kernel="linear", degree=1)
+        return np.asarray(where + between(where))
+
+    def affine(self) -> tuple[FloatArray, FloatArray]:
+        """Fit (offset, matrix): after = offset + before @ matrix, in (row, col) [px]."""
+        design = np.column_stack([np.ones(len(self)), self.before])
+        found = np.asarray(np.linalg.lstsq(design, self.after, rcond=None)[0], dtype=np.float64)
+        return found[0], found[1:]
+
+
+def match(reference: HoleLattice, deformed: HoleLattice) -> HoleMotion:
+    """Match the holes of two images; see :func:`possible_motions` for when that is ambiguous.
+
+    Raises
+    ------
+    InputError
+        If the lattices can't be the same specimen's.
+    """
+    return possible_motions(reference, deformed)[0]
+
+
+def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[HoleMotion, ...]:
+    """All ways to lay the deformed lattice on the reference's, the likeliest first.
+
+    Lattices look alike when moved by a whole cell; what decides is how many holes find a
+    partner, then the shorter mean displacement. If the outer rows of a specimen leave the
+    image, several ways match as many, and only the speckle can decide.
+
+    Raises
+    ------
+    InputError
+        If the lattices can't be the same specimen's.
+    """
+    index = _in_basis_of(reference, deformed)
+    steps = Counter(
+        (int(a[0] - b[0]), int(a[1] - b[1])) for a, b in product(reference.index, index)
+    )
+    most = max(steps.values())
+    motions = [
+        (count, _motion_by(reference, deformed, index + step))
+        for step, count in steps.items()
+        if count >= _RIVAL * most
+    ]
+    motions.sort(key=lambda found: (-found[0], _length(found[1])))
+    rivals = sum(count == most for count, _ in motions) - 1
+    return tuple(_with_sentences(motion, reference, deformed, rivals) for _, motion in motions)
+
+
+def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
+    """Indices of the deformed holes with respect to the vectors that were the reference's.
+
+    A lattice has many bases, and compression can change which one is the shortest.
+    """
+    changes = [
+        np.array(entries).reshape(2, 2)
+        for entries in product((-1, 0, 1), repeat=4)
+        if entries[0] * entries[3] - entries[1] * entries[2] == 1
+    ]
+    off = [np.linalg.norm(u @ deformed.vectors - reference.vectors) for u in changes]
+    best = int(np.argmin(off))
+    relative = off[best] / np.linalg.norm(reference.vectors)
+    if relative > _ALIKE:
+        raise InputError(
+            "expected the same lattice of holes in both images, got cells of "
+            f"{reference.pitch_px:.0f} px and of {deformed.pitch_px:.0f} px, turned by "
+            f"{reference.rotation_deg:.0f} and {deformed.rotation_deg:.0f} degrees; is the "
+            "reference the reference?"
+        )
+    back = np.rint(np.linalg.inv(changes[best])).astype(np.int64)
+    return np.asarray(deformed.index @ back)
+
+
+def _motion_by(reference: HoleLattice, deformed: HoleLattice, index: IntArray) -> HoleMotion:
+    place = {(int(i), int(j)): k for k, (i, j) in enumerate(index)}
+    pairs = [
+        (n, place[key])
+        for n, (i, j) in enumerate(reference.index)
+        if (key := (int(i), int(j))) in place
+    ]
+    first, second = np.array(pairs).T
+    return HoleMotion(
+        reference.index[first], reference.centres[first], deformed.centres[second], 0, ()
+    )
+
+
+def _length(motion: HoleMotion) -> float:
+    return float(np.linalg.norm((motion.after - motion.before).mean(axis=0)))
+
+
+def _with_sentences(
+    motion: HoleMotion, reference: HoleLattice, deformed: HoleLattice, rivals: int
+) -> HoleMotion:
+    moved = np.linalg.norm(motion.after - motion.before, axis=1)
+    said = [
+        f"{len(motion)} holes were found in both images, of {len(reference)} in the reference and "
+        f"{len(deformed)} in the deformed one; they moved by {moved.min():.0f} to "
+        f"{moved.max():.0f} px."
+    ]
+    if rivals:
+        said.append(
+            f"{rivals + 1} ways to lay one lattice on the other match as many holes; the one with "
+            "the shortest mean displacement comes first."
+        )
+    return HoleMotion(motion.index, motion.before, motion.after, rivals, tuple(said))
+
+
+Expected = Callable[[FloatArray], FloatArray]
+"""From (n, 2) (row, col) in the reference to (n, 2) (row, col) in the deformed image [px]."""
+
+BLOCKS, BLOCK_PX, SMALLEST_PX = 120, 41, 15
+"""About so many blocks of such an edge, smaller where ligaments are too narrow for it."""
+REACH_PX = 24
+"""A block may be so far from where it is expected, along rows and along columns."""
+TURNS_DEG = (0.0, -12.0, 12.0, -24.0, 24.0)
+"""Blocks are turned so [degrees]: where holes buckle, what lies between them turns that much."""
+_SAME = 0.5
+"""Share of blocks that must be found."""
+_CLEAR = 0.1
+"""By how much a correlation must exceed what chance gives."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockMatch:
+    """Blocks of the reference, found in the deformed image or not.
+
+    Parameters
+    ----------
+    before, after
+        (n, 2) block centres in the reference and where they correlate best, (row, col) whole
+        pixels.
+    correlation
+        (n,) normalised cross-correlation there [-].
+    chance
+        Correlation that 95 % of the blocks stay below where they can't be [-].
+    block_px
+        Edge of a block [px].
+    """
+
+    before: FloatArray
+    after: FloatArray
+    correlation: FloatArray
+    chance: float
+    block_px: int
+
+    @property
+    def found(self) -> BoolArray:
+        """(n,) whether a block correlates clearly better than by chance."""
+        return np.asarray(self.correlation > self.chance + _CLEAR * (1.0 - self.chance))
+
+    @property
+    def share(self) -> float:
+        """Share of blocks that were found [-]."""
+        return float(self.found.mean())
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the images show the same surface."""
+        return self.share >= _SAME
+
+    def in_mm(self, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
+        """(positions, displacements) of the blocks found, both (m, 2) along x and y [mm].
+
+        To about a pixel; enough for a start.
+        """
+        row, col = self.before[self.found].T
+        x, y = grid.to_mm(row, col)
+        x2, y2 = grid.to_mm(*self.after[self.found].T)
+        return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+
+    @property
+    def sentence(self) -> str:
+        """What was found."""
+        return (
+            f"{int(self.found.sum())} of {len(self.found)} blocks of {self.block_px} px of the "
+            f"reference were found in the deformed image (median correlation "
+            f"{np.median(self.correlation):.2f}, by chance up to {self.chance:.2f})."
+        )
+
+
+def match_blocks(
+    reference: ArrayLike,
+    deformed: ArrayLike,
+    mask: ArrayLike | None = None,
+    expected: Expected | None = None,
+    reach_px: int = REACH_PX,
+) -> BlockMatch:
+    """Look for blocks of the reference in the deformed image.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
+    expected
+        Where positions should have moved to, as ``HoleMotion.at`` says it; nowhere by default.
+    reach_px
+        How far from there a block is searched for, along rows and columns [px].
+
+    Raises
+    ------
+    InputError
+        If the images' sizes differ or there is no room for blocks.
+    """
+    f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
+    if f.ndim != 2 or f.shape != g.shape:
+        raise InputError(f"expected two images of one size, got {f.shape} and {g.shape}")
+    material = np.ones(f.shape, dtype=np.bool_) if mask is None else np.asarray(mask, np.bool_)
+    centres, half = _blocks(material)
+    aims = centres if expected is None else np.rint(expected(centres.astype(np.float64)))
+    inside = ((aims >= half) & (aims < np.array(f.shape) - half)).all(axis=1)
+    centres, aims = centres[inside], aims[inside].astype(np.int64)
+    if len(centres) < 4:
+        raise InputError(
+            f"expected blocks of the reference to lie in the deformed image, got {len(centres)} "
+            "that do; the motion is too large, or the mask is of another image"
+        )
+    elsewhere = np.roll(aims, len(aims) // 2, axis=0)
+    there = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, aims, strict=True)]
+    decoys = [_search(f, g, c, a, half, reach_px) for c, a in zip(centres, elsewhere, strict=True)]
+    return BlockMatch(
+        before=centres.astype(np.float64),
+        after=np.array([place for place, _ in there], dtype=np.float64),
+        correlation=np.array([value for _, value in there]),
+        chance=float(np.quantile([value for _, value in decoys], 0.95)),
+        block_px=2 * half + 1,
+    )
+
+
+def require_same_surface(match: BlockMatch, reference: str, deformed: str) -> None:
+    """Raise InputError unless two images, named for the message, show the same surface."""
+    if not match.is_same:
+        raise InputError(
+            f"expected two images of one surface, got {reference} and {deformed}, of which only "
+            f"{int(match.found.sum())} of {len(match.found)} blocks agree; the reference is not "
+            "the reference, or the motion is too large: give frames in between"
+        )
+
+
+def _blocks(material: BoolArray) -> tuple[NDArray[np.int64], int]:
+    """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
+    padded = np.pad(material, 1)  # the image's border counts as an edge
+    room = np.asarray(distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1]
+    cell = max(8, int(np.sqrt(material.size / BLOCKS)))
+    rows, cols = (n // cell for n in material.shape)
+    tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)
+    flat = tiles.reshape(rows, cols, -1)
+    widest, where = flat.max(axis=-1), flat.argmax(axis=-1)
+    half = min(BLOCK_PX // 2, int(np.quantile(widest[widest > 0], 0.5)) - 1 if widest.any() else 0)
+    if half < SMALLEST_PX // 2:
+        raise InputError(
+            f"expected room for blocks of {SMALLEST_PX} px on the material, got ligaments "
+            f"narrower than that or an image of {material.shape} px; check the mask"
+        )
+    i, j = np.nonzero(widest > half)
+    inner_row, inner_col = np.divmod(where[i, j], cell)
+    return np.column_stack([i * cell + inner_row, j * cell + inner_col]).astype(np.int64), half
+
+
+def _search(
+    f: FloatImage,
+    g: FloatImage,
+    centre: NDArray[np.int64],
+    aim: NDArray[np.int64],
+    half: int,
+    reach: int,
+) -> tuple[NDArray[np.int64], float]:
+    """Where around ``aim`` the block around ``centre``, turned or not, fits best; how well."""
+    low = np.maximum(aim - half - reach, 0)
+    high = np.minimum(aim + half + reach + 1, g.shape)
+    window = g[low[0] : high[0], low[1] : high[1]]
+    correlation = _correlation(window, _turned(f, centre, half))
+    best = np.array(np.unravel_index(int(np.argmax(correlation)), correlation.shape)[1:])
+    value = float(correlation.max())
+    return (low + half + best, value) if value > 0.0 else (aim, 0.0)
+
+
+def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> FloatImage:
+    """(turns, edge, edge) the block around a pixel, turned by each of ``TURNS_DEG``."""
+    row, col = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
+    angle = np.radians(TURNS_DEG)[:, None, None]
+    c, s = np.cos(angle), np.sin(angle)
+    at = np.array([centre[0] + c * row - s * col, centre[1] + s * row + c * col])
+    return np.asarray(map_coordinates(f, at, order=1, mode="nearest"), dtype=np.float32)
+
+
+def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
+    """Normalised cross-correlation of blocks (n, k, k) everywhere in a window (rows, cols).
+
+    As ``skimage.feature.match_template``, which would transform the window anew for each block.
+
+    Returns
+    -------
+    (n, rows - k + 1, cols - k + 1); 0 where a block or what it lies on is of one grey.
+    """
+    k = blocks.shape[-1]
+    shape = tuple(next_fast_len(size, real=True) for size in window.shape)
+    window = window - window.mean()  # for sums without loss of digits
+    blocks = blocks - blocks.mean(axis=(1, 2), keepdims=True)
+    rows, cols = (size - k + 1 for size in window.shape)
+    product = rfft2(window, shape) * np.conj(rfft2(blocks, shape))
+    cross = irfft2(product, shape)[:, :rows, :cols].astype(np.float64)
+    variance = np.maximum(0.0, _box_mean(window**2, k) - _box_mean(window, k) ** 2)
+    norm = k * np.sqrt(variance * (blocks**2).sum(axis=(1, 2))[:, None, None])
+    there = norm > np.finfo(np.float32).eps
+    return np.asarray(np.divide(cross, norm, out=np.zeros_like(cross), where=there))
+
+
+def _box_mean(values: FloatImage, k: int) -> FloatArray:
+    """(rows - k + 1, cols - k + 1) mean over squares of k x k values."""
+    total = np.pad(values.astype(np.float64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    return np.asarray((total[k:, k:] - total[:-k, k:] - total[k:, :-k] + total[:-k, :-k]) / k**2)

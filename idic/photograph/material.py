@@ -1,0 +1,300 @@
+"""Material in a photograph: the speckled surface against holes and background.
+
+The speckle itself tells: within some pixels the material's grey level varies, the background's
+hardly does, whether it is black, grey or white. That finds the background roughly; its own grey
+level, learnt there, then says pixel by pixel how far it goes. What is left at the edges but out of
+focus is the wall of a hole, seen through it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, label, uniform_filter
+from skimage.filters import threshold_otsu
+
+from modeharvest.util.arrays import BoolArray, FloatImage
+from modeharvest.util.errors import InputError
+
+
+def material_options(cell_px: float) -> MaterialOptions:
+    """How material is told from background where cells are that large [px].
+
+    Buckled holes are narrow: the window has to fit into them.
+    """
+    window = int(np.clip(_WINDOW_SHARE * cell_px, 9, 25)) // 2 * 2 + 1
+    return MaterialOptions(window_px=window, reach_px=0.4 * window)
+
+
+_WINDOW_SHARE = 0.15
+
+
+def grown(mask: BoolArray, px: float) -> BoolArray:
+    """The mask and all pixels within this distance of it [px]."""
+    if not mask.any():  # has no distance
+        return mask
+    return np.asarray(distance_transform_edt(~mask) <= px)
+
+
+def shrunk(mask: BoolArray, px: float) -> BoolArray:
+    """The mask without the pixels within this distance of the rest [px]."""
+    return ~grown(~mask, px)
+
+
+def opened(mask: BoolArray, radius: float) -> BoolArray:
+    """What of a mask a disk of this radius [px] can cover without leaving it."""
+    return grown(shrunk(mask, radius), radius)
+
+
+def without_small(mask: BoolArray, px: int) -> BoolArray:
+    """The mask without connected parts of up to ``px`` pixels."""
+    parts, _ = label(mask)
+    keep = np.bincount(parts.ravel()) > px
+    keep[0] = False
+    return np.asarray(keep[parts])
+
+
+def connected_to(seed: BoolArray, mask: BoolArray) -> BoolArray:
+    """The connected parts of a mask that share a pixel with ``seed``."""
+    parts, count = label(mask)
+    keep = np.zeros(count + 1, dtype=np.bool_)
+    keep[np.unique(parts[seed])] = True
+    keep[0] = False
+    return np.asarray(keep[parts])
+
+
+_SMOOTH_PX = 1.0
+"""Blur that takes away most of a camera's noise and little of a speckle of 3 px."""
+_APART = 3.0
+"""Ratio of the typical contrast on material and on background from which on they are two things."""
+_SIGMAS = 4.0
+"""A pixel within 4 standard deviations of the background's level may be background."""
+_FAINTEST = 0.002
+"""A difference of grey levels that counts as none, as a share of their range."""
+_LENS_PX = 3.0
+"""Beyond this a lens doesn't mix material with background."""
+_WIDE = 2.0
+"""Patches of the background's grey level that hold more than two disks of the reach are holes,
+however little of them was wide enough to lack contrast."""
+_SPECK_PX2 = 6
+"""Area of what can be a few pixels' noise in the background."""
+_WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
+"""Out of focus is what has, in a window of this share of the speckle's, less than this share of
+the material's fine contrast."""
+_SLIGHTEST = 0.02
+"""Share of material with grey levels of the background from which on that is said."""
+
+
+@dataclass(frozen=True)
+class MaterialOptions:
+    """How material is told from background.
+
+    Parameters
+    ----------
+    window_px
+        Size of the square in which the speckle's contrast is looked at [px]: two to three
+        speckles across, and well below a hole's diameter.
+    reach_px
+        Radius that a hole is at least as round as [px]. Where the background is as dark or as
+        bright as some speckles, nothing but this keeps such speckles at its edge apart from it.
+    """
+
+    window_px: int = 25
+    reach_px: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.window_px < 5 or not 1.0 <= self.reach_px <= 0.5 * self.window_px:
+            raise InputError(
+                "expected a window of 5 px or more and a reach from 1 px to half of it, got "
+                f"{self.window_px} and {self.reach_px} px"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialMask:
+    """The material found in an image.
+
+    Parameters
+    ----------
+    mask
+        (rows, cols) True on material.
+    contrast_ratio
+        Contrast of the speckle over what varies in the background [-]; infinity without one.
+    alike_share
+        Share of the material whose grey level could be the background's [-]: there the edge is
+        a guess by its neighbourhood.
+    sentences
+        What a reader should know about how it was found.
+    """
+
+    mask: BoolArray
+    contrast_ratio: float
+    alike_share: float
+    sentences: tuple[str, ...]
+
+    @property
+    def share(self) -> float:
+        """Share of the image that is material [-]."""
+        return float(self.mask.mean())
+
+
+def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> MaterialMask:
+    """Find the material in an image of a speckled specimen.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels, in any unit.
+    options
+        How.
+
+    Raises
+    ------
+    InputError
+        If the image is not a finite plane one larger than the window, or shows no speckle.
+    """
+    options = options or MaterialOptions()
+    grey = _checked(image, options)
+    contrast = _local_contrast(grey, options.window_px)
+    sure, ratio = _surely_background(contrast, options)
+    if not sure.any():
+        if not contrast.max() > 0.0:
+            raise InputError("expected a speckled material in the image, got a constant grey level")
+        said = ("No background was found: the whole image counts as material.",)
+        return MaterialMask(np.ones(grey.shape, dtype=np.bool_), np.inf, 0.0, said)
+    if sure.all():
+        raise InputError(
+            "expected a speckled material in the image, got a mask with nothing in it: no part has "
+            "more contrast than the rest; give the mask as an image"
+        )
+    material, alike = _refined(grey, sure, options)
+    if not material.any():
+        raise InputError(
+            "expected a speckled material in the image, got a mask with nothing in it: the "
+            "background's grey levels are everywhere; give the mask as an image"
+        )
+    material, walls = _without_walls(grey, material, options)
+    return MaterialMask(material, ratio, alike, _sentences(material, ratio, alike, walls))
+
+
+def _checked(image: ArrayLike, options: MaterialOptions) -> FloatImage:
+    grey = np.asarray(image, dtype=np.float32)
+    if grey.ndim != 2 or min(grey.shape) < 2 * options.window_px:
+        raise InputError(
+            f"expected a plane image of at least {2 * options.window_px} px each way to look for "
+            f"material with a window of {options.window_px} px, got shape {grey.shape}"
+        )
+    if not np.isfinite(grey).all():
+        raise InputError("expected finite grey levels to find material, got NaN or infinity")
+    return grey
+
+
+def _local_contrast(grey: FloatImage, window: int) -> FloatImage:
+    """Standard deviation of the grey level in a square around every pixel, fine noise removed."""
+    smooth = gaussian_filter(grey, _SMOOTH_PX).astype(np.float64)
+    smooth -= smooth.mean()
+    mean = uniform_filter(smooth, window)
+    variance = uniform_filter(smooth * smooth, window) - mean * mean
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float32)
+
+
+def _surely_background(contrast: FloatImage, options: MaterialOptions) -> tuple[BoolArray, float]:
+    """Where there is surely no speckle, and how much more contrast there is elsewhere."""
+    log = np.log(np.maximum(contrast, 1e-6 * max(float(contrast.max()), 1e-30)))
+    dull = log < threshold_otsu(log[::4, ::4])  # type: ignore[no-untyped-call]
+    ratio = float(np.exp(np.median(log[~dull]) - np.median(log[dull]))) if dull.any() else np.inf
+    if ratio < _APART:
+        return np.zeros(contrast.shape, dtype=np.bool_), np.inf
+    # Flat patches of a few joined speckles are dull, too, but not wide.
+    return opened(dull, 0.25 * options.window_px), ratio
+
+
+def _refined(
+    grey: FloatImage, sure: BoolArray, options: MaterialOptions
+) -> tuple[BoolArray, float]:
+    """(material, share of it that looks like background), from the background's own level."""
+    level, spread = _background_level(grey, sure, 4 * options.window_px)
+    away = np.abs(grey - level)
+    least = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
+    first = _background(away < least, sure, options)
+    some = (slice(None, None, 2),) * 2  # every fourth pixel will do for statistics
+    inside = shrunk(~first[some], 0.5 * _LENS_PX)
+    if not inside.any():
+        return ~first, 1.0
+    # Half-way to the material's nearest levels where they leave a gap, else as near as the
+    # noise allows.
+    half = 0.5 * float(np.quantile(away[some][inside], 0.01))
+    background = _background(away < np.maximum(least, half), sure, options)
+    share = float((away < least)[some][inside].mean())
+    return without_small(~background, options.window_px**2), share
+
+
+def _background(alike: BoolArray, sure: BoolArray, options: MaterialOptions) -> BoolArray:
+    """What has the background's grey level far and wide, or is connected to what surely is it."""
+    reach = options.reach_px
+    wide = opened(~without_small(~alike, _SPECK_PX2), reach)
+    return connected_to(sure, wide) | without_small(wide, int(_WIDE * np.pi * reach**2))
+
+
+def _without_walls(
+    grey: FloatImage, material: BoolArray, options: MaterialOptions
+) -> tuple[BoolArray, float]:
+    """The material without what lies deeper, out of focus: (material, share taken away).
+
+    Through a hole in a thick specimen the camera sees the hole's wall, bright but blurred.
+    """
+    window = max(5, int(_WALL_WINDOW * options.window_px))
+    fine = gaussian_filter(grey, 0.7) - gaussian_filter(grey, 2.7)
+    power = uniform_filter(fine.astype(np.float64) ** 2, window)
+    sharpness = np.sqrt(np.maximum(power, 0.0))
+    some = (slice(None, None, 4),) * 2
+    core = shrunk(material[some], 0.25 * window)
+    if not core.any():
+        return material, 0.0
+    dull = material & (sharpness < _WALL_SHARPNESS * float(np.median(sharpness[some][core])))
+    background = ~material
+    wall = opened(dull, 0.25 * window) & connected_to(background, dull | background)
+    # Near the edge the window holds some sharp material: a wall ends a little further on.
+    left = without_small(material & ~grown(wall, 0.45 * window), options.window_px**2)
+    return left, float((material & ~left).sum() / material.sum())
+
+
+def _background_level(
+    grey: FloatImage, sure: BoolArray, reach: int
+) -> tuple[FloatImage, FloatImage]:
+    """(level, standard deviation) of the background nearby, carried on into the material."""
+    core = shrunk(sure, 2.0)
+    core = core if core.any() else sure
+    mean = float(grey[core].mean())
+    off = np.where(core, grey - mean, np.float32(0.0))  # small numbers, for running sums
+    total = _around(core.astype(np.float32), reach)
+    known, scale = total > 1e-4, np.maximum(total, 1e-4)
+    level = np.where(known, _around(off, reach) / scale, 0.0)
+    variance = _around(np.where(core, off - level, 0.0) ** 2, reach) / scale
+    spread = np.where(known, np.sqrt(np.maximum(variance, 0.0)), off[core].std())
+    return (mean + level).astype(np.float32), spread.astype(np.float32)
+
+
+def _around(image: NDArray[Any], reach: int) -> NDArray[Any]:
+    """Mean around every pixel, weights falling linearly to 0 at ``reach`` along each axis."""
+    return np.asarray(uniform_filter(uniform_filter(image, reach), reach))
+
+
+def _sentences(material: BoolArray, ratio: float, alike: float, walls: float) -> tuple[str, ...]:
+    said = [
+        f"Material was found by its speckle, {100 * material.mean():.0f} % of the image, with "
+        f"{ratio:.0f} times the contrast of the background."
+    ]
+    if alike > _SLIGHTEST:
+        said.append(
+            f"{100 * alike:.0f} % of the material has grey levels of the background; there its "
+            "edge is known to some pixels only."
+        )
+    if walls > 0.0:
+        said.append(
+            f"At its edges, {100 * walls:.1f} % of it was out of focus and counts as background."
+        )
+    return tuple(said)

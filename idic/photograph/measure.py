@@ -1,0 +1,377 @@
+"""Measurement of one photograph: initial guess, correlation, final smoothing, error analysis.
+
+With it a sequence can be correlated image by image: g_k against g_(k-1) at x + u_(k-1), which
+takes the reference's place. The unknowns stay those of the whole displacement, so there is
+nothing to add up, and the ansatz and its taper stay where they are; what one image loses,
+however, the next ones inherit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.photograph.geometry import Geometry, confirmed_by_speckle, matched_holes
+from modeharvest.idic.photograph.initial_guess import (
+    InitialGuess,
+    InitialGuessOptions,
+    chosen_modes,
+    initial_guess,
+    shows_more,
+)
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import PhotographOptions
+from modeharvest.idic.slow_fields import Brightness
+from modeharvest.idic.solver.final_smoothing import (
+    FinalSmoothing,
+    blurred_pair,
+    final_smoothing,
+    speckle_size,
+)
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.idic.solver.pyramid import eroded
+from modeharvest.idic.uncertainty.covariance import (
+    MatchedImages,
+    hessian_corrected_covariance,
+    noise_covariance,
+)
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.idic.uncertainty.noise import GIVEN, ImageNoise, estimated_noise
+from modeharvest.idic.uncertainty.residual_test import ResidualTest, autocorrelation, lags_for
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+
+
+def noise_of(prepared: PreparedPhotographs, name: str) -> ImageNoise:
+    """Noise of the reference and of a deformed photograph [grey levels].
+
+    Unless it was given for both, the deformed one's is larger or smaller by as much as its finest
+    details are: a lamp that has aged, or other exposure, shows there.
+    """
+    sd = prepared.noise.sd
+    if prepared.noise.source == GIVEN:
+        return ImageNoise(sd, sd)
+    seen = prepared_pair(prepared, name)
+    in_f, in_g = (
+        estimated_noise(image, np.ones(image.shape, dtype=np.bool_) if mask is None else mask).sd
+        for image, mask in ((seen.reference, seen.mask), (seen.deformed, seen.deformed_mask))
+    )
+    return ImageNoise(sd, sd * in_g / in_f if in_f > 0.0 else sd)
+
+
+def covariances(
+    measured: MeasuredPhotograph, pair: ImagePair, noise: ImageNoise, cell: float
+) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
+    """Covariances of the unknowns by the images' noise and by what the ansatz leaves over.
+
+    Parameters
+    ----------
+    measured
+        What came out of a photograph.
+    pair
+        That was correlated.
+    noise
+        Of the two photographs.
+    cell
+        Edge of the blocks that are taken for independent [mm].
+
+    Returns
+    -------
+    by_noise, by_leftover, warnings
+        (n, n) each; the second None where there are too few cells, which the warnings say.
+    """
+    result, blur, order = measured.result, measured.blur_px, measured.result.order
+    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
+    if blur > 0.0:
+        images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
+    seen = MatchedImages.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX)
+    soft = seen.softness(result)
+    by_noise = hessian_corrected_covariance(result, noise, soft)
+    try:
+        by_leftover = seen.leftover_covariance(result, cell, soft)
+        if blur > 0.0:
+            by_noise = noise_covariance(
+                result, seen.reference, seen.deformed, _noises(pair, blur, noise), seen.used,
+                cell, order, soft,
+            )  # fmt: skip
+    except InputError as error:
+        return by_noise, None, (f"No error bars for what the ansatz leaves over: {error}.",)
+    return by_noise, by_leftover, ()
+
+
+_EDGE_PX = 3
+
+
+def _noises(
+    pair: ImagePair, blur: float, noise: ImageNoise
+) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """What a blur makes of examples of white noise in both images."""
+    rng = np.random.default_rng(0)
+    quiet = blurred_pair(pair.reference, pair.deformed, pair.mask, pair.deformed_mask, blur)
+    for _ in range(_EXAMPLES):
+        f, g = (
+            image + np.float32(sd) * rng.standard_normal(image.shape, dtype=np.float32)
+            for image, sd in ((pair.reference, noise.reference), (pair.deformed, noise.deformed))
+        )
+        loud = blurred_pair(f, g, pair.mask, pair.deformed_mask, blur)
+        yield loud[0] - quiet[0], loud[1] - quiet[1]
+
+
+_EXAMPLES = 4
+
+
+def prepared_pair(prepared: PreparedPhotographs, name: str) -> ImagePair:
+    return ImagePair(prepared.image(), prepared.image(name), prepared.mask(), prepared.mask(name))
+
+
+def residual_test(
+    measured: MeasuredPhotograph, reference: NDArray[Any], image: NDArray[Any], prepared: PreparedPhotographs,
+    noise: ImageNoise,
+) -> ResidualTest:  # fmt: skip
+    """The residual of the photographs as they are against their noise, lit alike."""
+    result = measured.result
+    if measured.blur_px == 0.0:
+        return result.agreement(noise)
+    back, seen = pulled_back(image, result, result.order)
+    used = eroded(prepared.mask(), _EDGE_PX) & seen
+    f, g = reference[used], back[used]
+    gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
+    offset = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
+    residual = np.where(used, reference - np.float32(gain) * back - np.float32(offset), np.nan)
+    rms = float(np.sqrt(np.nanmean(np.square(residual, dtype=np.float64))))
+    lags = lags_for(speckle_size(reference, used))
+    return ResidualTest.of(
+        rms, autocorrelation(residual, lags), int(used.sum()), result.ansatz.size,
+        result.residual_noise(noise), lags,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPhotograph:
+    """What came out of one photograph.
+
+    Parameters
+    ----------
+    result
+        Of the correlation.
+    local
+        The displacement field that the start was read from, a local DIC's if there is one.
+    held
+        Whether the mode was held.
+    blur_px
+        Of the images that the correlation ended on [px]; 0 for the images as they are.
+    sentences
+        Where the correlation started from and ended, in words.
+    """
+
+    result: Result
+    local: LocalField
+    held: bool
+    blur_px: float
+    sentences: tuple[str, ...]
+
+
+def measure(
+    pair: ImagePair,
+    geometry: Geometry,
+    cell_size: float,
+    how: PhotographOptions,
+    local: LocalField | None = None,
+    before: MeasuredPhotograph | None = None,
+    progress: Progress = silent,
+) -> MeasuredPhotograph:
+    """Find start and ansatz, and correlate.
+
+    Parameters
+    ----------
+    pair
+        Of images.
+    geometry
+        Of the specimen.
+    cell_size
+        l [mm].
+    how
+        The ansatz and how to correlate.
+    local
+        A local DIC's field.
+    before
+        What came out of the photograph before. If it shows all waves that are seen now, its
+        ansatz is kept and its unknowns are the start; the start is found anew if that leads
+        nowhere.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If the two images don't show the same surface, or the spectrum contradicts the cell size.
+    """
+    motion, said = matched_holes(pair, geometry)
+    holes = None if motion is None else motion.in_mm(geometry.grid)
+    if motion is None and before is not None:
+        holes = _moved_holes(before.result, geometry)
+        said += " v0 starts from the photograph before. "
+        said += confirmed_by_speckle(pair, partial(_moved_to, before.result))
+    options = InitialGuessOptions(how.v0_degree, how.v_degree, how.brightness())
+    boxes = [part.box for part in geometry.parts]
+    start = initial_guess(
+        pair.reference, pair.deformed, geometry.grid, cell_size, boxes, pair.mask,
+        pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
+        domain=geometry.region.domain, options=options,
+    )  # fmt: skip
+    ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
+    sentences = (said, *_guess_sentences(start, ansatz, geometry))
+    if before is not None and _goes_on(before, ansatz, unknowns, held):
+        found, finish = correlated(
+            pair, geometry, *_with_brightness(before.result, how), how, progress
+        )
+        if found.outcome is Outcome.CONVERGED:
+            words = "The correlation started from the result of the photograph before."
+            said_all = (*sentences, words, finish.sentence)
+            return MeasuredPhotograph(found, start.local, before.held, finish.blur_px, said_all)
+    found, finish = correlated(pair, geometry, ansatz, unknowns, how, progress)
+    return MeasuredPhotograph(
+        found, start.local, held, finish.blur_px, (*sentences, finish.sentence)
+    )
+
+
+def correlated(
+    pair: ImagePair,
+    geometry: Geometry,
+    ansatz: Ansatz,
+    unknowns: FloatArray,
+    how: PhotographOptions,
+    progress: Progress = silent,
+) -> tuple[Result, FinalSmoothing]:
+    """Correlate from coarse to fine, and finish as the leftover on the last coarse level asks for.
+
+    Parameters
+    ----------
+    pair, geometry
+        Images and specimen.
+    ansatz, unknowns
+        The start.
+    how
+        How to correlate.
+    progress
+        Listener.
+
+    Returns
+    -------
+    result, finish
+        A result on blurred images has no unknowns for gain and offset: levelling did that.
+    """
+    options, grid = how.options(), geometry.grid
+    masks = pair.mask, pair.deformed_mask
+    coarse = replace(options, levels=options.levels[:-1])
+    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
+    rough = correlate(*images, grid, ansatz, unknowns, *masks, coarse, progress)
+    binned = rough.grid.pixel_size / grid.pixel_size
+    leftover_px = binned * identifiability(rough, None).leftover_px
+    finish = final_smoothing(pair.reference, pair.mask, leftover_px)
+    if finish.blur_px > 0.0:
+        images = blurred_pair(*images, *masks, finish.blur_px)
+        ansatz = replace(ansatz, brightness=Brightness())
+    fine = replace(options, levels=options.levels[-1:])
+    start = rough.unknowns[: ansatz.size]
+    result = correlate(*images, grid, ansatz, start, *masks, fine, progress)
+    return replace(result, history=(*rough.history, *result.history)), finish
+
+
+def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
+    """Ansatz and unknowns of a result with the brightness that was asked for, to start from."""
+    ansatz = replace(result.ansatz, brightness=how.brightness())
+    first = result.ansatz.phi_offset(len(result.ansatz.modes))
+    start = np.zeros(ansatz.size)
+    start[:first] = result.unknowns[:first]
+    return ansatz, start
+
+
+def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, held: bool) -> bool:
+    """Whether the photograph before is a start: it was measured, and shows all that is seen now."""
+    result = before.result
+    if result.outcome is not Outcome.CONVERGED or before.held != held:
+        return False
+    return not shows_more(ansatz, unknowns, result.ansatz, result.unknowns)
+
+
+def _guess_sentences(start: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:
+    """The start's sentences; those about a spectrum name its part, where there are several."""
+    if len(geometry.parts) == 1:
+        return start.sentences
+    read = {sentence for region in start.regions for sentence in region.pattern.sentences}
+    said = [sentence for sentence in start.sentences if sentence not in read]
+    for part, region in zip(geometry.parts, start.regions, strict=True):
+        own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == part.box]
+        modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
+        said.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.sentences)}")
+    return tuple(said)
+
+
+def _moved_holes(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray] | None:
+    """The reference's holes and v0 there [mm], as if they had been followed; None without any."""
+    if geometry.lattice is None:
+        return None
+    x, y = geometry.grid.to_mm(*geometry.lattice.centres.T)
+    moved = result.ansatz.v0(result.unknowns, x[:, None], y[:, None])[:, 0]
+    return np.column_stack([x, y]), moved
+
+
+def _moved_to(result: Result, points: FloatArray) -> FloatArray:
+    """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px]."""
+    grid = result.grid
+    x, y = grid.to_mm(points[:, 0], points[:, 1])
+    moved = np.column_stack([x, y]) + result.ansatz.displacement_at(
+        result.unknowns, np.column_stack([x, y])
+    )
+    return np.column_stack(grid.to_px(moved[:, 0], moved[:, 1]))
+
+
+_BAND = 64
+"""Rows at a time, so that little memory is needed."""
+
+
+def pulled_back(
+    deformed: NDArray[Any], result: Result, order: int = 5
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Show a deformed image in the frame of the reference.
+
+    Parameters
+    ----------
+    deformed
+        (rows, cols) g [grey levels].
+    result
+        The measured displacement, and gain and offset if they were unknowns.
+    order
+        Of the spline, 3 or 5.
+
+    Returns
+    -------
+    image, seen
+        (rows, cols) (1 + b) g(x + u) + c, and where x + u lies inside the image.
+    """
+    grid, ansatz, a = result.grid, result.ansatz, result.unknowns
+    spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
+    image = np.empty(grid.shape, dtype=np.float32)
+    col = np.arange(grid.cols)
+    for first in range(0, grid.rows, _BAND):
+        band = slice(first, min(first + _BAND, grid.rows))
+        u = result.ansatz.displacement(a, grid.x, grid.y[band]) / grid.pixel_size
+        row = np.arange(band.start, band.stop)[:, None]
+        value, _, _ = spline.sample(row - u[..., 1], col + u[..., 0])
+        gain, offset = ansatz.gain_and_offset(a, grid.x, grid.y[band])
+        image[band] = gain * value + offset
+    seen = np.isfinite(image)
+    image[~seen] = 0.0
+    return image, seen

@@ -1,0 +1,240 @@
+"""Slow fields: Chebyshev polynomials on a box, and gain and offset of the grey levels made of them.
+
+A field of total degree D is the sum of c_ij T_i(xi) T_j(eta) over i + j <= D, where xi and eta
+run from -1 to 1 across the box: 21 terms for D = 5, 28 for D = 6.
+
+f(x) = (1 + b(x)) g(x + u(x)) + c(x): the gain 1 + b and the offset c vary slowly, as Chebyshev
+polynomials of a total degree over the ansatz's domain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+
+def sum_of_products(
+    along_x: FloatArray, along_y: FloatArray, out: FloatArray | None = None
+) -> FloatArray:
+    """Sum over k the products along_x[k] * along_y[k], which broadcast together.
+
+    On an open grid, along_x of shape (n, 1, cols) and along_y of shape (n, rows, 1), it is a
+    matrix product, and some ten times faster than going through all pixels n times.
+
+    Parameters
+    ----------
+    along_x, along_y
+        (n, ...) factors.
+    out
+        Where the sum goes; by default into an array of its own.
+    """
+    if along_x.ndim == 3 and along_x.shape[1] == 1 and along_y.shape[2:] == (1,):
+        return np.matmul(along_y[:, :, 0].T, along_x[:, 0, :], out=out)
+    total = np.multiply(along_x[0], along_y[0], out=out)
+    for x, y in zip(along_x[1:], along_y[1:], strict=True):
+        total = np.add(total, x * y, out=out)
+    return np.asarray(total)
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-parallel rectangle in the physical frame [mm]."""
+
+    x_min: float
+    x_max: float
+    y_min: float
+    y_max: float
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(astuple(self)).all():
+            raise InputError(f"expected finite limits of a box [mm], got {astuple(self)}")
+        if not (self.x_min < self.x_max and self.y_min < self.y_max):
+            raise InputError(
+                "expected a box with x_min < x_max and y_min < y_max [mm], got "
+                f"({self.x_min}, {self.x_max}, {self.y_min}, {self.y_max})"
+            )
+
+    @classmethod
+    def centred(cls, width: float, height: float) -> Box:
+        """Make the box of this size [mm] around the origin."""
+        return cls(-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """(x, y) of the middle [mm]."""
+        return 0.5 * (self.x_min + self.x_max), 0.5 * (self.y_min + self.y_max)
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Half the width and half the height [mm]."""
+        return 0.5 * (self.x_max - self.x_min), 0.5 * (self.y_max - self.y_min)
+
+    def normalised(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(xi, eta) in [-1, 1] of positions [mm] inside the box."""
+        (xc, yc), (hx, hy) = self.centre, self.half
+        xi: FloatArray = np.subtract(x, xc, dtype=np.float64) / hx
+        eta: FloatArray = np.subtract(y, yc, dtype=np.float64) / hy
+        return xi, eta
+
+
+def orders(degree: int) -> tuple[tuple[int, int], ...]:
+    """All (i, j) with i + j <= degree, by rising total degree, x first."""
+    return tuple((total - j, j) for total in range(degree + 1) for j in range(total + 1))
+
+
+def chebyshev(t: ArrayLike, degree: int) -> FloatArray:
+    """T_0(t) ... T_degree(t), stacked along a new first axis."""
+    t = np.asarray(t, dtype=np.float64)
+    values = np.empty((degree + 1, *t.shape))
+    values[0] = 1.0
+    if degree > 0:
+        values[1] = t
+    for k in range(2, degree + 1):
+        values[k] = 2.0 * t * values[k - 1] - values[k - 2]
+    return values
+
+
+@dataclass(frozen=True)
+class ChebyshevField:
+    """The space of scalar fields of total degree ``degree`` on ``box``.
+
+    The coefficients are in the order of :func:`orders`; the field has their unit.
+    """
+
+    box: Box
+    degree: int
+
+    def __post_init__(self) -> None:
+        if self.degree < 0:
+            raise InputError(f"expected a degree of at least 0, got {self.degree}")
+
+    @property
+    def orders(self) -> tuple[tuple[int, int], ...]:
+        """(i, j) of each coefficient."""
+        return orders(self.degree)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients: (degree + 1)(degree + 2)/2."""
+        return (self.degree + 1) * (self.degree + 2) // 2
+
+    def square(self, coefficients: ArrayLike) -> FloatArray:
+        """(degree + 1, degree + 1) array [i, j], zero where i + j > degree."""
+        matrix = np.zeros((self.degree + 1, self.degree + 1))
+        i, j = np.array(self.orders).T
+        matrix[i, j] = coefficients
+        return matrix
+
+    def evaluate(
+        self, coefficients: ArrayLike, x: FloatArray, y: FloatArray, out: FloatArray | None = None
+    ) -> FloatArray:
+        """Evaluate the field at positions [mm] that broadcast together, into ``out`` if given.
+
+        Fast on an open grid, x of shape (1, cols) and y of shape (rows, 1).
+        """
+        xi, eta = self.box.normalised(x, y)
+        table = self.square(coefficients).T
+        along_x = np.asarray(np.tensordot(table, chebyshev(xi, self.degree), axes=1), np.float64)
+        return sum_of_products(along_x, chebyshev(eta, self.degree), out)
+
+    def basis(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(..., size): every product T_i T_j at positions [mm] that broadcast together."""
+        xi, eta = self.box.normalised(x, y)
+        along_x, along_y = chebyshev(xi, self.degree), chebyshev(eta, self.degree)
+        return np.stack([along_x[i] * along_y[j] for i, j in self.orders], axis=-1)
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """Which of gain and offset are unknowns, and how finely they vary.
+
+    Parameters
+    ----------
+    gain_degree
+        Total degree of b; 0 is one number for the whole image, None (the default) no gain.
+    offset_degree
+        Total degree of c, likewise.
+    """
+
+    gain_degree: int | None = None
+    offset_degree: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, degree in (("gain", self.gain_degree), ("offset", self.offset_degree)):
+            if degree is not None and not 0 <= degree <= 6:
+                raise InputError(
+                    f"brightness: expected a degree of the {name} from 0 to 6, or none, got "
+                    f"{degree}"
+                )
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """Those that are unknowns, the gain's first."""
+        return tuple(d for d in (self.gain_degree, self.offset_degree) if d is not None)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return sum((d + 1) * (d + 2) // 2 for d in self.degrees)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each unknown: ``gain[0,0]``, ``offset[1,0]``."""
+        return tuple(
+            f"{name}[{i},{j}]"
+            for name, degree in self._parts
+            for i, j in ChebyshevField(_ANY, degree).orders
+        )
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each unknown."""
+        return tuple("-" if name.startswith("gain") else "grey levels" for name in self.names)
+
+    def evaluate(
+        self, box: Box, coefficients: ArrayLike, x: FloatArray, y: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The gain 1 + b [-] and the offset c [grey levels] at positions that broadcast [mm]."""
+        b, c = self._split(coefficients)
+        values = [
+            np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+            if degree is None
+            else ChebyshevField(box, degree).evaluate(part, x, y)
+            for degree, part in ((self.gain_degree, b), (self.offset_degree, c))
+        ]
+        return 1.0 + values[0], values[1]
+
+    def squares(self, coefficients: ArrayLike) -> FloatArray:
+        """(2, D + 1, D + 1) coefficients [i, j] of b and of c, zeros where not an unknown."""
+        result = np.zeros((2, max(self.degrees, default=0) + 1, max(self.degrees, default=0) + 1))
+        degrees = (self.gain_degree, self.offset_degree)
+        for k, (degree, part) in enumerate(zip(degrees, self._split(coefficients), strict=True)):
+            if degree is not None:
+                square = ChebyshevField(_ANY, degree).square(part)
+                result[k, : degree + 1, : degree + 1] = square
+        return result
+
+    def fields(self, first: int) -> tuple[int, int]:
+        """Numbers of the base fields of gain and offset, from ``first`` on; 0 for none."""
+        gain = 0 if self.gain_degree is None else first
+        offset = 0 if self.offset_degree is None else first + (gain > 0)
+        return gain, offset
+
+    @property
+    def _parts(self) -> list[tuple[str, int]]:
+        both = (("gain", self.gain_degree), ("offset", self.offset_degree))
+        return [(name, degree) for name, degree in both if degree is not None]
+
+    def _split(self, coefficients: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        values = np.asarray(coefficients, dtype=np.float64)
+        d = self.gain_degree
+        gains = 0 if d is None else (d + 1) * (d + 2) // 2
+        return values[:gains], values[gains:]
+
+
+_ANY = Box(-1.0, 1.0, -1.0, 1.0)  # the order of the coefficients doesn't depend on the box

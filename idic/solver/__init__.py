@@ -1,0 +1,1 @@
+"""The minimiser: compiled passes over pixels, normal equations, Gauss-Newton, coarse to fine."""

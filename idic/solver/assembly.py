@@ -1,0 +1,361 @@
+"""Normal equations of an ansatz from moments; residuals and warped images of the same pixels.
+
+The unknowns of the ansatz are a linear combination of *primitives*: a base field times a
+product of Chebyshev polynomials (see :mod:`modeharvest.idic.solver.passes`). From
+T_a T_b = (T_(a+b) + T_|a-b|)/2 the matrix of the primitives follows from the moments, and the
+mode families then make from it the matrix of the unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.modes import PER_WAVE
+from modeharvest.idic.slow_fields import orders
+from modeharvest.idic.solver.passes import (
+    Runs,
+    accumulate,
+    push_forward_rows,
+    runs_of,
+    tables_of,
+    warp_pass,
+)
+from modeharvest.idic.solver.pixel_blocks import Target
+from modeharvest.imaging.compiled import readable, side_by_side
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+
+BANDS = 64
+"""Bands of rows; fixed, so that sums don't depend on the number of threads."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The quadratic model of the cost 1/2 sum r^2 around some unknowns.
+
+    Parameters
+    ----------
+    matrix
+        (n, n): J'J, where J is minus the derivative of the residual; zero if not asked for.
+    gradient
+        (n,): -J'r, the derivative of the cost.
+    cost
+        1/2 sum r^2 over the pixels used.
+    pixels
+        Number of pixels used; a displacement fit counts its two components as two.
+    left_image
+        Number of pixels whose deformed position is outside the image.
+    """
+
+    matrix: FloatArray
+    gradient: FloatArray
+    cost: float
+    pixels: int
+    left_image: int
+
+    @property
+    def mean_square(self) -> float:
+        """Mean of r^2 over the pixels used; infinite if there is none."""
+        return 2.0 * self.cost / self.pixels if self.pixels else float("inf")
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(
+            self.matrix + other.matrix,
+            self.gradient + other.gradient,
+            self.cost + other.cost,
+            self.pixels + other.pixels,
+            self.left_image + other.left_image,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """What stays the same from one iteration to the next: ansatz, pixels and tables.
+
+    Parameters
+    ----------
+    ansatz
+        The kinematics.
+    grid
+        Where the pixels are.
+    mask
+        (rows, cols) True where there is material.
+    outside
+        Number of further pixels that were mapped outside the deformed image when the pixels were
+        chosen: they take no part, but count as having left.
+    """
+
+    ansatz: Ansatz
+    grid: PixelGrid
+    mask: BoolArray
+    outside: int = 0
+
+    def __post_init__(self) -> None:
+        if self.mask.shape != self.grid.shape:
+            raise InputError(
+                f"expected a mask of {self.grid.shape} px like the grid, got {self.mask.shape}"
+            )
+
+    @cached_property
+    def runs(self) -> Runs:
+        """Where the pixels that count are."""
+        return runs_of(self.mask)
+
+    @cached_property
+    def pixels(self) -> int:
+        """How many pixels count."""
+        return int((self.runs.stop - self.runs.first).sum())
+
+    @cached_property
+    def _degrees(self) -> list[int]:
+        """Total degree of the products that multiply each base field."""
+        ansatz = self.ansatz
+        d = [ansatz.v0_degree] * 2
+        d += [ansatz.v_degree] * len(ansatz.modes)
+        for mode in ansatz.modes:
+            d += [0, 0, 1] * mode.family.wave_count
+        return [*d, *ansatz.brightness.degrees, 0]
+
+    def _pairs(self, with_matrix: bool) -> NDArray[np.int64]:
+        """All pairs of base fields; without the matrix those with the residual alone."""
+        d = self._degrees
+        last = len(d) - 1
+        pairs = [(e, k) for e in range(len(d)) for k in range(e if with_matrix else last, len(d))]
+        return np.array([(e, k, d[e] + d[k]) for e, k in pairs])
+
+    @cached_property
+    def _primitive_slices(self) -> list[slice]:
+        ends = np.cumsum([0] + [(d + 1) * (d + 2) // 2 for d in self._degrees])
+        return [slice(a, b) for a, b in pairwise(ends.tolist())]
+
+    @cached_property
+    def _to_unknowns(self) -> FloatArray:
+        """(primitives, unknowns): how each unknown's sensitivity is made of primitives."""
+        ansatz, parts = self.ansatz, self._primitive_slices
+        result = np.zeros((parts[-1].start, ansatz.size))
+        slow = ansatz.phi_offset(0)
+        result[:slow, :slow] = np.eye(slow)
+        (xc, yc), (hx, hy) = ansatz.domain.centre, ansatz.domain.half
+        k = 2 + len(ansatz.modes)
+        for i, mode in enumerate(ansatz.modes):
+            for w in range(mode.family.wave_count):
+                wave = np.zeros((5, PER_WAVE))  # rows: sin gx, sin gy, then T00, T10, T01 of cos
+                wave[0, 0] = wave[1, 1] = 1.0
+                wave[2:, 2] = xc, hx, 0.0
+                wave[2:, 3] = yc, 0.0, hy
+                wave[2, 4] = 1.0
+                rows = slice(parts[k].start, parts[k + 2].stop)
+                family = mode.family.matrix[PER_WAVE * w : PER_WAVE * (w + 1)]
+                result[rows, ansatz.phi_slice(i)] = wave @ family
+                k += 3
+        kinematic = ansatz.phi_offset(len(ansatz.modes))
+        result[parts[k].start :, kinematic:] = np.eye(ansatz.size - kinematic)
+        return result
+
+    def images(
+        self,
+        a: FloatArray,
+        reference: NDArray[Any],
+        deformed: SplineImage,
+        with_matrix: bool = True,
+        instrument: NDArray[Any] | None = None,
+        share: float = 1.0,
+    ) -> NormalEquations:
+        """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
+
+        With brightness among the unknowns r = f - (1 + b) g(x + u) - c.
+
+        Parameters
+        ----------
+        a
+            (size,) unknowns.
+        reference
+            (rows, cols): f, float32 or float64.
+        deformed
+            g.
+        with_matrix
+            Without the matrix the pass costs about half as much.
+        instrument
+            (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and
+            y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
+            being its products with the derivatives of the displacement and of the gain.
+        share
+            How much of h is the instrument; the rest is g's own [-].
+        """
+        target = Target.images(reference, deformed, self.grid, instrument, share)
+        return self._assemble(a, target, with_matrix)
+
+    def displacement(
+        self, a: FloatArray, target: NDArray[Any], with_matrix: bool = True
+    ) -> NormalEquations:
+        """Assemble the normal equations of r = target - u(a), both components.
+
+        Parameters
+        ----------
+        a
+            (size,) unknowns.
+        target
+            (rows, cols, 2) displacement [mm].
+        with_matrix
+            Whether the matrix is wanted.
+        """
+
+        def along(component: int) -> NormalEquations:
+            known = np.asarray(target[..., component], dtype=np.float64)
+            return self._assemble(a, Target.along(component, known, self.grid), with_matrix)
+
+        return along(0) + along(1)
+
+    def _assemble(self, a: FloatArray, target: Target, with_matrix: bool) -> NormalEquations:
+        pairs, degrees, runs = self._pairs(with_matrix), self._degrees, self.runs
+        top = max(int(pairs[:, 2].max()), *degrees) + 1
+        moments = np.zeros((BANDS, len(pairs), top, top))
+        left = np.zeros(BANDS, dtype=np.int64)
+        tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
+        side_by_side(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
+        off = int(left.sum())
+        return self._from_moments(pairs, moments.sum(axis=0), self.pixels - off, off)
+
+    def _from_moments(
+        self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int
+    ) -> NormalEquations:
+        parts, degrees = self._primitive_slices, self._degrees
+        matrix = np.zeros((parts[-1].stop, parts[-1].stop))
+        for (e, k, _), moment in zip(pairs, moments, strict=True):
+            matrix[parts[e], parts[k]] = _products(moment, degrees[e], degrees[k])
+            matrix[parts[k], parts[e]] = matrix[parts[e], parts[k]].T
+        to = self._to_unknowns
+        left = self.outside + off
+        return NormalEquations(
+            to.T @ matrix[:-1, :-1] @ to, -to.T @ matrix[:-1, -1], 0.5 * matrix[-1, -1], used, left
+        )
+
+
+def _products(moment: FloatArray, degree: int, other: int) -> FloatArray:
+    """Sum e e' (T_i T_j)(T_k T_l) for all (i, j) and (k, l), from the moments of e e'."""
+    a, b, c, d = _sums_and_differences(degree, other)
+    return np.asarray(0.25 * (moment[a, c] + moment[a, d] + moment[b, c] + moment[b, d]))
+
+
+@cache
+def _sums_and_differences(degree: int, other: int) -> tuple[NDArray[np.int64], ...]:
+    """Give i + k, |i - k|, j + l and |j - l| for all (i, j) and (k, l)."""
+    i, j = np.array(orders(degree)).T[:, :, None]
+    k, m = np.array(orders(other)).T[:, None, :]
+    return i + k, abs(i - k), j + m, abs(j - m)
+
+
+def valid_pixels(
+    assembly: Assembly,
+    a: FloatArray,
+    reference: NDArray[Any],
+    deformed: SplineImage,
+    allowed: BoolArray,
+) -> tuple[BoolArray, int]:
+    """Keep the pixels that the unknowns map onto material of the deformed image.
+
+    Parameters
+    ----------
+    assembly
+        Ansatz and pixels.
+    a
+        (size,) unknowns.
+    reference, deformed
+        f and g.
+    allowed
+        (rows, cols) where g may be sampled.
+
+    Returns
+    -------
+    kept
+        (rows, cols).
+    outside
+        Number of the others that are mapped outside the deformed image.
+    """
+    kept = assembly.mask.copy()
+    nothing = np.zeros((0, 0, 0), dtype=np.float32)
+    outside = _run(assembly, a, reference, deformed, allowed, kept, nothing)
+    return kept, outside
+
+
+def residual(
+    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
+) -> NDArray[np.float32]:
+    """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
+    left = np.full((1, *assembly.grid.shape), np.nan, dtype=np.float32)
+    _fill(left, assembly, a, reference, deformed)
+    return np.asarray(left[0])
+
+
+def warped_back(
+    assembly: Assembly, a: FloatArray, reference: NDArray[Any], deformed: SplineImage
+) -> NDArray[np.float32]:
+    """(3, rows, cols) (1 + b) times the gradient of g at x + u, along x and y, and (1 + b) g + c.
+
+    The gradient in [grey levels/mm]; 0, and f, where no pixel counts or g doesn't reach.
+    """
+    found = np.zeros((3, *assembly.grid.shape), dtype=np.float32)
+    _fill(found, assembly, a, reference, deformed)
+    np.subtract(reference, found[2], out=found[2])
+    return found
+
+
+def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32]) -> None:
+    """Turn slopes at X into those at x = X + u of what moves along: F^-T times them, in place.
+
+    F by central differences of u between neighbouring pixels.
+
+    Parameters
+    ----------
+    assembly
+        Ansatz and grid; pixels beyond those that count are turned, too.
+    a
+        (size,) unknowns.
+    slopes
+        (2 or more, rows, cols) along x and y.
+    """
+    everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
+    u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
+    nothing = np.zeros((0, 0), dtype=np.bool_)
+    _run(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), nothing, nothing, u)
+    side_by_side(push_forward_rows, u, slopes, assembly.grid.pixel_size)
+
+
+def _fill(
+    left: NDArray[np.float32],
+    assembly: Assembly,
+    a: FloatArray,
+    reference: NDArray[Any],
+    deformed: SplineImage,
+) -> None:
+    """Fill (1, rows, cols) with the residual, or (3, rows, cols) with slopes and residual."""
+    nothing = np.zeros((0, 0), dtype=np.bool_)
+    _run(assembly, a, reference, deformed, nothing, nothing, left)
+
+
+def _run(
+    assembly: Assembly,
+    a: FloatArray,
+    reference: NDArray[Any],
+    deformed: SplineImage,
+    allowed: BoolArray,
+    kept: BoolArray,
+    left: NDArray[np.float32],
+) -> int:
+    ansatz, outside = assembly.ansatz, np.zeros(BANDS, dtype=np.int64)
+    tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
+    target = Target.images(reference, deformed, assembly.grid)
+    degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
+    side_by_side(
+        warp_pass, target, assembly.runs, tables, degree, readable(allowed), kept, left, outside
+    )
+    return int(outside.sum())

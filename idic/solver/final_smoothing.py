@@ -1,0 +1,166 @@
+"""Final smoothing: the last level's blur where the model error is large for the speckle size.
+
+A correlation weighs the model error w by the grey-level gradient, as long as w is
+short against a speckle: beyond that the grey levels have nothing more to tell, parts of the image
+that match badly lose their weight, and the result moves away from the best fit of the ansatz.
+Speckles that are much finer than w is long have to be blurred first. What that costs is noise,
+of which there is little against w.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from modeharvest.idic.solver.pyramid import eroded, locally_normalised
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+
+_LONGEST = 64
+"""Lags looked at [px]."""
+_SPECKLE_EDGE_PX = 3
+"""Pixels closer than this to an edge show some of what is beyond it."""
+_LINES = 256
+"""Rows, and columns, that are enough: neighbouring ones say nearly the same."""
+
+
+def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
+    """Full width at half maximum of the autocorrelation of an image's material [px].
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material; None for everywhere.
+
+    Returns
+    -------
+    float
+        At most twice the largest lag looked at, 128 px; that for an image without contrast, too.
+    """
+    mask = np.ones(image.shape, dtype=np.bool_) if mask is None else mask
+    inner = eroded(mask, _SPECKLE_EDGE_PX)
+    inner = inner if inner.any() else mask
+    curve = 0.5 * (_autocorrelation(image, inner) + _autocorrelation(image.T, inner.T))
+    below = int(np.argmax(curve < 0.5))
+    if below == 0:
+        return 2.0 * _LONGEST
+    fraction = (curve[below - 1] - 0.5) / (curve[below - 1] - curve[below])
+    return float(2.0 * (below - 1 + fraction))
+
+
+def _autocorrelation(image: NDArray[Any], inner: BoolArray) -> FloatArray:
+    """(_LONGEST,) along the rows, over pairs of pixels that are both inside."""
+    lines = np.flatnonzero(inner.any(axis=1))
+    lines = lines[:: len(lines) // _LINES + 1]
+    values, weights = image[lines], inner[lines]
+    level = values[weights].mean(dtype=np.float64) if weights.any() else 0.0
+    shown = np.where(weights, values - np.float32(level), np.float32(0.0))
+    n = fft.next_fast_len(shown.shape[1] + _LONGEST, real=True)
+    products, pairs = _lagged(shown, n), _lagged(weights, n)
+    means = products / np.maximum(pairs, 1.0)
+    return np.asarray(means / means[0] if means[0] > 0.0 else np.ones(_LONGEST))
+
+
+def _lagged(values: NDArray[Any], n: int) -> FloatArray:
+    """(_LONGEST,) sums over an image of products of pixels that lag along its rows."""
+    part = fft.rfft(values.astype(np.float32), n, axis=1)
+    power = (part.real**2 + part.imag**2).sum(axis=0, dtype=np.float64)
+    return np.asarray(fft.irfft(power, n)[:_LONGEST])
+
+
+WIDTHS = 6.0
+"""Speckles are as wide as that many rms lengths of w per component. Where 10 px speckles are
+measured with w of 2 px, the paper's virtual experiment, nothing has to be blurred."""
+AROUND = 2.0
+"""How far local mean and contrast reach [blurs]: nearly a single speckle."""
+_LEAST_BLUR = 1.0
+"""Less than this changes nothing [px]."""
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+@dataclass(frozen=True)
+class FinalSmoothing:
+    """How the last level looks.
+
+    Parameters
+    ----------
+    width_px
+        Full width at half maximum of the speckle's autocorrelation [px].
+    leftover_px
+        What the ansatz leaves over, rms per component [px].
+    blur_px
+        Standard deviation of the blur [px]; 0 for none.
+    """
+
+    width_px: float
+    leftover_px: float
+    blur_px: float
+
+    @property
+    def sentence(self) -> str:
+        """That in words."""
+        start = (
+            f"The speckle's autocorrelation is {self.width_px:.1f} px wide, the ansatz leaves "
+            f"about {self.leftover_px:.2g} px over"
+        )
+        if self.blur_px == 0.0:
+            return f"{start}: the correlation ends on the images as they are."
+        return (
+            f"{start}, too much for such fine speckles: the correlation ends on images blurred "
+            f"by {self.blur_px:.1f} px, with a local mean of 0 and a local contrast of 1."
+        )
+
+
+def final_smoothing(image: NDArray[Any], mask: BoolArray, leftover_px: float) -> FinalSmoothing:
+    """Decide how to finish.
+
+    Parameters
+    ----------
+    image, mask
+        (rows, cols) the reference and its material.
+    leftover_px
+        Rms per component of w, as a coarser level tells it [px].
+    """
+    width = speckle_size(image, mask)
+    wanted = (WIDTHS * leftover_px) ** 2 - width**2
+    # Widths of Gaussians add up in squares; a blur of s widens an autocorrelation by sqrt(2) s.
+    blur = float(np.sqrt(max(0.0, wanted / 2.0)) / _FWHM)
+    return FinalSmoothing(width, leftover_px, blur if blur >= _LEAST_BLUR else 0.0)
+
+
+def blurred_pair(
+    reference: NDArray[Any],
+    deformed: NDArray[Any],
+    mask: BoolArray,
+    deformed_mask: BoolArray,
+    blur_px: float,
+) -> tuple[FloatImage, FloatImage]:
+    """Both images blurred over their material and levelled, in the reference's grey levels.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) f and g.
+    mask, deformed_mask
+        (rows, cols) True on material.
+    blur_px
+        Standard deviation [px].
+    """
+    f = locally_normalised(reference, mask, blur_px, AROUND)
+    g = locally_normalised(deformed, deformed_mask, blur_px, AROUND)
+    scale = contrast_after(reference, mask, blur_px)
+    f *= scale
+    g *= scale
+    return f, g
+
+
+def contrast_after(image: NDArray[Any], mask: BoolArray, blur_px: float) -> np.float32:
+    """Standard deviation that a speckle has after a blur [grey levels]."""
+    inner = eroded(mask, int(np.ceil(3.0 * blur_px)))
+    smooth = ndimage.gaussian_filter(np.asarray(image, dtype=np.float32), blur_px)
+    return np.float32(smooth[inner if inner.any() else mask].std(dtype=np.float64))

@@ -1,0 +1,341 @@
+"""Gauss-Newton with a Levenberg safeguard, on the eigenvectors of the scaled matrix.
+
+A full Gauss-Newton step is tried first. One that raises the cost is solved again from the
+stored matrix with more damping, until the cost falls. The matrix is scaled to a unit diagonal
+and decomposed into eigenvectors; directions the images can't tell anything about (the mode's
+parameters where v is zero) get no step instead of an enormous one.
+
+Once steps are short, J'J hardly changes, and what it lacks of the Hessian makes convergence
+linear. So it is no longer assembled but corrected by what each step does to the gradient
+(Broyden, Fletcher, Goldfarb & Shanno): cheaper iterations, and fewer. J'J itself is assembled
+again where the iteration ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from modeharvest.idic.solver.assembly import NormalEquations
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.scaled_eigen import ScaledEigen
+
+"""Columns of the Jacobian smaller than this share of the largest one are taken for zero."""
+
+
+class Outcome(Enum):
+    """Why an iteration ended; ``explanation`` says it in a sentence."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "max_iterations"
+    STAGNATED = "stagnated"
+    SINGULAR = "singular"
+    LEFT_IMAGE = "left_image"
+    TRAPPED = "trapped"
+    UNWEIGHTED = "unweighted"
+
+    @property
+    def explanation(self) -> str:
+        """One sentence for a reader of the result."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Outcome.CONVERGED: "The displacement changed by less than the tolerance.",
+    Outcome.MAX_ITERATIONS: (
+        "The largest number of iterations was reached before the displacement settled; "
+        "start closer, or allow more iterations."
+    ),
+    Outcome.STAGNATED: (
+        "No step, however short, lowered the cost, yet the last one was above the tolerance."
+    ),
+    Outcome.SINGULAR: (
+        "The images hold no information about the unknowns: no pixel was used, or the deformed "
+        "image has no gradient there."
+    ),
+    Outcome.LEFT_IMAGE: (
+        "Too many pixels are mapped outside the deformed image; check the sign of the start, "
+        "the pixel size and the origin of the grid."
+    ),
+    Outcome.TRAPPED: (
+        "The iteration ended where parts of the images don't match at all: a local minimum; "
+        "start closer, with other mode parameters, or with coarser speckle: fine speckle beside "
+        "a large displacement that the ansatz can't describe traps it, from any start."
+    ),
+    Outcome.UNWEIGHTED: (
+        "The least-squares minimum was found, but from there no way to where the gradient that "
+        "was to weigh the residual does so: this is the least-squares minimum, which noise biases "
+        "by more than its standard errors say; try gradient_blur_px, or gradient = 'deformed'."
+    ),
+}
+
+
+@dataclass(frozen=True)
+class GaussNewtonOptions:
+    """When to stop, and how patient to be.
+
+    Parameters
+    ----------
+    tolerance_px
+        Converged once a step changes the displacement by less than this, rms [px]. The error
+        left is no larger than about the last step. 1e-4 px is a hundredth of the best noise
+        floor of DIC.
+    coarse_tolerance_px
+        The same in *binned* px on the coarse levels, which only have to lead to the next.
+    tolerance_errors
+        Converged, too, where no step lowers the cost any more and the last one was that short,
+        rms over the unknowns in standard errors, the residual being taken for noise: the
+        relative offset of Bates & Watts, Technometrics 23 (1981), doi
+        10.1080/00401706.1981.10486254.
+    max_iterations
+        On each level.
+    max_left
+        Fraction of the pixels that may be mapped outside the deformed image [-].
+    """
+
+    tolerance_px: float = 1e-4
+    coarse_tolerance_px: float = 1e-2
+    tolerance_errors: float = 0.01
+    max_iterations: int = 50
+    max_left: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (self.tolerance_px > 0 and self.coarse_tolerance_px > 0):
+            raise InputError(
+                "expected tolerances above 0 px, got "
+                f"{self.tolerance_px} and {self.coarse_tolerance_px} px"
+            )
+        if self.max_iterations < 1 or not 0 <= self.max_left <= 1:
+            raise InputError(
+                "expected at least 1 iteration and max_left in [0, 1], got "
+                f"{self.max_iterations} and {self.max_left}"
+            )
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One accepted (or the last refused) step.
+
+    Parameters
+    ----------
+    factor
+        Binning of the level [px].
+    number
+        From 1 on each level, and again whenever the pixels used are chosen anew.
+    mean_square
+        Mean of r^2 after the step.
+    step_px
+        Rms change of the displacement [px of the full image].
+    damping
+        Levenberg's damping of the scaled matrix [-]; 0 is a full step.
+    pixels
+        Pixels used.
+    """
+
+    factor: int
+    number: int
+    mean_square: float
+    step_px: float
+    damping: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the iteration ended, and how.
+
+    Parameters
+    ----------
+    unknowns
+        (n,): the best ones found.
+    equations
+        The normal equations there.
+    outcome
+        Why it ended.
+    history
+        Every step.
+    curvature
+        (n, n): J'J corrected by what the steps did to the gradient; see :func:`minimise`.
+    """
+
+    unknowns: FloatArray
+    equations: NormalEquations
+    outcome: Outcome
+    history: tuple[Iteration, ...]
+    curvature: FloatArray
+
+
+Evaluate = Callable[[FloatArray, bool], NormalEquations]
+StepLength = Callable[[FloatArray, FloatArray], float]
+
+_FIRST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e4
+
+_SHORT = 0.1
+"""Steps shorter than this [binned px] leave J'J nearly as it was: speckles are 3 px or more."""
+
+_FALLING = 0.9
+"""Ratio of the costs after and before a step below which the cost is said to fall a lot."""
+
+_LEAST_CURVATURE = 0.05
+"""Share of J'J's curvature along a step that the gradient's change must show at least."""
+
+
+def minimise(
+    evaluate: Evaluate,
+    step_length: StepLength,
+    start: FloatArray,
+    options: GaussNewtonOptions,
+    tolerance_px: float,
+    factor: int = 1,
+    on_iteration: Callable[[int], None] = lambda number: None,
+    curvature: FloatArray | None = None,
+    least: float = 0.0,
+) -> Minimum:
+    """Minimise 1/2 sum r^2.
+
+    Parameters
+    ----------
+    evaluate
+        The normal equations at some unknowns, and whether with the matrix.
+    step_length
+        Rms difference of the displacement between two sets of unknowns [px].
+    start
+        (n,) unknowns.
+    options, tolerance_px
+        When to stop.
+    factor
+        Binning.
+    on_iteration
+        Called with the number of each finished iteration.
+    curvature
+        (n, n) what to begin with in place of J'J, if something is known already.
+    least
+        Directions with an eigenvalue below this share of the largest one get no step [-].
+    """
+    at = _SearchPoint.of(start, evaluate(start, curvature is None), curvature)
+    limits = _Limits(options, tolerance_px, _SHORT * factor, least)
+    history: list[Iteration] = []
+    outcome = Outcome.LEFT_IMAGE if _left(at.equations) > options.max_left else None
+    while outcome is None:
+        if not np.any(at.curvature):
+            outcome = Outcome.SINGULAR
+            break
+        step = _descend(at, evaluate, step_length, limits)
+        at = step.to if step.accepted else at
+        number, damping, here = len(history) + 1, step.damping, at.equations
+        history.append(
+            Iteration(factor, number, here.mean_square, step.length_px, damping, here.pixels)
+        )
+        on_iteration(number)
+        outcome = _ending(step, number, limits)
+        at = replace(at, damping=0.0 if damping <= _FIRST_DAMPING else 0.1 * damping)
+    there = at.equations if at.is_assembled else evaluate(at.a, True)
+    return Minimum(at.a, there, outcome, tuple(history), at.curvature)
+
+
+@dataclass(frozen=True, eq=False)
+class _SearchPoint:
+    """Where the iteration is, and what it knows there."""
+
+    a: FloatArray
+    equations: NormalEquations
+    is_assembled: bool
+    curvature: FloatArray
+    has_fallen: bool = True
+    """Whether the cost still falls a lot: then Gauss-Newton's own matrix is the best."""
+    damping: float = 0.0
+
+    @classmethod
+    def of(
+        cls, a: FloatArray, equations: NormalEquations, known: FloatArray | None
+    ) -> _SearchPoint:
+        if known is None:
+            return cls(a, equations, True, equations.matrix)
+        return cls(a, equations, False, known, has_fallen=False)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    options: GaussNewtonOptions
+    tolerance_px: float
+    short_px: float
+    least: float
+
+
+@dataclass(frozen=True, eq=False)
+class _TrialStep:
+    """A step from one point to another, and whether it was good enough to be taken."""
+
+    to: _SearchPoint
+    length_px: float
+    errors: float
+    damping: float
+    accepted: bool
+
+
+def _descend(
+    at: _SearchPoint, evaluate: Evaluate, step_length: StepLength, limits: _Limits
+) -> _TrialStep:
+    """Take a step that lowers the cost, damped as much as it takes."""
+    eigen, damping = ScaledEigen.of(at.curvature), at.damping
+    while True:
+        a = at.a - eigen.solve(at.equations.gradient, damping, limits.least)
+        length = step_length(at.a, a)
+        is_settling = damping == 0.0 and length < limits.short_px and not at.has_fallen
+        # The last step's matrix is wanted for the covariance.
+        is_assembled = not is_settling or length <= limits.tolerance_px
+        found = evaluate(a, is_assembled)
+        descends = found.mean_square <= at.equations.mean_square
+        accepted = descends and _left(found) <= limits.options.max_left
+        if accepted or length <= limits.tolerance_px or damping >= _LARGEST_DAMPING:
+            break
+        damping = max(_FIRST_DAMPING, 10.0 * damping)
+    curvature = found.matrix
+    if is_settling:
+        change = found.gradient - at.equations.gradient
+        curvature = corrected(at.curvature, a - at.a, change)
+    has_fallen = found.mean_square < _FALLING * at.equations.mean_square
+    errors = standard_errors(a - at.a, at.curvature, at.equations)
+    to = _SearchPoint(a, found, is_assembled, curvature, has_fallen)
+    return _TrialStep(to, length, errors, damping, accepted)
+
+
+def _ending(step: _TrialStep, number: int, limits: _Limits) -> Outcome | None:
+    """Why to stop after this step, if there is a reason."""
+    if step.length_px <= limits.tolerance_px and step.damping <= _FIRST_DAMPING:
+        return Outcome.CONVERGED
+    if step.accepted and number < limits.options.max_iterations:
+        return None
+    if step.damping <= _FIRST_DAMPING and step.errors <= limits.options.tolerance_errors:
+        return Outcome.CONVERGED
+    return Outcome.MAX_ITERATIONS if step.accepted else Outcome.STAGNATED
+
+
+def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+    """The matrix with the curvature seen along a step: matrix . step = change of the gradient.
+
+    As it was where the gradient tells of no positive curvature.
+    """
+    pushed = matrix @ step
+    curvature, seen = float(step @ pushed), float(step @ change)
+    if not seen > _LEAST_CURVATURE * curvature > 0:
+        return matrix
+    lost, gained = np.outer(pushed, pushed) / curvature, np.outer(change, change) / seen
+    return np.asarray(matrix - lost + gained)
+
+
+def standard_errors(step: FloatArray, curvature: FloatArray, at: NormalEquations) -> float:
+    """How long a step is, rms over the unknowns, in their standard errors by the residual."""
+    squares = max(0.0, float(step @ curvature @ step))
+    if not at.mean_square > 0.0:
+        return np.inf
+    return float(np.sqrt(squares / (at.mean_square * step.size)))
+
+
+def _left(equations: NormalEquations) -> float:
+    """Fraction of the pixels that are mapped outside the image."""
+    return equations.left_image / max(1, equations.left_image + equations.pixels)

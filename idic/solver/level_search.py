@@ -1,0 +1,225 @@
+"""The minimum on one level of the pyramid: choice of pixels, and row subsampling to begin with.
+
+The set of pixels is frozen while the cost is minimised: pixels that came and went with every
+step would make the cost jump, and the iteration stagnate. It is chosen anew at the minimum.
+
+Where there are far more pixels than it takes to find the unknowns, every few rows lead most of
+the way, and hand over what they know of the cost's curvature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.solver.assembly import Assembly, NormalEquations, valid_pixels
+from modeharvest.idic.solver.gauss_newton import (
+    GaussNewtonOptions,
+    Iteration,
+    Minimum,
+    Outcome,
+    StepLength,
+    minimise,
+)
+from modeharvest.idic.solver.pyramid import LevelPair
+from modeharvest.idic.solver.weighting import Propagation, root
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray
+
+_ROUNDS, _SETTLED = 5, 1e-2
+"""The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
+_PLENTY, _STRIDE = 1000, 4
+"""Pixels an unknown that suffice to lead the way, and of how many rows one is taken then."""
+
+_ACROSS = 128
+"""Rows and columns, at most, over which the length of a step is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSearch:
+    """One level of a correlation.
+
+    Parameters
+    ----------
+    pair
+        Its images.
+    ansatz
+        The kinematics.
+    factor
+        Its binning.
+    least
+        Directions less determined than this share of the best one stay as they are [-].
+    tolerance_px, rough_px
+        Steps to stop at, with all pixels and with every few rows [px].
+    options
+        Limits.
+    on_iteration
+        Called with the number of each finished iteration.
+    """
+
+    pair: LevelPair
+    ansatz: Ansatz
+    factor: int
+    least: float
+    tolerance_px: float
+    rough_px: float
+    options: GaussNewtonOptions
+    on_iteration: Callable[[int], None]
+
+    def better(self, a: FloatArray, before: FloatArray) -> FloatArray:
+        """Choose what fits better: the last level's unknowns, or those it began with.
+
+        A speckle that is too fine for a coarse blur leaves no information there, and the level
+        leads astray; this takes its steps back.
+        """
+        if np.array_equal(a, before):
+            return a
+        some = self._thinned(self._everything)
+        costs = [self._equations(some, x, False).mean_square for x in (a, before)]
+        return a if costs[0] <= costs[1] else before
+
+    def minimum(self, start: FloatArray) -> tuple[Minimum, Assembly]:
+        """Find it, and the pixels it was found with."""
+        assembly = self._landed(start)
+        history: tuple[Iteration, ...] = ()
+        curvature = None
+        some = self._thinned(assembly)
+        if some is not assembly:
+            rough = self._minimise(some, start, self.rough_px, None)
+            history += rough.history
+            if rough.outcome is Outcome.CONVERGED and self._only_leads:
+                return rough, some
+            if rough.outcome is Outcome.CONVERGED:
+                start = rough.unknowns
+                curvature = rough.curvature * (assembly.pixels / some.pixels)
+        for _ in range(_ROUNDS):
+            found = self._minimise(assembly, start, self.tolerance_px, curvature)
+            history += found.history
+            used, start, curvature = assembly, found.unknowns, found.curvature
+            if self.pair.allowed is None:
+                break
+            assembly = self._landed(start)
+            if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
+                break
+        return replace(found, history=history), used
+
+    def reweighed(
+        self, found: Minimum, used: Assembly, instrument: NDArray[Any]
+    ) -> tuple[Minimum, Propagation]:
+        """Move on from the minimum to where an instrument weighs the residual to zero.
+
+        Parameters
+        ----------
+        found, used
+            The minimum and its pixels.
+        instrument
+            (3, rows, cols) as for :meth:`Assembly.images`.
+        """
+        images = self.pair.reference, self.pair.deformed
+
+        def matrix(share: float) -> FloatArray:
+            return used.images(found.unknowns, *images, True, instrument, share).matrix
+
+        def evaluate(a: FloatArray) -> NormalEquations:
+            return used.images(a, *images, False, instrument)
+
+        how = Propagation.of(matrix, found.equations.matrix)
+        length = step_length(self.ansatz, used.grid, used.mask, self.factor)
+        there = root(evaluate, how.slope, length, found, self.options, self.on_iteration)
+        return there, how
+
+    def _landed(self, a: FloatArray) -> Assembly:
+        """All pixels, less those that these unknowns map onto no material, or off the image."""
+        pair = self.pair
+        if pair.allowed is None:
+            return self._everything
+        kept, outside = valid_pixels(
+            self._everything, a, pair.reference, pair.deformed, pair.allowed
+        )
+        return replace(self._everything, mask=kept, outside=outside)
+
+    @property
+    def _only_leads(self) -> bool:
+        """Whether this is a coarse level: the next one has to be reached, and no more."""
+        return self.least > 0.0
+
+    @cached_property
+    def _everything(self) -> Assembly:
+        return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
+
+    @cached_property
+    def _material(self) -> NDArray[np.int64]:
+        """(rows,) pixels of the level's mask."""
+        return np.asarray(np.count_nonzero(self.pair.mask, axis=1))
+
+    def _thinned(self, assembly: Assembly) -> Assembly:
+        """One row of a few, if that leaves plenty of pixels."""
+        if assembly.pixels < _STRIDE * _PLENTY * self.ansatz.size:
+            return assembly
+        rows = np.zeros_like(assembly.mask)
+        rows[_STRIDE // 2 :: _STRIDE] = assembly.mask[_STRIDE // 2 :: _STRIDE]
+        return replace(assembly, mask=rows, outside=assembly.outside // _STRIDE)
+
+    def _minimise(
+        self, assembly: Assembly, start: FloatArray, tolerance: float, curvature: FloatArray | None
+    ) -> Minimum:
+        return minimise(
+            partial(self._equations, assembly),
+            step_length(self.ansatz, assembly.grid, assembly.mask, self.factor),
+            start,
+            self._limits(assembly),
+            tolerance,
+            self.factor,
+            self.on_iteration,
+            curvature,
+            self.least,
+        )
+
+    def _limits(self, assembly: Assembly) -> GaussNewtonOptions:
+        """The options, whose share of pixels that may leave is one of the whole material.
+
+        Those left out at g's border and at its holes are not to weigh as if they had left.
+        """
+        rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
+        kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
+        most = min(1.0, self.options.max_left / kept) if kept > 0 else self.options.max_left
+        return replace(self.options, max_left=most)
+
+    def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
+        return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)
+
+
+def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
+    """Rms difference of two displacements over some 10^4 of the pixels [px of the full image].
+
+    Parameters
+    ----------
+    ansatz, grid
+        The kinematics, and where the pixels are.
+    mask
+        (rows, cols) pixels that count.
+    factor
+        Binning: a binned px is so many px.
+    """
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
+    some, x, y = mask[np.ix_(rows, cols)], grid.x[cols], grid.y[rows]
+    per_px = factor / grid.pixel_size
+
+    @lru_cache(maxsize=2)
+    def displacement(a: bytes) -> FloatArray:
+        """Where one step ends the next one begins."""
+        return ansatz.displacement(np.frombuffer(a), x, y)
+
+    def length(a: FloatArray, b: FloatArray) -> float:
+        change = displacement(b.tobytes()) - displacement(a.tobytes())
+        squares = (change[some] ** 2).sum(axis=-1)
+        return float(np.sqrt(squares.mean()) * per_px) if squares.size else 0.0
+
+    return length

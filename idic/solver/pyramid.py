@@ -1,0 +1,332 @@
+"""Image pyramid: a pair of images binned, blurred and locally normalised over its material.
+
+A level bins the images and blurs them. Where masks are given, binning and blur are normalised
+by them, so that no grey level of a hole or of the surroundings leaks into the material.
+
+Every output row is made on its own, so the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from modeharvest.imaging.compiled import compiled, readable
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.spline import SplineImage, border_reach
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.errors import InputError
+
+Float32Image = NDArray[np.float32]
+
+_ENDS = 4.0
+"""Standard deviations after which the Gaussian is cut off."""
+
+
+def binned(
+    image: Float32Image, weight: BoolArray | None, factor: int
+) -> tuple[Float32Image, Float32Image]:
+    """Means over blocks; incomplete blocks at the right and at the bottom are dropped.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) float32 grey levels.
+    weight
+        (rows, cols) True where they count; None for everywhere.
+    factor
+        Edge of the blocks [px].
+
+    Returns
+    -------
+    mean, share
+        (rows // factor, cols // factor): mean of grey level times weight, and mean of weight.
+    """
+    weight = np.ones(image.shape, dtype=np.bool_) if weight is None else weight
+    shape = image.shape[0] // factor, image.shape[1] // factor
+    mean, share = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    _bin(readable(image), readable(weight), factor, mean, share)
+    return mean, share
+
+
+def blurred(image: Float32Image, sigma: float) -> Float32Image:
+    """Blur with a Gaussian; the outermost pixels are repeated beyond the border.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) float32.
+    sigma
+        Standard deviation [px]; 0 gives the image as it is.
+    """
+    if sigma == 0:
+        return image
+    reach = int(_ENDS * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
+    weights /= weights[0] + 2.0 * weights[1:].sum()
+    out = np.empty_like(image)
+    _blur(readable(image), weights.astype(np.float32), out)
+    return out
+
+
+@compiled(parallel=True, relaxed=True)
+def _bin(image: Any, weight: Any, factor: int, mean: Any, share: Any) -> None:
+    rows, cols = mean.shape
+    size = np.float32(1.0 / (factor * factor))
+    for i in prange(rows):
+        along, count = np.zeros(cols * factor, np.float32), np.zeros(cols * factor, np.float32)
+        for row in range(i * factor, (i + 1) * factor):
+            for j in range(cols * factor):
+                # Not a product: what lies outside the material may be anything.
+                along[j] += image[row, j] if weight[row, j] else np.float32(0.0)
+                count[j] += np.float32(weight[row, j])
+        for j in range(cols):
+            total, number = np.float32(0.0), np.float32(0.0)
+            for k in range(j * factor, (j + 1) * factor):
+                total += along[k]
+                number += count[k]
+            mean[i, j], share[i, j] = total * size, number * size
+
+
+@compiled(parallel=True, relaxed=True)
+def _blur(image: Any, weights: Any, out: Any) -> None:
+    rows, cols = image.shape
+    reach = weights.size - 1
+    for i in prange(rows):
+        line = np.empty(cols + 2 * reach, np.float32)
+        middle, own = line[reach : reach + cols], image[i]
+        for j in range(cols):
+            middle[j] = weights[0] * own[j]
+        for k in range(1, reach + 1):
+            up, down, w = image[max(0, i - k)], image[min(rows - 1, i + k)], weights[k]
+            for j in range(cols):
+                middle[j] += w * (up[j] + down[j])
+        line[:reach], line[reach + cols :] = middle[0], middle[cols - 1]
+        to = out[i]
+        for j in range(cols):
+            to[j] = weights[0] * middle[j]
+        for k in range(1, reach + 1):
+            before, after, w = line[reach - k :], line[reach + k :], weights[k]
+            for j in range(cols):
+                to[j] += w * (before[j] + after[j])
+
+
+Image = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One step from coarse to fine.
+
+    Parameters
+    ----------
+    factor
+        Edge of the blocks of pixels that are averaged [px].
+    blur
+        Standard deviation of the Gaussian blur after that [binned px]; 0 for none.
+    """
+
+    factor: int
+    blur: float
+
+    def __post_init__(self) -> None:
+        if self.factor < 1 or self.blur < 0:
+            raise InputError(
+                "expected a binning of at least 1 px and a blur of at least 0 px, got "
+                f"{self.factor} and {self.blur}"
+            )
+
+
+FULL = Level(1, 0.0)
+"""The images as they are."""
+COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
+"""Blurs of 24, 12, 6 and 0 px."""
+
+_FELT, _MOST = 2e-3, 1 / 16
+"""On the finest level no pixel counts that lands where the spline of g feels the mirror image
+beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic. What
+is left of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in the
+strip left out, polynomials are extrapolated, and on small images that costs more than it mends."""
+_CONTINUED = 1.5
+"""Blur that continues the material into holes on a level without blur of its own [binned px]."""
+
+_AROUND = 3.0
+"""How far the local mean and contrast reach, in blurs: nothing finer than the blur is lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelPair:
+    """Reference, deformed image and masks on one level.
+
+    Parameters
+    ----------
+    grid
+        The pixels of both images.
+    reference
+        (rows, cols) float32: f.
+    deformed
+        g, ready to be sampled.
+    mask
+        (rows, cols): pixels of f that count.
+    allowed
+        (rows, cols) where g may be sampled; None for everywhere.
+    """
+
+    grid: PixelGrid
+    reference: Image
+    deformed: SplineImage
+    mask: BoolArray
+    allowed: BoolArray | None
+
+
+def level_pair(
+    reference: Image,
+    deformed: Image,
+    grid: PixelGrid,
+    mask: BoolArray | None,
+    deformed_mask: BoolArray | None,
+    level: Level,
+    edge_px: int,
+    order: int,
+    levelled: bool = False,
+) -> LevelPair:
+    """Make one level of a pair of images.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) f and g.
+    grid
+        Their pixels.
+    mask, deformed_mask
+        (rows, cols) True on material, of f and of g; None if not known. Holes are kept out of
+        the blur only if both are known: they have to look alike in the two images.
+    level
+        Binning and blur.
+    edge_px
+        Pixels closer than this to the mask's edge are left out on the finest level [px].
+    order
+        Of the spline, 3 or 5.
+    levelled
+        Give both images a local mean of 0 and a local contrast of 1, so that differences of
+        brightness that vary slowly are gone; for blurred levels only.
+    """
+    reference, deformed = (np.asarray(image, np.float32) for image in (reference, deformed))
+    f_weight = mask if deformed_mask is not None else None
+    is_finest = level == FULL
+    # The reference is never sampled between its pixels: no need to continue it into holes.
+    f = reference if is_finest else _smooth(reference, f_weight, level)
+    g = _smooth(deformed, deformed_mask, level)
+    if levelled and level.blur > 0:
+        f, g = _locally_normalised(f, level.blur), _locally_normalised(g, level.blur)
+    inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
+    if is_finest:
+        inside = eroded(inside, edge_px)
+        allowed = _allowed(deformed_mask, grid.shape, edge_px, order)
+    else:
+        inside = binned(reference, inside, level.factor)[1] >= 0.5
+        allowed = None
+    return LevelPair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, allowed)
+
+
+def _allowed(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: int) -> BoolArray:
+    """Where g may be sampled: away from its border, and from the edges of its mask if known."""
+    border = min(border_reach(order, _FELT), int(_MOST * min(shape)))
+    allowed = np.zeros(shape, dtype=np.bool_)
+    inner = (slice(border, shape[0] - border), slice(border, shape[1] - border))
+    # The reference's eroded edge lands near edge_px from the edge of g, give or take the
+    # local strain; one pixel less leaves those pixels in.
+    allowed[inner] = True if mask is None else eroded(mask, max(0, edge_px - 1))[inner]
+    return allowed
+
+
+def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
+    """Take away the pixels within ``distance_px`` of the mask's edge; the image border is none."""
+    if distance_px < 1 or mask.all():
+        return mask
+    for _ in range(2):  # along the rows, then along what were the columns
+        kept = mask.copy(order="K")
+        for shift in range(1, distance_px + 1):
+            kept[shift:] &= mask[:-shift]
+            kept[:-shift] &= mask[shift:]
+        mask = kept.T
+    return np.ascontiguousarray(mask)
+
+
+def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
+    """Binned and blurred; where there is no material, a smooth continuation of the material."""
+    if weight is None or weight.all():
+        return blurred(binned(image, None, level.factor)[0], level.blur)
+    mean, share = binned(image, weight, level.factor)
+    filled = _continued(mean, share, level.blur or _CONTINUED)
+    if level.factor == 1 and level.blur == 0:
+        np.copyto(filled, image, where=weight)
+    return filled
+
+
+def _continued(mean: Image, share: Image, blur: float) -> Image:
+    """Blur both, and divide; far from any material, its mean grey level.
+
+    Parameters
+    ----------
+    mean, share
+        (rows, cols) grey level times share of material, and that share.
+    blur
+        Standard deviation [binned px].
+    """
+    overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
+    far = np.float32(1e-4)
+    mean, share = blurred(mean, blur), blurred(share, blur)
+    mean += far * np.float32(overall)
+    share += far
+    mean /= share
+    return mean
+
+
+def _locally_normalised(image: Image, blur: float, around: float = _AROUND) -> Image:
+    """The image less its local mean, over its local standard deviation."""
+    around *= blur
+    image = image - blurred(image, around)
+    contrast = np.sqrt(blurred(image**2, around))
+    return np.asarray(image / (contrast + 1e-3 * contrast.max()))
+
+
+def smoothed(image: Image, mask: BoolArray | None, blur: float) -> Image:
+    """Blur an image over its material, and continue it beyond.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material; None for everywhere.
+    blur
+        Standard deviation [px].
+    """
+    return _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
+
+
+def locally_normalised(
+    image: Image, mask: BoolArray | None, blur: float, around: float = _AROUND
+) -> NDArray[np.float32]:
+    """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
+
+    Where all speckles count alike, what an ansatz leaves over weighs alike everywhere.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) grey levels.
+    mask
+        (rows, cols) True on material; what is elsewhere has no part in it.
+    blur
+        Standard deviation [px].
+    around
+        How far the local mean and contrast reach [blurs].
+    """
+    smooth = smoothed(image, mask, blur)
+    return np.asarray(_locally_normalised(smooth, blur, around), dtype=np.float32)

@@ -1,0 +1,297 @@
+"""Which gradient weighs the residual (instrumental variables), and the root of h'r = 0.
+
+A correlation ends where h'r = 0: r is the residual f - g(x + u), h are the displacement's
+derivatives times a gradient. With the gradient of g at x + u that is the least-squares minimum.
+But g's noise has a gradient of its own, the noise of the residual among it:
+
+* the two are correlated by half the slope of the interpolated noise's variance, which depends on
+  where between pixels x + u lies: a bias of the displacement, with a period of one pixel;
+* the noise's gradient scatters the unknowns.
+
+These are errors in the variables, for which the cure is an *instrument*, an h whose errors have
+nothing to do with those of r. Whatever h is, exact images have r = 0 at the truth, so that no
+choice of h makes a bias of its own. The gradient of f, pushed forward by F^-T to where it belongs
+in g, is such an instrument: at a pixel of f, its noise and the slope of its noise are
+uncorrelated, because the spline is symmetric about the pixel. A blur of f takes from the slope's
+noise by its fourth power, and costs little as long as it is narrow against a speckle.
+
+Sources: J. Neggers, B. Blaysat, J. P. M. Hoefnagels, M. G. D. Geers, Int. J. Numer. Methods Eng.
+105 (2016), doi 10.1002/nme.4971 (the choice of the gradient); W. A. Fuller, Measurement Error
+Models, Wiley 1987, doi 10.1002/9780470316665 (instruments); H. Schreier, M. Sutton, Exp. Mech. 42
+(2002), doi 10.1007/BF02410987, and Y. Wang et al., Strain 45 (2009), doi
+10.1111/j.1475-1305.2008.00592.x (bias by interpolated noise).
+
+Their slopes are taken once, at the least-squares minimum, and from there Newton steps lead to the
+root, which is a few hundredths of a pixel off. There is no cost that has to fall. The derivative
+of h'r is A = h'J, J being that of the residual; noise that pushes h'r with the covariance s^2 h'h
+moves the root with s^2 A^-1 h'h A^-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.pair import CheckedImages
+from modeharvest.idic.solver.assembly import Assembly, NormalEquations, push_forward, warped_back
+from modeharvest.idic.solver.gauss_newton import (
+    GaussNewtonOptions,
+    Iteration,
+    Minimum,
+    Outcome,
+    StepLength,
+    corrected,
+    standard_errors,
+)
+from modeharvest.idic.solver.pyramid import LevelPair, blurred, smoothed
+from modeharvest.idic.uncertainty.noise import slope_noise
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.scaled_eigen import ScaledEigen
+
+WORTH_IT = 0.01
+"""Share of the unknowns' variance for which a blur is worth having [-]."""
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+class Gradient(Enum):
+    """Of which image the gradient is that weighs the residual."""
+
+    DEFORMED = "deformed"
+    """Of g at x + u: the derivative of the cost."""
+    REFERENCE = "reference"
+    """Of f at x, pushed forward: F^-T times it, the same in exact images."""
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """What weighs the residual.
+
+    Parameters
+    ----------
+    gradient
+        Of which image.
+    blur_px
+        Standard deviation of the blur of the image that the gradient is taken of [px]; 0 for
+        none.
+    width_px
+        Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known.
+    """
+
+    gradient: Gradient = Gradient.DEFORMED
+    blur_px: float = 0.0
+    width_px: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not (self.blur_px >= 0 and self.width_px > 0):
+            raise InputError(
+                "expected a blur of at least 0 px and a speckle wider than 0 px, got "
+                f"{self.blur_px} and {self.width_px}"
+            )
+
+    @property
+    def is_least_squares(self) -> bool:
+        """Whether h'r = 0 is the minimum of the residual's sum of squares."""
+        return self.gradient is Gradient.DEFORMED and self.blur_px == 0.0
+
+    def excess(self, noise: float, order: int = 5) -> float:
+        """Relative excess of the unknowns' variance over the Cramer-Rao bound [-].
+
+        With the same noise in both images, the reference's gradient, and a speckle whose
+        autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost,
+        (1 + t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the
+        noise of an image has nothing in common with its own gradient.
+
+        Parameters
+        ----------
+        noise
+            Variance of the noise over the mean square of the speckle's slope [px^2].
+        order
+            Of the spline.
+        """
+        noise *= slope_noise(order, self.blur_px)
+        if self.blur_px == 0.0:
+            return 0.5 * noise
+        t = (self.blur_px * _FWHM / self.width_px) ** 2
+        return float((1.0 + t) ** 4 * (1.0 / (1.0 + 2.0 * t) ** 2 + 0.5 * noise) - 1.0)
+
+    @property
+    def sentence(self) -> str:
+        """That in words."""
+        whose = {
+            Gradient.DEFORMED: "the deformed image's gradient",
+            Gradient.REFERENCE: "the reference's gradient",
+        }[self.gradient]
+        if self.blur_px == 0.0:
+            return f"The residual was weighed with {whose}."
+        return (
+            f"The residual was weighed with {whose} after a blur of {self.blur_px:.2g} px, which "
+            "takes away the gradient of the image's noise."
+        )
+
+
+def best_blur(noise: float, width_px: float, order: int = 5, worth: float = WORTH_IT) -> float:
+    """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
+
+    Parameters
+    ----------
+    noise, order
+        As for :meth:`Weighting.excess`.
+    width_px
+        Full width at half maximum of the speckle's autocorrelation [px].
+    worth
+        Share of the variance that a blur has to spare at least [-].
+    """
+    candidates = [Weighting(Gradient.REFERENCE, blur, width_px) for blur in (0.0, *_BLURS_PX)]
+    excess = [weighting.excess(noise, order) for weighting in candidates]
+    best = int(np.argmin(excess))
+    return candidates[best].blur_px if excess[0] - excess[best] > worth else 0.0
+
+
+LEAST_BLUR_PX = 0.6
+"""Below that a sampled Gaussian isn't one."""
+_BLURS_PX = tuple(LEAST_BLUR_PX + 0.05 * k for k in range(69))
+"""Up to 4 px."""
+
+
+_FAR = 10.0
+"""Steps longer than that many times the first one: it runs away."""
+_NEIGHBOURS_PX = 1.0
+"""Blur by which a pixel's neighbours stand for it where a gain is among the unknowns [px]."""
+
+
+def instrument(
+    weighting: Weighting, images: CheckedImages, pair: LevelPair, used: Assembly, a: FloatArray
+) -> NDArray[np.float32]:
+    """Make what weighs the residual: (3, rows, cols), slopes along x and y, and grey levels.
+
+    In the reference's frame, at the pixels that count. The grey levels, for a gain among the
+    unknowns, are those of f around each pixel without the pixel itself: so their noise has
+    nothing in common with the residual's.
+
+    Parameters
+    ----------
+    weighting
+        Which gradient.
+    images, pair
+        f and g, whole and prepared for the finest level.
+    used, a
+        The pixels that count, and the (size,) unknowns of the least-squares minimum.
+    """
+    order = pair.deformed.order
+    # As in the pyramid: what is beyond the material is only left out if both masks are known.
+    f_mask = None if images.g_mask is None else images.f_mask
+    if weighting.gradient is Gradient.DEFORMED:
+        g = smoothed(images.g, images.g_mask, weighting.blur_px)
+        made = warped_back(used, a, pair.reference, SplineImage.of(g, order))
+    else:
+        f = smoothed(images.f, f_mask, weighting.blur_px)
+        rest = np.zeros_like(a)
+        made = warped_back(used, rest, pair.reference, SplineImage.of(f, order))
+        push_forward(used, a, made)
+    if used.ansatz.brightness.gain_degree is not None:
+        made[2] = _neighbours(images.f, f_mask, max(weighting.blur_px, _NEIGHBOURS_PX))
+    return made
+
+
+def _neighbours(
+    image: NDArray[Any], mask: NDArray[np.bool_] | None, blur_px: float
+) -> NDArray[np.float32]:
+    """(rows, cols) Gaussian mean of the pixels around each pixel, without the pixel itself."""
+    inside = np.ones(image.shape, np.float32) if mask is None else mask.astype(np.float32)
+    alone = np.zeros((int(10 * blur_px) | 1,) * 2, np.float32)
+    alone[len(alone) // 2, len(alone) // 2] = 1.0
+    own = blurred(alone, blur_px).max()
+    grey = np.where(inside > 0.0, np.asarray(image, np.float32), np.float32(0.0))
+    around = blurred(grey, blur_px) - own * grey
+    around /= np.maximum(blurred(inside, blur_px) - own * inside, own)
+    return np.asarray(around)
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation:
+    """How what pushes h'r moves its root.
+
+    Parameters
+    ----------
+    slope
+        (n, n) A = h'J, made symmetric.
+    weight
+        (n, n) h'h.
+    """
+
+    slope: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def of(cls, matrix: Callable[[float], FloatArray], least_squares: FloatArray) -> Propagation:
+        """From matrices of squares alone: for the mean m of h and J, 4 m'm = h'h + J'J + A + A'.
+
+        Parameters
+        ----------
+        matrix
+            (n, n) m'm of weights that are a mixture: so much of h, the rest of J.
+        least_squares
+            (n, n) J'J.
+        """
+        pure, mixed = matrix(1.0), matrix(0.5)
+        return cls(2.0 * mixed - 0.5 * (pure + least_squares), pure)
+
+
+def root(
+    evaluate: Callable[[FloatArray], NormalEquations],
+    curvature: FloatArray,
+    step_length: StepLength,
+    found: Minimum,
+    options: GaussNewtonOptions,
+    on_iteration: Callable[[int], None] = lambda number: None,
+) -> Minimum:
+    """Find the root, from a least-squares minimum.
+
+    Parameters
+    ----------
+    evaluate
+        -h'r at some unknowns, as the gradient of normal equations.
+    curvature
+        (n, n) A = h'J.
+    step_length
+        Rms difference of the displacement between two sets of unknowns [px].
+    found
+        The minimum.
+    options
+        When to stop.
+    on_iteration
+        Called with the number of each finished iteration.
+
+    Returns
+    -------
+    Minimum
+        With the minimum's own matrix J'J, and these steps alone; converged. If they don't settle,
+        the minimum itself with the outcome UNWEIGHTED.
+    """
+    a, history = found.unknowns, list[Iteration]()
+    here = evaluate(a)
+    first = np.inf
+    for number in range(1, options.max_iterations + 1):
+        step = -ScaledEigen.of(curvature).solve(here.gradient)
+        length, errors = step_length(a, a + step), standard_errors(step, curvature, here)
+        there = evaluate(a + step)
+        curvature = corrected(curvature, step, there.gradient - here.gradient)
+        a, here, first = a + step, there, min(first, length)
+        history.append(Iteration(1, number, here.mean_square, length, 0.0, here.pixels))
+        on_iteration(number)
+        if length <= options.tolerance_px or errors <= options.tolerance_errors:
+            equations = replace(here, matrix=found.equations.matrix)
+            return replace(
+                found, unknowns=a, equations=equations, history=tuple(history),
+                outcome=Outcome.CONVERGED,
+            )  # fmt: skip
+        if length > _FAR * first:
+            break
+    return replace(found, outcome=Outcome.UNWEIGHTED, history=tuple(history))

@@ -1,1 +1,0 @@
-"""What a photograph shows of a cellular specimen: material, holes, lattice, region."""

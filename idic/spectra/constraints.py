@@ -1,0 +1,341 @@
+"""Constraints between the waves of a field: equal amplitudes and phases as one parameter.
+
+Plane waves with complex amplitudes become real ones, A and B sin(π/l (kx x + ky y + c)), and what
+symmetry makes equal among them becomes one parameter. A symmetry that turns one wave vector into
+another turns the motion with it, so amplitudes are compared in each wave's own frame: L along its
+wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by +90 degrees.
+
+* L and T with a common phase: one wave. Otherwise two waves with the same wave vector, one of L
+  and one of T, each with a phase of its own.
+* |L|, and |T|, equal within a star of waves: one parameter, the signs held.
+* L or T zero: held at zero.
+* The overall amplitude is held, since v_i carries it.
+
+Wave vectors are free, and so are phases: they make up for a specimen that isn't quite its drawing
+(the paper's a₂ ... a₇). The frames stay those of the wave vectors found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeharvest.idic.modes import PER_WAVE, ModeFamily
+from modeharvest.idic.spectra.waves import Selection
+from modeharvest.util.arrays import FloatArray
+
+SAME_AMPLITUDE = 0.02
+"""Difference of two amplitudes that are called equal, or from zero, of the star's strongest: the
+smallest that a correlation would notice; a mesh without symmetry makes less (a test)."""
+IN_PHASE = 0.02
+"""Share of a wave that may be out of phase between x and y. A real mode at a wave vector on the
+zone's boundary is in phase to rounding where the cell has an inversion centre."""
+SAME_PHASE = 0.01
+"""Difference of phases [l] that are called equal: a hundredth of a cell."""
+POLARISED = 0.1
+"""Sine of the angle up to which a wave is called transverse or longitudinal."""
+
+
+@dataclass(frozen=True)
+class RealWave:
+    """A wave (L n + T m) sin(π/l (k·x + c)) of the field.
+
+    Parameters
+    ----------
+    k
+        Wave vector [π/l].
+    amplitude
+        (L, T) along n = k/|k| and along m = n turned by +90 degrees, signed [unit of the field].
+    phase
+        c [l], above −1/2 and up to 1/2; the rest is in the signs.
+    star
+        Which star of waves it belongs to.
+    shares_k
+        Whether its wave vector is that of the wave before: one of two that are out of phase.
+    """
+
+    k: tuple[float, float]
+    amplitude: tuple[float, float]
+    phase: float
+    star: int
+    shares_k: bool = False
+
+    @property
+    def frame(self) -> FloatArray:
+        """(2, 2) n and m as rows."""
+        return local_frame(np.array(self.k))
+
+    @property
+    def strength(self) -> float:
+        """Length of the amplitude [unit of the field]."""
+        return float(np.hypot(*self.amplitude))
+
+    @property
+    def row(self) -> FloatArray:
+        """(5,) A, B [unit of the field], kx, ky [-] and c [l]."""
+        return np.array([*(np.array(self.amplitude) @ self.frame), *self.k, self.phase])
+
+    @property
+    def polarisation(self) -> str:
+        """How it moves compared with where it points: transverse, longitudinal, or mixed."""
+        along, across = np.abs(self.amplitude) / self.strength
+        if along <= POLARISED:
+            return "transverse"
+        return "longitudinal" if across <= POLARISED else "mixed"
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Amplitudes of one component that are one parameter, or held.
+
+    Parameters
+    ----------
+    component
+        0 for L, along the wave vector, 1 for T, across.
+    waves
+        Numbers of the waves, from 0.
+    value
+        Their common magnitude [unit of the field]; 0: they are held at zero.
+    """
+
+    component: int
+    waves: tuple[int, ...]
+    value: float
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter, such as "T1" or "T1,2"."""
+        return "LT"[self.component] + ",".join(str(w + 1) for w in self.waves)
+
+
+def local_frame(vector: FloatArray) -> FloatArray:
+    """(2, 2) rows: the direction of a vector, and that turned by +90 degrees."""
+    x, y = vector / np.linalg.norm(vector)
+    return np.array([[x, y], [-y, x]])
+
+
+def real_waves(selection: Selection) -> list[RealWave]:
+    """Turn complex amplitudes into real waves, one each or two."""
+    waves: list[RealWave] = []
+    for xi, cartesian, star in zip(selection.xi, selection.amplitudes, selection.star, strict=True):
+        z = local_frame(xi) @ cartesian
+        angle = 0.5 * float(np.angle(np.sum(z**2)))
+        turned = z * np.exp(-1j * angle)
+        if np.linalg.norm(turned.imag) <= IN_PHASE * np.linalg.norm(turned):
+            waves.append(_real_wave(xi, turned.real, angle, star))
+            continue
+        for component in (0, 1):
+            alone = np.where(np.arange(2) == component, np.abs(z), 0.0)
+            angle = float(np.angle(z[component]))
+            waves.append(_real_wave(xi, alone, angle, star, component == 1))
+    return waves
+
+
+def _real_wave(
+    xi: FloatArray, amplitude: FloatArray, angle: float, star: int, shares_k: bool = False
+) -> RealWave:
+    """Move the phase between −1/2 and 1/2 l; what rounding makes of 0 and 1/2 is the same."""
+    phase = round(angle / np.pi, 12)
+    turns = np.ceil(phase - 0.5 - 1e-9)
+    along, across = amplitude * (-1.0) ** turns
+    k = (2.0 * float(xi[0]), 2.0 * float(xi[1]))
+    return RealWave(k, (float(along), float(across)), float(phase - turns) + 0.0, star, shares_k)
+
+
+def find_ties(waves: list[RealWave]) -> list[Tie]:
+    """Amplitudes that are equal within a star, or zero: T before L, strongest star first."""
+    ties = []
+    for star in dict.fromkeys(w.star for w in waves):
+        members = [k for k, w in enumerate(waves) if w.star == star]
+        tolerance = SAME_AMPLITUDE * max(waves[k].strength for k in members)
+        for component in (1, 0):
+            sizes = {k: abs(waves[k].amplitude[component]) for k in members}
+            ties += _clustered(component, sizes, tolerance)
+    return ties
+
+
+def _clustered(component: int, sizes: dict[int, float], tolerance: float) -> list[Tie]:
+    zero = tuple(k for k, size in sizes.items() if size <= tolerance)
+    ties = [Tie(component, zero, 0.0)] if zero else []
+    left = {k: size for k, size in sizes.items() if size > tolerance}
+    while left:
+        first = next(iter(left.values()))
+        same = tuple(k for k, size in left.items() if abs(size - first) <= tolerance)
+        ties.append(Tie(component, same, float(np.mean([left.pop(k) for k in same]))))
+    return ties
+
+
+def fixed_tie(ties: list[Tie]) -> Tie:
+    """The amplitudes that are held at ±1: the largest."""
+    return max(ties, key=lambda tie: tie.value)
+
+
+def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
+    """Make the family: amplitudes first, then wave vectors, then phases.
+
+    Parameters
+    ----------
+    name
+        What to call it.
+    waves
+        Of the field.
+    ties
+        From :func:`find_ties`.
+    pitch
+        l [mm].
+    """
+    rows = PER_WAVE * len(waves)
+    columns, start, names, units = [], [], [], []
+    held = fixed_tie(ties)
+    offset = _amplitude_column(held, waves)
+    for tie in ties:
+        if tie is not held and tie.value > 0:
+            columns.append(_amplitude_column(tie, waves))
+            start.append(tie.value / held.value)
+            names.append(tie.name)
+            units.append("-")
+    for first, both in _by_wave_vector(waves):
+        for axis in (0, 1):
+            columns.append(_unit_column(rows, [PER_WAVE * w + 2 + axis for w in both]))
+            start.append(waves[first].k[axis])
+            names.append(f"k{'xy'[axis]}{first + 1}")
+            units.append("-")
+    for w, wave in enumerate(waves):
+        columns.append(_unit_column(rows, [PER_WAVE * w + 4]))
+        start.append(wave.phase * pitch)
+        names.append(f"c{w + 1}")
+        units.append("mm")
+    matrix = np.stack(columns, axis=1)
+    return ModeFamily(name, matrix, offset, np.array(start), tuple(names), tuple(units))
+
+
+def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
+    """(5 w,) What a unit of the tied amplitude is, as A and B of each wave, signs included."""
+    column = np.zeros((len(waves), PER_WAVE))
+    for w in tie.waves:
+        sign = np.sign(waves[w].amplitude[tie.component])
+        column[w, :2] = sign * waves[w].frame[tie.component]
+    return column.ravel()
+
+
+def _unit_column(rows: int, ones: list[int]) -> FloatArray:
+    column = np.zeros(rows)
+    column[ones] = 1.0
+    return column
+
+
+def _by_wave_vector(waves: list[RealWave]) -> list[tuple[int, list[int]]]:
+    """Waves that share one wave vector, named by the first of them."""
+    groups: list[tuple[int, list[int]]] = []
+    for w, wave in enumerate(waves):
+        if wave.shares_k:
+            groups[-1][1].append(w)
+        else:
+            groups.append((w, [w]))
+    return groups
+
+
+def as_rows(waves: list[RealWave], pitch: float) -> FloatArray:
+    """(w, 5) A, B [unit of the field], kx, ky [-], c [mm], nothing tied."""
+    return np.array([wave.row for wave in waves]) * [1.0, 1.0, 1.0, 1.0, pitch]
+
+
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+_ACROSS = ("along", "across")
+
+
+def describe(
+    selection: Selection,
+    waves: list[RealWave],
+    ties: list[Tie],
+    family: ModeFamily,
+    captured: float,
+) -> tuple[str, ...]:
+    """Which waves, what they have in common, and how much of the field they are."""
+    said = [_stars(waves), _energy(selection, captured)]
+    said += _phases(waves)
+    said += [*_amplitudes(waves, ties), _family(family, ties)]
+    return tuple(said)
+
+
+def number(count: int, noun: str) -> str:
+    """Such as "two waves"."""
+    word = _NUMBERS[count] if count < len(_NUMBERS) else str(count)
+    return f"{word} {noun}{'s' * (count != 1)}"
+
+
+def _stars(waves: list[RealWave]) -> str:
+    parts = []
+    for star in dict.fromkeys(w.star for w in waves):
+        members = [w for w in waves if w.star == star]
+        vectors = [f"[{w.k[0]:+.3g}, {w.k[1]:+.3g}]" for w in members if not w.shares_k]
+        kinds = sorted({w.polarisation for w in members})
+        kind = f", {kinds[0]}" if len(kinds) == 1 and kinds[0] != "mixed" else ""
+        parts.append(f"{' and '.join(vectors)} π/l{kind}")
+    total = sum(not w.shares_k for w in waves)
+    return f"{number(total, 'wave').capitalize()}: {'; then '.join(parts)}."
+
+
+def _energy(selection: Selection, captured: float) -> str:
+    text = f"At the start they are {100 * captured:.1f} % of the energy over the material"
+    if selection.growth[-1][0] == len(selection.xi):
+        return text + "; no further wave could be told apart from them."
+    return text + f"; the next would add {100 * selection.next_gain:.1f} %."
+
+
+def _phases(waves: list[RealWave]) -> list[str]:
+    pairs = [w for w in waves if w.shares_k]
+    said = []
+    if pairs:
+        said.append(
+            f"In {number(len(pairs), 'wave')} x and y are out of phase; each of these is written "
+            "as a wave along x and a wave along y with the same wave vector."
+        )
+    phases = np.array([w.phase for w in waves])
+    if np.all(np.abs(phases) <= SAME_PHASE):
+        said.append("All phases are 0 at the origin: a half turn about it keeps the field.")
+    elif np.all(np.abs(phases - 0.5) <= SAME_PHASE):
+        said.append("All phases are l/2 at the origin: a half turn about it reverses the field.")
+    else:
+        said.append("Phases: " + ", ".join(f"{p:+.2f}" for p in phases) + " l.")
+    return said
+
+
+def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
+    said = []
+    for tie in ties:
+        if len(tie.waves) > 1 and tie.value > 0:
+            said.append(
+                f"The amplitude {_ACROSS[tie.component]} the wave vector is the same in waves "
+                f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
+                f"signs {_signs(tie, waves)}."
+            )
+    split = {w for w, wave in enumerate(waves) if wave.shares_k}
+    split |= {w - 1 for w in split}
+    zero = [tie.name for tie in ties if tie.value == 0 and not split & set(tie.waves)]
+    if zero:
+        said.append(f"Zero within {100 * SAME_AMPLITUDE:.0f} %: {', '.join(zero)}.")
+    return said
+
+
+def _signs(tie: Tie, waves: list[RealWave]) -> str:
+    """Relative to the first."""
+    values = np.array([waves[w].amplitude[tie.component] for w in tie.waves])
+    return " ".join("+" if value > 0 else "−" for value in values * values[0])
+
+
+def _family(family: ModeFamily, ties: list[Tie]) -> str:
+    free = [name for name in family.names if name[0] not in "kc"]
+    if family.name.startswith("square"):
+        start = ", ".join(f"{value:.3g}" for value in np.round(family.start, 3) + 0.0)
+        return (
+            f"This is Eq. (mode) of the paper ({family.name}): {number(family.size, 'parameter')}, "
+            f"start [{start}]."
+        )
+    names = f" ({', '.join(free)})" if free else ""
+    held = f"; {fixed_tie(ties).name} is held, since v carries the amplitude" if ties else ""
+    return (
+        f"{number(family.size, 'parameter').capitalize()}: all wave vectors and phases, and "
+        f"{number(len(free), 'amplitude')}{names}{held}."
+    )

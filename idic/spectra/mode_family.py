@@ -1,0 +1,386 @@
+"""Mode families found in periodic fields: identification, overlap with nodal fields, JSON files.
+
+What the paper does by eye in its Section "Parametrization and Initial Guess of the Patterning
+Modes": find the peaks, take the waves that matter (``waves``), see what they have in common
+(``constraints``), and say it in words. For the (π, π) mode of a square lattice this is Eq. (mode)
+with its seven parameters.
+
+The normalised overlap |∫ u·φ dA| / (‖u‖ ‖φ‖) is 1 for fields that differ by a factor. Both are
+taken without their mean over the material: a rigid translation is no part of a mode.
+
+Programs that don't know this project can read it: a field is ``amplitude`` times the sum over the
+waves of (A, B) sin(π/l (kx x + ky y + c)), [mm]; parameters a give the waves as rows of
+``matrix`` a + ``offset``. Numbers are written so that reading gives the very same ones.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.modes import ModeFamily, free_family, square_family
+from modeharvest.idic.spectra.constraints import (
+    SAME_AMPLITUDE,
+    SAME_PHASE,
+    RealWave,
+    Tie,
+    as_rows,
+    describe,
+    find_ties,
+    real_waves,
+    tied_family,
+)
+from modeharvest.idic.spectra.lattice_spectrum import (
+    LatticeSpectrum,
+    MeshQuadrature,
+    lattice_spectrum,
+    points_for,
+)
+from modeharvest.idic.spectra.pattern import mode_equivalent
+from modeharvest.idic.spectra.waves import GROWTH, select_waves
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_record, reading, write_json
+
+
+def overlap(
+    mesh: Mesh,
+    values: ArrayLike,
+    family: ModeFamily,
+    pitch: float,
+    parameters: ArrayLike | None = None,
+) -> float:
+    """Normalised overlap of a nodal field with a family's waves [-], between 0 and 1.
+
+    Parameters
+    ----------
+    mesh
+        Of the field [mm].
+    values
+        (n, 2) field at the nodes [any unit].
+    family
+        Whose waves to compare with; the taper is left out.
+    pitch
+        l [mm].
+    parameters
+        (m,) of the mode; by default the family's start.
+
+    Raises
+    ------
+    InputError
+        If the field's shape differs from the nodes', or one of the two is only a translation.
+    """
+    u = np.asarray(values, dtype=np.float64)
+    if u.shape != mesh.nodes.shape or not np.isfinite(u).all():
+        raise InputError(
+            f"overlap: expected a finite field of shape {mesh.nodes.shape}, got {u.shape}"
+        )
+    waves = family.waves(family.start if parameters is None else parameters)
+    largest = float(np.linalg.norm(waves[:, 2:4], axis=1).max())
+    rule = MeshQuadrature(mesh, points_for(mesh, 2.0 * np.pi * largest / pitch))
+    phi = wave_values(rule, waves, pitch)
+    return float(np.sqrt(best_amplitude(rule, rule.without_mean(rule.values(u)), phi)[1]))
+
+
+def wave_values(rule: MeshQuadrature, waves: FloatArray, pitch: float) -> FloatArray:
+    """(q, 2) sum of waves (w, 5) at the points of a quadrature [-], without mean."""
+    phases = np.pi / pitch * (rule.positions @ waves[:, 2:4].T + waves[:, 4])
+    return rule.without_mean(np.sin(phases) @ waves[:, :2])
+
+
+def best_amplitude(rule: MeshQuadrature, u: FloatArray, phi: FloatArray) -> tuple[float, float]:
+    """Factor a that makes a φ nearest to u, and the share of ∫ |u|² that a φ is.
+
+    The share is the square of the normalised overlap.
+
+    Raises
+    ------
+    InputError
+        If one of the two is zero.
+    """
+    mixed, uu, pp = rule.product(u, phi), rule.product(u, u), rule.product(phi, phi)
+    if not (uu > 0 and pp > 0):
+        raise InputError("overlap: expected two fields that are more than a translation, got zero")
+    return mixed / pp, min(1.0, mixed**2 / (uu * pp))
+
+
+NEAR_DIAGONAL = 0.1
+"""Difference of a wave vector's components from ±1 [π/l] up to which it is called diagonal: the
+next reciprocal vectors of even a 10 x 10 cell are 0.2 away."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFamily:
+    """A mode family, where it came from, and how much of the field it is.
+
+    The field is about ``amplitude`` times the sum of the family's waves at its start.
+
+    Parameters
+    ----------
+    family
+        The family; its start is the field.
+    pitch
+        l [mm], the half-wavelength of :class:`modeharvest.idic.modes.FourierMode`.
+    amplitude
+        [unit of the field], with sign.
+    captured
+        Share of ∫ |u|² over the material, translation apart, that ``amplitude`` and the start
+        describe [-].
+    growth
+        (number of waves, share captured by as many, nothing tied); goes on beyond those taken.
+    sentences
+        What was found, in words.
+    info
+        Plain JSON values of the caller: lattice, material, loading, critical strain.
+    """
+
+    family: ModeFamily
+    pitch: float
+    amplitude: float
+    captured: float
+    growth: tuple[tuple[int, float], ...]
+    sentences: tuple[str, ...]
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (0 < self.pitch < np.inf and np.isfinite([self.amplitude, self.captured]).all()):
+            raise InputError(
+                f"mode family {self.family.name!r}: expected a positive pitch and finite numbers, "
+                f"got {self.pitch} mm, amplitude {self.amplitude}, captured {self.captured}"
+            )
+
+    @property
+    def waves(self) -> FloatArray:
+        """(w, 5) A, B, kx, ky [-] and c [mm] of the waves at the start."""
+        return self.family.waves(self.family.start)
+
+
+def mode_family(
+    mesh: Mesh,
+    lattice: ArrayLike,
+    values: ArrayLike,
+    pitch: float,
+    *,
+    shared: bool = True,
+    growth: float = GROWTH,
+    info: Mapping[str, Any] | None = None,
+) -> FoundFamily:
+    """Find the truncated Fourier series of a periodic field, and make it a family.
+
+    Parameters
+    ----------
+    mesh
+        One cell of the lattice [mm].
+    lattice
+        (2, 2) its lattice vectors as rows [mm].
+    values
+        (n, 2) field at the nodes, periodic, affine part removed [any unit].
+    pitch
+        l [mm].
+    shared
+        Look for constraints; otherwise every wave has five parameters of its own (but one).
+    growth
+        Least share of the energy that a further star of waves must add [-]; larger for fewer waves.
+    info
+        To keep with the family.
+
+    Raises
+    ------
+    InputError
+        As :func:`modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum`.
+    """
+    spectrum = lattice_spectrum(mesh, lattice, values, pitch)
+    rule = MeshQuadrature(mesh, points_for(mesh, 6.0 * np.pi / pitch))
+    u = rule.without_mean(rule.values(values))
+    selection = select_waves(spectrum, rule, u, growth)
+    waves = real_waves(selection)
+    ties = find_ties(waves)
+    family = _family(waves, ties, pitch, shared)
+    phi = wave_values(rule, family.waves(family.start), pitch)
+    amplitude, captured = best_amplitude(rule, u, phi)
+    sentences = describe(selection, waves, ties if shared else [], family, captured)
+    return FoundFamily(
+        family, pitch, amplitude, captured, selection.growth, sentences, dict(info or {})
+    )
+
+
+def _family(waves: list[RealWave], ties: list[Tie], pitch: float, shared: bool) -> ModeFamily:
+    count = f"{len(waves)} wave" + "s" * (len(waves) > 1)
+    rows = as_rows(waves, pitch)
+    rows[:, :2] /= np.abs(rows[:, :2]).max()
+    if not shared:
+        return free_family(rows, f"{count}, free")
+    return as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
+
+
+def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
+    """The paper's Eq. (mode) with these two waves as its start, if it has them; else None.
+
+    Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component
+    and opposite in the other. Turned and shifted (:mod:`modeharvest.idic.spectra.pattern`) to
+    whichever of the paper's starts is nearer: the origin at a junction, or at a hole's centre.
+
+    Parameters
+    ----------
+    waves
+        (w, 5) A, B, kx, ky [-] and c [mm].
+    pitch
+        l [mm].
+    """
+    if len(waves) != 2:
+        return None
+    amplitudes, k, phases = waves[:, :2], waves[:, 2:4], waves[:, 4].copy()
+    same = SAME_AMPLITUDE * np.linalg.norm(amplitudes, axis=1).max()
+    diagonal = np.all(np.abs(np.abs(k) - 1.0) <= NEAR_DIAGONAL) and k.prod() < 0
+    equal = np.all(np.abs(np.diff(np.abs(amplitudes), axis=0)) <= same)
+    if not (diagonal and equal and amplitudes.prod() < 0):
+        return None
+    # Eq. (mode) has B = 1 and −1; a wave with the other sign is moved by half its length.
+    turned = np.sign(amplitudes[:, 1]) != (1, -1)
+    phases[turned] += pitch
+    signs = np.where(turned, -1.0, 1.0)
+    ratio = -(signs @ amplitudes[:, 0]) / np.abs(amplitudes[:, 1]).sum()
+    return _nearer(np.array([ratio, *k[0], *k[1], *phases]), pitch)
+
+
+def _nearer(mode: FloatArray, pitch: float) -> ModeFamily:
+    """Eq. (mode) with the start that needs the smaller phases."""
+    found = []
+    for origin in ("junction", "hole"):
+        family = square_family(origin)
+        start, _ = mode_equivalent(mode, pitch, family.start)
+        off = float(np.abs(start[5:]).max()) / pitch
+        found.append((round(off, 9), origin, family, start))
+    off, origin, family, start = min(found, key=lambda f: f[0])
+    name = family.name if off <= SAME_PHASE else "square"
+    return ModeFamily(name, family.matrix, family.offset, start, family.names, family.units)
+
+
+FORMAT = "modeharvest-family-1"
+_WHAT = f"a whole {FORMAT} file"
+
+_CONVENTIONS = {
+    "field": "u(x) = amplitude * sum over waves of (A, B) * sin(pi/pitch * (kx*x + ky*y + c))",
+    "wave": ["A [-]", "B [-]", "kx [-]", "ky [-]", "c [mm]"],
+    "parameters": "flattened waves = matrix . parameters + offset",
+    "axes": "x to the right, y up, mm; the origin is that of the cell's mesh",
+    "normalisation": "the amplitude held by the family is 1 or -1; amplitude has the field's unit",
+    "captured": "share of the integral of |u|^2 over the material, rigid translation apart",
+    "coefficients": "integral over the cell of u exp(-2 pi i xi.x/pitch) dA, u = 0 in the holes",
+}
+
+
+def write_family(
+    path: Path | str,
+    found: FoundFamily,
+    info: Mapping[str, Any] | None = None,
+    spectrum: LatticeSpectrum | None = None,
+) -> None:
+    """Write a family, atomically.
+
+    Parameters
+    ----------
+    path
+        Of the JSON file.
+    found
+        The family.
+    info
+        Plain JSON values to add to the family's own ``info``, such as the critical strain.
+    spectrum
+        Fourier coefficients of the same field, to keep beside it.
+
+    Raises
+    ------
+    InputError
+        If ``info`` can't be written as JSON, or the file can't be written.
+    """
+    family = found.family
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "conventions": _CONVENTIONS,
+        "name": family.name,
+        "pitch": found.pitch,
+        "amplitude": found.amplitude,
+        "captured": found.captured,
+        "growth": [list(step) for step in found.growth],
+        "sentences": list(found.sentences),
+        "waves": found.waves.tolist(),
+        "matrix": family.matrix.tolist(),
+        "offset": family.offset.tolist(),
+        "start": family.start.tolist(),
+        "names": list(family.names),
+        "units": list(family.units),
+        "info": {**found.info, **(info or {})},
+    }
+    if spectrum is not None:
+        content["spectrum"] = _spectrum_to_dict(spectrum)
+    try:
+        json.dumps(content, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"family file {path}: expected plain, finite JSON values, got {error}"
+        ) from error
+    write_json(path, content)
+
+
+def read_family(path: Path | str) -> FoundFamily:
+    """Read what :func:`write_family` wrote; InputError if it is damaged or something else."""
+    with reading(path, _WHAT):
+        content = read_record(path, FORMAT, _WHAT, "make it again")
+        family = ModeFamily(
+            str(content["name"]),
+            np.array(content["matrix"], dtype=np.float64),
+            np.array(content["offset"], dtype=np.float64),
+            np.array(content["start"], dtype=np.float64),
+            tuple(str(name) for name in content["names"]),
+            tuple(str(unit) for unit in content["units"]),
+        )
+        return FoundFamily(
+            family,
+            float(content["pitch"]),
+            float(content["amplitude"]),
+            float(content["captured"]),
+            tuple((int(count), float(share)) for count, share in content["growth"]),
+            tuple(str(sentence) for sentence in content["sentences"]),
+            dict(content["info"]),
+        )
+
+
+def read_spectrum(path: Path | str) -> LatticeSpectrum | None:
+    """Read the Fourier coefficients in a family's file; None if there are none."""
+    with reading(path, _WHAT):
+        content = read_record(path, FORMAT, _WHAT, "make it again").get("spectrum")
+        if content is None:
+            return None
+        parts = np.array(content["coefficients"], dtype=np.float64)
+        x, y = content["translation"]
+        return LatticeSpectrum(
+            np.array(content["xi"], dtype=np.float64),
+            parts[:, :, 0] + 1j * parts[:, :, 1],
+            float(content["pitch"]),
+            np.array(content["lattice"], dtype=np.float64),
+            float(content["energy"]),
+            float(content["material"]),
+            (float(x), float(y)),
+        )
+
+
+def _spectrum_to_dict(spectrum: LatticeSpectrum) -> dict[str, Any]:
+    """Coefficients as [[re, im] of u_x, [re, im] of u_y] for each wave vector."""
+    u = spectrum.coefficients
+    return {
+        "pitch": spectrum.pitch,
+        "lattice": spectrum.lattice.tolist(),
+        "energy": spectrum.energy,
+        "material": spectrum.material,
+        "translation": list(spectrum.translation),
+        "xi": spectrum.xi.tolist(),
+        "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
+    }

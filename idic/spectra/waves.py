@@ -1,0 +1,405 @@
+"""Plane waves in displacement fields: spectral peaks, their selection, and least-squares fits.
+
+Of a field known at pixels: peaks are looked for away from the lines that the specimen's edges
+cause. The jump of the mean deformation at a vertical edge spreads energy along ξ2 = 0, at a
+horizontal edge along ξ1 = 0, about l/L wide, L being the material's height or width; and as the
+holes repeat with the period l, copies of the lines stand at whole numbers of ξ1 and ξ2. Wave
+vectors within two such widths (``EDGE_LINE_WIDTHS``) of a whole number in either component are
+left out, unless they stand out against the line itself, which falls off slowly along its length,
+where a wave is a peak (one of the three waves of a hexagonal lattice lies on such a line).
+
+The peak tells where a wave is. Its amplitude and phase can't be read off û alone, because the
+holes couple waves whose vectors differ by whole numbers of 1/l, and the diagonals of the
+square pattern do: a third of one shows up at the other. So all waves are fitted at once, by
+least squares over the material, under a Hann taper that keeps the edges out.
+
+Of a periodic field on a mesh: the spectral density says where waves may be, not how large they
+are: the holes couple waves that differ by a vector of the lattice of holes, so a wave shows up at
+each of those (see above). What counts is how much of the field's energy over the material the
+waves explain together, by least squares.
+
+Waves are added as stars: peaks of equal density and wavelength, which a symmetry of the field may
+turn into each other, stay together. The first star is that of the largest peak; from then on the
+star that explains most of what is left is next (orthogonal matching pursuit, Pati, Rezaiifar &
+Krishnaprasad, 1993, doi 10.1109/ACSSC.1993.342465).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+
+from modeharvest.idic.spectra.lattice_spectrum import LatticePeak, LatticeSpectrum, MeshQuadrature
+from modeharvest.idic.spectra.spectrum import Spectrum
+from modeharvest.util.arrays import ComplexArray, FloatArray
+from modeharvest.util.errors import InputError
+
+EDGE_LINE_WIDTHS = 2.0
+"""Distance from whole numbers of ξ [l/L] within which a maximum is taken for an edge line."""
+LINE_CONTRAST = 10.0
+"""Ratio of a maximum on a line to the largest density 1.5 to 2.5 l/L further along it, either way,
+from which it is a wave's: a wave's own side lobes give 20, the lines of the paper's
+specimen before buckling less than 3."""
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A maximum of S_xx + S_yy outside the edges' lines.
+
+    Parameters
+    ----------
+    xi
+        Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since
+        S(−ξ) = S(ξ).
+    density
+        S_xx + S_yy there [mm⁶].
+    contrast
+        That density over the median of all the wave vectors searched [-].
+    """
+
+    xi: tuple[float, float]
+    density: float
+    contrast: float
+
+
+@dataclass(frozen=True)
+class PlaneWave:
+    """One plane wave, A sin(π/l (k·x + c)), directed upwards (k_y > 0) or, if level, to the right.
+
+    Parameters
+    ----------
+    k
+        Wave vector [π/l]; (1, 1) is a wavelength of 2l along both axes.
+    amplitude
+        (x, y) amplitudes with their signs [mm], averaged under the Hann taper.
+    phase
+        Shift c [mm], between −l/2 and l/2; the rest is in the signs.
+    out_of_phase
+        Share of the wave that no common phase of x and y describes [-]; 0 for a plain sine.
+    """
+
+    k: tuple[float, float]
+    amplitude: tuple[float, float]
+    phase: float
+    out_of_phase: float
+
+    @property
+    def xi(self) -> tuple[float, float]:
+        """Wave vector [1/l], as on the axes of the spectral densities."""
+        return self.k[0] / 2, self.k[1] / 2
+
+    @property
+    def strength(self) -> float:
+        """Length of the amplitude vector [mm]."""
+        return float(np.hypot(*self.amplitude))
+
+
+def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
+    """All maxima of S_xx + S_yy outside the edges' lines, largest first."""
+    xi1, xi2, S_xx, S_yy = spectrum.window(xi_max)
+    S = S_xx + S_yy
+    margin = [min(0.3, EDGE_LINE_WIDTHS * spectrum.pitch / size) for size in spectrum.extent]
+    away1 = np.abs(xi1 - np.round(xi1)) >= margin[0]
+    away2 = (np.abs(xi2 - np.round(xi2)) >= margin[1]) & (xi2 > 0)
+    searched = away2[:, None] & away1[None, :]
+    if not searched.any() or not S.max() > 0:
+        return []
+    median = float(np.median(S[searched]))
+    # Two maxima closer than a main lobe's width, l/L, are one.
+    lobe = spectrum.pitch / max(spectrum.extent)
+    distance = max(1, round(lobe / (xi1[1] - xi1[0])))
+    # Maxima of the whole plane that are searched, so the foot of a line is not one of them.
+    maxima = maximum_filter(S, 2 * distance + 1) == S
+    found = np.vstack([np.argwhere(maxima & searched), _on_lines(S, maxima, xi1, xi2, spectrum)])
+    peaks = [
+        Peak((float(xi1[c]), float(xi2[r])), float(S[r, c]), float(S[r, c]) / median)
+        for r, c in found
+    ]
+    return sorted(peaks, key=lambda p: -p.density)
+
+
+def _on_lines(
+    S: FloatArray, maxima: NDArray[np.bool_], xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
+) -> NDArray[np.intp]:
+    """(n, 2) indices of maxima on one of the edges' lines, not where two cross, that stand out."""
+    lobes = [spectrum.pitch / size for size in spectrum.extent]
+    near = [
+        np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
+        for xi, lobe in zip((xi1, xi2), lobes, strict=True)
+    ]
+    half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1[None, :] > 0.5 * lobes[0])
+    half_plane &= xi2[:, None] > -0.5 * lobes[1]
+    one_line = near[0][None, :] != near[1][:, None]
+    found = []
+    for r, c in np.argwhere(maxima & one_line & half_plane):
+        along, at, xi, lobe = (
+            (S[:, c], r, xi2, lobes[1]) if near[0][c] else (S[r], c, xi1, lobes[0])
+        )
+        away = np.abs(xi - xi[at]) / lobe
+        beside = along[(away >= 1.5) & (away <= 2.5)]
+        if beside.size and S[r, c] >= LINE_CONTRAST * beside.max():
+            found.append((r, c))
+    return np.array(found, dtype=np.intp).reshape(-1, 2)
+
+
+def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[PlaneWave]:
+    """Fit plane waves near some peaks, all at once, wave vectors included.
+
+    Each wave vector stays within half a main lobe, l/2L, of its peak.
+    """
+    weight = _taper(spectrum)
+    start = np.array([p.xi for p in peaks])
+    reach = 0.5 * spectrum.pitch / np.array(spectrum.extent)
+
+    def loss(step: FloatArray) -> float:
+        return -_amplitudes(spectrum, weight, start + reach * step.reshape(-1, 2))[1]
+
+    found = minimize(loss, np.zeros(start.size), method="L-BFGS-B", bounds=[(-1, 1)] * start.size)
+    xi = start + reach * found.x.reshape(-1, 2)
+    z, _ = _amplitudes(spectrum, weight, xi)
+    return [_wave(*pair, spectrum.pitch) for pair in zip(xi, z, strict=True)]
+
+
+def explained_share(spectrum: Spectrum, waves: Sequence[PlaneWave | Peak]) -> float:
+    """Share of the field's square, under the Hann taper, that waves there describe together [-]."""
+    return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
+
+
+def _wave(xi: FloatArray, z: NDArray[np.complex128], pitch: float) -> PlaneWave:
+    """Split off the common phase of both components, and note what it leaves."""
+    angle = 0.5 * float(np.angle(np.sum(z**2)))
+    turned = z * np.exp(-1j * angle)
+    return PlaneWave(
+        k=(2 * float(xi[0]), 2 * float(xi[1])),
+        amplitude=(float(turned[0].real), float(turned[1].real)),
+        phase=angle / np.pi * pitch,
+        out_of_phase=float(np.linalg.norm(turned.imag) / np.linalg.norm(turned)),
+    )
+
+
+def _taper(spectrum: Spectrum) -> FloatArray:
+    """(q, p) Hann taper over the bounding box of the material."""
+    across, up = (
+        0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(c.size) + 0.5) / c.size)
+        for c in (spectrum.x, spectrum.y)
+    )
+    return np.asarray(np.outer(up, across), dtype=np.float64)
+
+
+def _amplitudes(
+    spectrum: Spectrum, taper: FloatArray, xi: FloatArray
+) -> tuple[NDArray[np.complex128], float]:
+    """Weighted least squares for given wave vectors.
+
+    Returns
+    -------
+    (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of the
+    field's weighted square that they explain.
+    """
+    # Products of sines and cosines are those of sums and differences of their wave vectors, and
+    # at a wave vector a sum over all bins is two small products of matrices.
+    tapered = taper[..., None] * spectrum.source
+    projected = np.array([_sum_over(spectrum, tapered, k) for k in xi])
+    pairs = xi[:, None] - xi[None, :], xi[:, None] + xi[None, :]
+    weight = (taper * spectrum.coverage)[..., None]
+    minus, plus = (
+        np.array([_sum_over(spectrum, weight, k)[0] for k in of.reshape(-1, 2)]).reshape(
+            len(xi), -1
+        )
+        for of in pairs
+    )
+    normal = 0.5 * np.block(
+        [[(minus - plus).real, (plus + minus).imag], [(plus - minus).imag, (minus + plus).real]]
+    )
+    right = np.concatenate([projected.imag, projected.real])
+    solution = np.linalg.solve(normal, right)
+    total = float(np.sum(tapered * spectrum.source))
+    explained = float(np.sum(solution * right)) / total
+    return solution[: len(xi)] + 1j * solution[len(xi) :], explained
+
+
+def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> NDArray[np.complex128]:
+    """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
+    angle_x, angle_y = 2 * np.pi / spectrum.pitch * xi
+    along_x, along_y = np.exp(1j * angle_x * spectrum.x), np.exp(1j * angle_y * spectrum.y)
+    # numpy would turn all values into complex ones.
+    up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
+    found: NDArray[np.complex128] = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
+    return found
+
+
+PEAK_SHARE = 0.02
+"""Least density of a candidate, of the largest peak's. A wave this weak is 14 % as strong, and
+what a fit over the holes' gaps can't tell from others only makes it ill-conditioned."""
+SAME_DENSITY = 0.02
+"""Relative difference of densities that are called equal, 1 % of the amplitude. Symmetric meshes
+reach 1e-7."""
+SAME_LENGTH = 1e-3
+"""Relative difference of wave numbers that are called equal: for lattices given with few digits."""
+GROWTH = 0.04
+"""A star of waves is worth its parameters if it explains this much more of the energy: it moves
+the material by a fifth of the field's amplitude."""
+LARGEST_CONDITION = 1e3
+"""Of the least-squares matrix of unit waves over the material. Beyond, two waves differ mostly in
+the holes, and their amplitudes grow and cancel each other in the material."""
+MOST_WAVES = 12
+"""The search ends here; it is longer than any family that can be identified from images."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The waves chosen, and how the energy explained grew with their number.
+
+    Parameters
+    ----------
+    xi
+        (w, 2) wave vectors [1/l].
+    amplitudes
+        (w, 2) complex z [unit of the field]: the waves' sum is Im Σ z exp(2πi ξ·x/l).
+    star
+        (w,) which of the stars each belongs to, from 0.
+    captured
+        Share of ∫ |u|² over the material that they explain [-].
+    growth
+        (number of waves, share), also beyond those chosen.
+    """
+
+    xi: FloatArray
+    amplitudes: ComplexArray
+    star: tuple[int, ...]
+    captured: float
+    growth: tuple[tuple[int, float], ...]
+
+    @property
+    def next_gain(self) -> float:
+        """What the next star would have explained in addition [-]; 0 if there is none left."""
+        later = [share for count, share in self.growth if count > len(self.xi)]
+        return later[0] - self.captured if later else 0.0
+
+
+class WaveFit:
+    """Least squares over the material with any of some plane waves.
+
+    Parameters
+    ----------
+    rule
+        Quadrature over the material.
+    field
+        (q, 2) what to fit, at its points, without mean.
+    xi
+        (c, 2) wave vectors of all candidates [1/l].
+    pitch
+        l [mm].
+    """
+
+    def __init__(
+        self, rule: MeshQuadrature, field: FloatArray, xi: FloatArray, pitch: float
+    ) -> None:
+        phases = 2.0 * np.pi / pitch * rule.positions @ xi.T
+        # The mean isn't the waves' business: a rigid translation is v0's.
+        basis = rule.without_mean(np.hstack([np.sin(phases), np.cos(phases)]))
+        weighted = rule.weights[:, None] * basis
+        self.count = len(xi)
+        self._gram, self._right = weighted.T @ basis, weighted.T @ field
+        self._size = np.sqrt(np.diag(self._gram))
+        self._energy = rule.product(field, field)
+
+    def solve(self, chosen: list[int]) -> tuple[ComplexArray, float, float]:
+        """Complex amplitudes (w, 2), share of the energy explained, condition number."""
+        rows = np.array(chosen + [k + self.count for k in chosen])
+        scale = self._size[rows]
+        gram = self._gram[np.ix_(rows, rows)] / np.outer(scale, scale)
+        right = self._right[rows] / scale[:, None]
+        solution = np.linalg.lstsq(gram, right, rcond=1e-13)[0]
+        share = float(np.sum(solution * right)) / self._energy
+        fit = solution / scale[:, None]
+        half = len(chosen)
+        return fit[:half] + 1j * fit[half:], share, float(np.linalg.cond(gram))
+
+
+def select_waves(
+    spectrum: LatticeSpectrum, rule: MeshQuadrature, field: FloatArray, growth: float = GROWTH
+) -> Selection:
+    """Add stars of waves until the next would explain less than ``growth`` of the energy.
+
+    Parameters
+    ----------
+    spectrum
+        Of the field.
+    rule
+        Quadrature over the material.
+    field
+        (q, 2) the field at its points, without mean.
+    growth
+        Least share of the energy that a further star must add [-].
+
+    Raises
+    ------
+    InputError
+        If ``growth`` is not between 0 and 1.
+    """
+    if not 0 < growth < 1:
+        raise InputError(f"mode family: expected a growth between 0 and 1, got {growth}")
+    stars = _stars(spectrum)
+    xi = np.array([wave for star in stars for wave in star])
+    fit = WaveFit(rule, field, xi, spectrum.pitch)
+    starts = np.cumsum([0] + [len(star) for star in stars])
+    left = {k: list(range(starts[k], starts[k + 1])) for k in range(len(stars))}
+    order, curve = _pursued(fit, left)
+    kept = 1
+    while kept < len(curve) and curve[kept][1] - curve[kept - 1][1] >= growth:
+        kept += 1
+    waves = [wave for star in order[:kept] for wave in star]
+    amplitudes, captured, _ = fit.solve(waves)
+    labels = tuple(s for s, star in enumerate(order[:kept]) for _ in star)
+    return Selection(xi[waves], amplitudes, labels, captured, tuple(curve))
+
+
+def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
+    """Peaks worth considering, those that symmetry may exchange together, from right to left."""
+    stars: list[list[LatticePeak]] = []
+    for peak in spectrum.peaks:
+        if peak.density < PEAK_SHARE * spectrum.peaks[0].density:
+            break
+        home = next((star for star in stars if _exchangeable(star[0], peak)), None)
+        if home is None:
+            stars.append([peak])
+        else:
+            home.append(peak)
+    return [
+        sorted((peak.xi for peak in star), key=lambda xi: np.arctan2(xi[1], xi[0]))
+        for star in stars
+    ]
+
+
+def _exchangeable(first: LatticePeak, other: LatticePeak) -> bool:
+    """Whether two peaks have the same density and the same wavelength."""
+    lengths = np.hypot(*first.xi), np.hypot(*other.xi)
+    same_length = abs(lengths[1] - lengths[0]) <= SAME_LENGTH * lengths[0]
+    return bool(same_length and other.density >= (1.0 - SAME_DENSITY) * first.density)
+
+
+def _pursued(
+    fit: WaveFit, left: dict[int, list[int]]
+) -> tuple[list[list[int]], list[tuple[int, float]]]:
+    """Stars in the order in which they explain most, and the share after each."""
+    order = [left.pop(0)]
+    curve = [(len(order[0]), fit.solve(order[0])[1])]
+    while True:
+        have = [wave for star in order for wave in star]
+        best, most = None, curve[-1][1]
+        for key, star in left.items():
+            if len(have) + len(star) > MOST_WAVES:
+                continue
+            _, share, condition = fit.solve(have + star)
+            if share > most and condition <= LARGEST_CONDITION:
+                best, most = key, share
+        if best is None:
+            return order, curve
+        order.append(left.pop(best))
+        curve.append((sum(len(star) for star in order), most))

@@ -1,1 +1,0 @@
-"""From images to an ansatz and a start, with no number typed."""

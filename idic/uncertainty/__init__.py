@@ -1,0 +1,1 @@
+"""Uncertainty: image noise, residual test, covariance of the unknowns, identifiability."""

@@ -1,0 +1,190 @@
+"""Identifiability: which unknowns and modes the images determine, and which they do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.idic.result import Result
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.scaled_eigen import ScaledEigen
+
+_POINTS = 4000  # at which displacements are compared
+_LISTED = 3  # combinations, and terms of each
+FINE = 5.0
+"""Where w is 2 px rms, IDIC is 0.25 px from the best fit with speckles of 12 px, 0.47 px with 0.7
+times that, and trapped with half of it (docs/studies.md, size of the speckle)."""
+OBSERVABLE = 2.0
+"""A mode counts as observed if v_i phi_i is that many times what the ansatz leaves over."""
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Unknowns that the images can hardly tell apart.
+
+    Parameters
+    ----------
+    eigenvalue
+        Of the column-scaled Gauss-Newton matrix, whose eigenvalues have the mean 1 [-].
+    terms
+        The largest parts: name of the unknown and its weight in the scaled eigenvector.
+    """
+
+    eigenvalue: float
+    terms: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        parts = " ".join(f"{weight:+.2f} {name}" for name, weight in self.terms)
+        return f"{parts} (eigenvalue {self.eigenvalue:.1e})"
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """How well a correlation's unknowns are determined.
+
+    Parameters
+    ----------
+    condition_number
+        Of the column-scaled Gauss-Newton matrix.
+    undetermined
+        Names of the unknowns that the images say nothing about.
+    worst
+        The worst-determined combinations of the others, the worst first.
+    overlap
+        For each mode the largest cosine between a displacement that its v_i and phi_i can make
+        and one that v0 can make [-]: 1 would mean that they can't be told apart.
+    leftover_px
+        What the ansatz leaves over, rms per component: residual over grey-level gradient [px].
+    amplitude_px
+        For each mode the rms of v_i phi_i per component [px].
+    speckle_px
+        Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known.
+    """
+
+    condition_number: float
+    undetermined: tuple[str, ...]
+    worst: tuple[Combination, ...]
+    overlap: tuple[float, ...]
+    leftover_px: float
+    amplitude_px: tuple[float, ...]
+    speckle_px: float = np.inf
+
+    @property
+    def unobservable(self) -> tuple[int, ...]:
+        """Numbers (from 0) of the modes that are too weak for phi_i to mean anything."""
+        least = OBSERVABLE * self.leftover_px
+        return tuple(i for i, size in enumerate(self.amplitude_px) if size < least)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know, one sentence each."""
+        said = [
+            f"phi{i + 1} is not observable: v{i + 1} phi{i + 1} is {self.amplitude_px[i]:.2g} px "
+            f"rms, what the ansatz leaves over about {self.leftover_px:.2g} px (before buckling "
+            "there is no pattern to measure); hold the mode fixed, or don't interpret it"
+            for i in self.unobservable
+        ]
+        if self.speckle_px < FINE * self.leftover_px:
+            said.append(
+                f"the speckle is {self.speckle_px:.2g} px wide, the ansatz leaves about "
+                f"{self.leftover_px:.2g} px over: speckles finer than {FINE:g} times that pull the "
+                "measurement away from the best fit, and finer than twice may trap it; spray "
+                "coarser, take pictures of fewer pixels, or blur them"
+            )
+        if self.undetermined:
+            names = ", ".join(self.undetermined[:_LISTED])
+            more = ", ..." if len(self.undetermined) > _LISTED else ""
+            said.append(
+                f"the images say nothing about {len(self.undetermined)} unknowns: {names}{more}"
+            )
+        return tuple(said)
+
+
+def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiability:
+    """Look at the Gauss-Newton matrix and at the displacements that the unknowns make.
+
+    Parameters
+    ----------
+    result
+        Of a correlation, or of a fit to a displacement (then ``leftover_px`` is its residual).
+    mask
+        (rows, cols) True on material; everywhere by default.
+
+    Raises
+    ------
+    InputError
+        If the mask is not of the images' size or has no material.
+    """
+    S, u = _sensitivities(result, mask)
+    ansatz, n_modes = result.ansatz, len(result.ansatz.modes)
+    v0 = S[:, : ansatz.v0_slice(1).stop]
+    overlaps = []
+    for i in range(n_modes):
+        own = np.hstack([S[:, ansatz.v_slice(i)], S[:, ansatz.phi_slice(i)]])
+        overlaps.append(float(np.linalg.svd(_orthonormal(v0).T @ _orthonormal(own))[1][0]))
+    px = result.grid.pixel_size
+    amplitudes = tuple(float(np.sqrt((u[i] ** 2).mean()) / px) for i in range(n_modes))
+    return Identifiability(
+        result.condition_number,
+        result.undetermined,
+        _worst(result),
+        tuple(overlaps),
+        _leftover_px(result),
+        amplitudes,
+        result.weighting.width_px,
+    )
+
+
+def _sensitivities(result: Result, mask: ArrayLike | None) -> tuple[FloatArray, list[FloatArray]]:
+    """At some points of the material: (2 p, n) du/da, and for each mode (p, 2) v_i phi_i [mm]."""
+    grid, a = result.grid, result.unknowns
+    inside = np.ones(grid.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+    if inside.shape != grid.shape or not inside.any():
+        raise InputError(
+            f"expected a mask of {grid.shape} px with some material, got shape {inside.shape} "
+            f"with {int(inside.sum())} px"
+        )
+    stride = max(1, int(np.sqrt(inside.sum() / _POINTS)))
+    row, col = (index * stride for index in np.nonzero(inside[::stride, ::stride]))
+    if not row.size:
+        row, col = np.nonzero(inside)
+    x, y = grid.x[col][:, None], grid.y[row][:, None]  # as columns: positions, not axes
+    S = result.ansatz.sensitivities(a, x, y)
+    modes = range(len(result.ansatz.modes))
+    u = [result.ansatz.fluctuation(i, a, x, y)[:, 0] for i in modes]
+    return S.reshape(-1, result.ansatz.size), u
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    """A basis of what the columns span; columns of nothing are left out."""
+    lengths = np.linalg.norm(columns, axis=0)
+    used = columns[:, lengths > 0] / lengths[lengths > 0]
+    left, sizes, _ = np.linalg.svd(used, full_matrices=False)
+    return np.asarray(left[:, sizes > 1e-10 * sizes.max(initial=0.0)])
+
+
+def _determined(result: Result) -> tuple[NDArray[np.intp], FloatArray]:
+    """Numbers of the determined unknowns, and the Gauss-Newton matrix of these."""
+    kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
+    return kept, np.asarray(np.linalg.inv(result.inverse[np.ix_(kept, kept)]), np.float64)
+
+
+def _worst(result: Result) -> tuple[Combination, ...]:
+    kept, matrix = _determined(result)
+    eigen = ScaledEigen.of(matrix)
+    found = []
+    for value, vector in zip(eigen.values[:_LISTED], eigen.vectors.T[:_LISTED], strict=True):
+        largest = np.argsort(-abs(vector))[:_LISTED]
+        vector = vector * np.sign(vector[largest[0]])
+        terms = tuple((result.names[kept[k]], float(vector[k])) for k in largest)
+        found.append(Combination(float(value), terms))
+    return tuple(found)
+
+
+def _leftover_px(result: Result) -> float:
+    """Residual over the rms gradient."""
+    gradient = np.sqrt(2.0 * result.slope_square)
+    return float(result.residual_rms / gradient) if gradient else np.inf

@@ -1,0 +1,261 @@
+"""Image noise, given, measured or estimated, and its propagation to residual and unknowns.
+
+A spline passes through every pixel, so that between pixels it is a weighted mean of their noise,
+and smoother: of variance 1 at pixels, of about 0.4 in the middle between four of them. Its slope's
+variance depends on the place likewise. And where the material has shrunk, fewer pixels of g look
+at the same material, so its noise weighs more: by 1/det F.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+
+_OTHER_STATE = 0.25
+"""Share of an exposure's variance that noise alone can hardly make: speckle has far more."""
+_MOTION = 2.0
+"""Times the noise that a single image shows, beyond which motion is the likelier cause."""
+
+
+GIVEN = "given"
+"""Source of a noise that the experiment's file states."""
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """White noise of each photograph.
+
+    Parameters
+    ----------
+    sd
+        Standard deviation over the material [grey levels].
+    source
+        Where it is known from, in words.
+    """
+
+    sd: float
+    source: str
+
+
+def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> CameraNoise:
+    """Measure the noise from exposures of one and the same state.
+
+    Half the variance of what is left of one when the other has been fitted to it by a gain and
+    an offset (the lamp may have flickered), pooled over neighbours in the series.
+
+    Parameters
+    ----------
+    images
+        Two or more of (rows, cols) [grey levels], the reference first.
+    mask
+        (rows, cols) True on material.
+
+    Raises
+    ------
+    InputError
+        If two exposures have so little in common that they are of different states.
+    """
+    halves = []
+    for number, (a, b) in enumerate(pairwise(images), start=1):
+        left, there = _residual_variance(a[mask], b[mask]), float(b[mask].var(dtype=np.float64))
+        if left > _OTHER_STATE * there:
+            raise InputError(
+                "images.repeats: expected exposures of the reference's state, got number "
+                f"{number}, {100 * left / there:.0f} % of whose variance the exposure before "
+                f"doesn't explain (a noise of {np.sqrt(0.5 * left):.3g} grey levels); leave it out"
+            )
+        halves.append(0.5 * left)
+    sd, seen = float(np.sqrt(np.mean(halves))), estimated_noise(images[0], mask).sd
+    source = f"measured from {len(images)} exposures of the reference"
+    if sd > _MOTION * seen:
+        source += (
+            f"; the reference's finest details show {seen:.2g} grey levels only: if anything "
+            "moved between the exposures, leave the repeats out"
+        )
+    return CameraNoise(sd, source)
+
+
+def _residual_variance(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Variance of b - gain a - offset at the best gain and offset."""
+    covariance = np.cov(a, b, dtype=np.float64)
+    return float(covariance[1, 1] - covariance[0, 1] ** 2 / covariance[0, 0])
+
+
+def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise:
+    """Estimate the noise from a single image, by what no smooth pattern shows.
+
+    The difference of two Laplacians weighs white noise by 6 and a pattern by (k_x k_y)^2, k its
+    wave number in rad/px. Too large where the speckles are of 2 px or so themselves.
+
+    Parameters
+    ----------
+    image
+        (rows, cols) [grey levels].
+    mask
+        (rows, cols) True on material.
+
+    References
+    ----------
+    J. Immerkaer, Comput. Vis. Image Underst. 64 (1996), doi 10.1006/cviu.1996.0060.
+    """
+    second = np.array([1.0, -2.0, 1.0])
+    details = ndimage.convolve(image.astype(np.float64), np.outer(second, second))
+    inner = ndimage.binary_erosion(mask, iterations=2)
+    sd = stats.median_abs_deviation(details[inner], scale="normal") / 6.0
+    return CameraNoise(
+        float(sd), "estimated from the finest details of the reference: two exposures measure it"
+    )
+
+
+_ACROSS = 128
+"""Rows and columns, at most, over which means are taken: displacements vary slowly."""
+_LEAST_DET = 0.1
+"""No material shrinks to less than that: what does is an iteration gone astray."""
+_PHASES = 64
+"""Positions between two pixels at which a spline's noise is tabulated."""
+
+
+@dataclass(frozen=True)
+class ImageNoise:
+    """White noise of the two images.
+
+    Parameters
+    ----------
+    reference, deformed
+        Standard deviations in f and in g [grey levels].
+
+    Raises
+    ------
+    InputError
+        If one is negative or not finite.
+    """
+
+    reference: float
+    deformed: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.reference < np.inf and 0.0 <= self.deformed < np.inf):
+            raise InputError(
+                "expected noise of 0 grey levels or more in each image, got "
+                f"{self.reference} and {self.deformed}"
+            )
+
+    @classmethod
+    def of(cls, value: ImageNoise | float) -> ImageNoise:
+        """The noise itself, or that of two images with the same."""
+        return value if isinstance(value, ImageNoise) else cls(float(value), float(value))
+
+
+@dataclass(frozen=True)
+class NoiseTransfer:
+    """What reaches the residual f(x) - g(x + u) of white noise of variance 1 in g.
+
+    Means over the pixels compared. The defaults are those of g sampled at its pixels.
+
+    Parameters
+    ----------
+    value
+        Variance of the interpolated noise [-].
+    slope
+        Variance of its slope along an axis [1/px^2].
+    density
+        1/det F: pixels of the reference that share a pixel of g [-].
+    """
+
+    value: float = 1.0
+    slope: float = 0.0
+    density: float = 1.0
+
+    @classmethod
+    def of(
+        cls, ansatz: Ansatz, a: FloatArray, grid: PixelGrid, mask: BoolArray, order: int
+    ) -> NoiseTransfer:
+        """Look where the pixels are mapped.
+
+        Parameters
+        ----------
+        ansatz, a
+            The kinematics and its (size,) unknowns.
+        grid, mask
+            The pixels, and (rows, cols) True on those compared.
+        order
+            Of the spline.
+        """
+        rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+        rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
+        some = mask[np.ix_(rows, cols)]
+        if not some.any():
+            return cls()
+        x, y = grid.x[cols], grid.y[rows]
+        u = ansatz.displacement(a, x, y)
+        # Whole pixels make no difference to where between pixels a position is.
+        along, down = (u[some][:, k] / grid.pixel_size % 1.0 for k in (0, 1))
+        (w_x, s_x), (w_y, s_y) = _variances(order, along), _variances(order, down)
+        h = 0.5 * grid.pixel_size
+        F_x, F_y = (
+            (ansatz.displacement(a, x + dx, y + dy) - ansatz.displacement(a, x - dx, y - dy))[some]
+            / (2.0 * h)
+            for dx, dy in ((h, 0.0), (0.0, h))
+        )
+        det = (1.0 + F_x[:, 0]) * (1.0 + F_y[:, 1]) - F_y[:, 0] * F_x[:, 1]
+        return cls(
+            float(np.mean(w_x * w_y)),
+            float(0.5 * np.mean(s_x * w_y + w_x * s_y)),
+            float(np.mean(1.0 / np.maximum(det, _LEAST_DET))),
+        )
+
+
+def slope_noise(order: int, blur_px: float) -> float:
+    """Variance at a pixel of the slope of white noise of variance 1, blurred first [1/px^2].
+
+    Parameters
+    ----------
+    order
+        Of the spline whose slope it is.
+    blur_px
+        Standard deviation of a Gaussian blur; from 0.6 px on that is 1/(8 pi s^4).
+    """
+    if blur_px > 0.0:
+        return float(1.0 / (8.0 * np.pi * blur_px**4))
+    return float(_variances(order, np.zeros(1))[1][0])
+
+
+def _variances(order: int, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variances of interpolated noise of variance 1 and of its slope, along one axis.
+
+    Parameters
+    ----------
+    order
+        Of the spline.
+    phase
+        Where between two pixels, 0 ... 1.
+    """
+    at = np.arange(_PHASES + 1) / _PHASES
+    value, slope = _table(order)
+    return np.interp(phase, at, value), np.interp(phase, at, slope)
+
+
+@cache
+def _table(order: int) -> tuple[FloatArray, FloatArray]:
+    """Both at the phases 0 ... 1: sums of squares of the spline through a single 1."""
+    reach = 24
+    impulse = np.zeros((2 * reach + 1, 2 * reach + 1))
+    impulse[reach, reach] = 1.0
+    spline = SplineImage.of(impulse, order, np.float64)
+    phase = np.arange(_PHASES + 1)[:, None] / _PHASES
+    col = phase + np.arange(4, 2 * reach - 4)
+    value, _, slope = spline.sample(float(reach), col)
+    return (value**2).sum(axis=1), (slope**2).sum(axis=1)

@@ -1,0 +1,272 @@
+"""What a camera makes of a specimen's state: lens, averaging pixels, exposure, files.
+
+Where pixels average over an aperture, the reference image is exact in Fourier space away from the
+edge of the material. A deformed image is summed over the points of a Gauss rule in each pixel of
+the *deformed* frame, each point found in the mesh and evaluated exactly; the rule has as many
+points as keep its error below :data:`TOLERANCE`. Near an edge, both images average evenly
+scattered points, some of them material and some background.
+
+The entry of an image in the sidecar of its set, besides the names of its files:
+
+``noise_sd``
+    Root mean square over the material of the camera image's predicted noise [fraction of full
+    scale].
+``saturated_px``, ``doubly_covered_px``
+    Material pixels at the highest level, and pixels inside more than one element, where the
+    specimen overlaps.
+``light``
+    If the light flickers: the factor on the irradiance.
+``quadrature``
+    If the sensor averages: points a pixel and their error's bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from modeharvest.fem.field import Mesh
+from modeharvest.imaging.distortion.undistort import Positions, seen_points
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import (
+    bezier_matrix,
+    monomial_gradients,
+    polynomials,
+    reference_element,
+    require_positive_jacobian,
+)
+from modeharvest.imaging.mapping.render_rows import render_rows_average
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.imaging.render import Rendering, render_seen
+from modeharvest.imaging.sensor import EDGE_POINTS, Aperture
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.arrays import BoolArray, FloatArray
+
+TOLERANCE = 1e-7  # of full scale, rms: its largest among millions of pixels stays below 1e-6
+_MOST_POINTS = 16  # a side
+
+
+@dataclass(frozen=True, eq=False)
+class ImagedState:
+    """A state of the specimen before a camera.
+
+    Parameters
+    ----------
+    mesh
+        The undeformed mesh.
+    displacement
+        (n, 2) at its nodes [mm]; None for the undeformed state.
+    grid
+        The pixels; the speckle's whole pixels are the grid's.
+    speckle, background
+        Intensity of the material and around it [fraction of full scale].
+    where
+        What to call the state in an error.
+    """
+
+    mesh: Mesh
+    displacement: FloatArray | None
+    grid: PixelGrid
+    speckle: Speckle
+    background: float
+    where: str = "mesh"
+
+    @property
+    def compression(self) -> float:
+        """How many times a length shrinks, at most, among the elements' centres [-]."""
+        if self.displacement is None:
+            return 1.0
+        mesh = self.mesh
+        middle = np.full(2, 1.0 / 3.0 if reference_element(mesh.element).triangular else 0.0)
+        slopes = monomial_gradients(middle)
+        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
+        after = polynomials(mesh.element, mesh.cells, mesh.nodes + self.displacement) @ slopes
+        stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
+        return float(1.0 / stretches.min())
+
+    def average(self, offsets: FloatArray, weights: FloatArray, wanted: BoolArray) -> FloatArray:
+        """(k,) weighted sum of the intensities at the k wanted pixels moved by each offset.
+
+        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
+        """
+        mesh = self.mesh
+        nodes = mesh.nodes + (0.0 if self.displacement is None else self.displacement)
+        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
+        reach = float(np.abs(offsets).max(initial=0.0))
+        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, wanted, reach)], mesh.element)
+        total = render_rows_average(
+            near, nodes, self.grid, self.speckle.spline, self.background, wanted, offsets, weights
+        )
+        return total[wanted]
+
+    def _reaching(self, nodes: FloatArray, wanted: BoolArray, reach: float) -> BoolArray:
+        """(m,) True for elements that may hold a point within ``reach`` px of a wanted pixel."""
+        element, shape = reference_element(self.mesh.element), self.grid.shape
+        control = bezier_matrix(element.triangular) @ element.coefficients
+        position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
+        hull = np.einsum("pk,mki->mpi", control, position)
+        low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
+        past = np.clip(np.ceil(hull.max(axis=1) + reach) + 1, 0, shape).astype(np.int64)
+        count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=np.int64)
+        count[1:, 1:] = wanted.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+        (top, left), (bottom, right) = low.T, past.T
+        inside = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
+        return np.asarray(inside > 0)
+
+
+@dataclass(frozen=True)
+class PixelQuadrature:
+    """How the pixels of an image were averaged.
+
+    Parameters
+    ----------
+    points
+        Points in each pixel away from the edges; 0: none needed, the average is exact.
+    rms_bound
+        Bound of their root-mean-square error on the pattern [fraction of full scale].
+    edge_points
+        Points in each pixel near an edge.
+    """
+
+    points: int
+    rms_bound: float
+    edge_points: int = EDGE_POINTS
+
+
+def integrate(
+    scene: ImagedState, aperture: Aperture, mask: BoolArray
+) -> tuple[FloatArray, PixelQuadrature]:
+    """(rows, cols) intensity averaged over every pixel's aperture, and how.
+
+    ``mask`` tells material (at pixel centres) from background.
+    """
+    near = near_edges(mask, aperture.reach_px)
+    inside = mask & ~near
+    image = np.full(mask.shape, scene.background)
+    if scene.displacement is None:
+        image[inside] = scene.speckle.image(aperture.transfer)[inside]
+        quadrature = PixelQuadrature(0, 0.0)
+    else:
+        side, bound = points_a_side(aperture, scene.speckle.spec, scene.compression)
+        nodes, weights = aperture.rule(side)
+        offsets = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+        pairs = np.asarray(np.outer(weights, weights).ravel(), dtype=np.float64)
+        image[inside] = scene.average(offsets, pairs, inside)
+        quadrature = PixelQuadrature(side**2, bound)
+    scattered = aperture.scattered()
+    even: FloatArray = np.full(len(scattered), 1.0 / len(scattered))
+    image[near] = scene.average(scattered, even, near)
+    return image, quadrature
+
+
+def near_edges(mask: BoolArray, reach_px: int) -> BoolArray:
+    """(rows, cols) True where material and background both lie within reach, rows or columns."""
+    size = 2 * reach_px + 1
+    dilated = ndimage.maximum_filter(mask, size, mode="nearest")
+    eroded = ndimage.minimum_filter(mask, size, mode="nearest")
+    return np.asarray(dilated & ~eroded)
+
+
+def points_a_side(
+    aperture: Aperture, pattern: SpeckleSpec, compression: float = 1.0
+) -> tuple[int, float]:
+    """How many points a side the Gauss rule needs, and the bound of its rms error.
+
+    A plane wave of the pattern is seen at up to ``compression`` times its frequency f. The rule
+    multiplies it by one factor, the exact average by another; by Parseval's theorem the rms
+    error is at most the largest of |difference of factors| times the blur's transfer function
+    at f, times the standard deviation of the pattern before its blur. The least number of
+    points is taken for which that is below TOLERANCE, but at most 16.
+    """
+    f = np.linspace(0.0, 0.5, 257)
+    blur = np.exp(-2.0 * (np.pi * pattern.blur_px * f) ** 2)
+    exact = aperture.transfer(compression * f)
+    contrast = 0.5 * (pattern.bright - pattern.dark)
+    bound = np.inf
+    for side in range(1, _MOST_POINTS + 1):
+        nodes, weights = aperture.rule(side)
+        ruled = np.cos(2.0 * np.pi * compression * np.outer(f, nodes)) @ weights
+        error = np.outer(ruled, ruled) - np.outer(exact, exact)
+        bound = contrast * float(np.abs(error * np.outer(blur, blur)).max())
+        if bound <= TOLERANCE:
+            break
+    return side, bound
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A lens and a sensor that expose images into a folder.
+
+    Parameters
+    ----------
+    spec
+        The sensor, its bits, the lens.
+    points
+        What the lens sees at its pixels; None of a perfect one.
+    folder
+        Where the images go.
+    """
+
+    spec: ImagingSpec
+    points: Positions | None
+    folder: Path
+
+    @classmethod
+    def of(cls, spec: ImagingSpec, shape: tuple[int, int], folder: Path) -> Camera:
+        """The camera of a specification, for images of (rows, cols) pixels."""
+        lens = spec.lens(shape)
+        return cls(spec, None if lens is None else seen_points(lens, shape), folder)
+
+    def expose(
+        self, ideal: Rendering, scene: ImagedState, name: str, mask_name: str
+    ) -> dict[str, Any]:
+        """Write what the camera makes of an image; return its entry in the sidecar.
+
+        Parameters
+        ----------
+        ideal
+            What a perfect lens shows.
+        scene
+            What there is to be seen.
+        name, mask_name
+            Of the image, and of its mask's file. The name also seeds noise and flicker.
+        """
+        seen = self._through_lens(ideal, scene)
+        sensor, bits, mask, irradiance = self.spec.sensor, self.spec.bits, seen.mask, seen.image
+        entry: dict[str, Any] = {}
+        if not sensor.aperture.is_point:
+            averaged, quadrature = integrate(scene, sensor.aperture, mask)
+            irradiance = averaged.astype(np.float32)
+            entry["quadrature"] = asdict(quadrature)
+        if sensor.flicker > 0.0:
+            irradiance = np.float32(sensor.light(name)) * irradiance
+            entry["light"] = sensor.light(name)
+        mean, levels = sensor.mean(irradiance), sensor.expose(irradiance, bits, name)
+        camera_name = f"{name}_{bits}bit.tif"
+        write_image(self.folder / f"{name}.tif", mean)
+        write_image(self.folder / camera_name, levels)
+        write_image(self.folder / mask_name, mask)
+        variance = sensor.noise_variance(mean[mask], bits)
+        return entry | {
+            "image": f"{name}.tif",
+            "camera_image": camera_name,
+            "mask": mask_name,
+            "noise_sd": float(np.sqrt(variance.mean())),
+            "saturated_px": sensor.saturated(levels[mask], bits),
+            "doubly_covered_px": seen.doubly_covered,
+        }
+
+    def _through_lens(self, ideal: Rendering, scene: ImagedState) -> Rendering:
+        """What the lens shows."""
+        if self.points is None:
+            return ideal
+        shown = render_seen(
+            scene.mesh, scene.displacement, scene.grid, self.points, scene.speckle,
+            scene.background, scene.where,
+        )  # fmt: skip
+        return replace(shown, doubly_covered=ideal.doubly_covered)

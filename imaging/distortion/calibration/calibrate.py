@@ -1,0 +1,301 @@
+"""Optical distortion from photographs of a speckled flat target that a stage has shifted.
+
+A distortion S makes a rigid shift t look like t + S(x + t) - S(x): the apparent motion varies
+over the image, and S follows from how. All photographs are fitted at once, grey level by grey
+level (:mod:`modeharvest.imaging.distortion.calibration.fit`); the shifts are found along with S.
+
+Source of the idea: Maraghechi et al. 2019, the paper's reference for S. The fit is this
+project's own.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from skimage.registration import phase_cross_correlation
+
+from modeharvest.imaging.distortion.calibration.fit import (
+    Fit,
+    Pose,
+    View,
+    fit_views,
+    normalised_illumination,
+    with_poses,
+)
+from modeharvest.imaging.distortion.calibration.model import PolynomialModel
+from modeharvest.imaging.distortion.calibration.result import (
+    Calibration,
+    calibration_of,
+    sampled_noise,
+)
+from modeharvest.imaging.photographs.files import require_contrast
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+
+_COARSE_PX = 512
+"""Size to which photographs are binned to find their shifts within some px."""
+_COARSE_DEGREE = 3
+_BORDER_PX = 4.0
+_MATCH = 0.5
+"""Photographs that correlate less with the others show something else."""
+_LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
+"""The longest shift has to be of 5 px, and they have to spread across it by 0.05 of that."""
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How to calibrate.
+
+    Parameters
+    ----------
+    degrees
+        Total degrees of S to compare, ascending, from 2 on, until the criterion has risen twice.
+    rotations
+        Whether the target may turn a little between photographs; only where shifts are not
+        known.
+    blurs_px
+        Blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
+        correlation and S leave; the last makes the spline's noise independent of where between
+        pixels it samples, which would else draw S towards half pixels.
+    points
+        About how many points of the target to look at; more lower the standard deviation.
+    order
+        Of the spline that samples the photographs: 5 or 3.
+    """
+
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
+    rotations: bool = True
+    blurs_px: tuple[float, ...] = (12.0, 6.0, 3.0, 0.7)
+    points: int = 100_000
+    order: int = 5
+
+    def __post_init__(self) -> None:
+        if not self.degrees or self.degrees[0] < 2 or list(self.degrees) != sorted(self.degrees):
+            raise InputError(f"expected ascending degrees from 2 on, got {self.degrees}")
+        if len(self.blurs_px) < 2 or min(self.blurs_px) < 0.0 or self.points < 1000:
+            raise InputError(
+                "expected two or more blurs of 0 px or more and at least 1000 points, got "
+                f"{self.blurs_px} and {self.points}"
+            )
+
+
+def calibrate(
+    images: Sequence[ArrayLike],
+    shifts: ArrayLike | None = None,
+    options: CalibrationOptions | None = None,
+    progress: Progress = silent,
+) -> Calibration:
+    """Find the distortion of a lens from photographs of one flat target in several positions.
+
+    Parameters
+    ----------
+    images
+        m >= 3 photographs (rows, cols), the target shifted in its plane along at least two
+        directions.
+    shifts
+        (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
+        goes into S. Not needed: without them the affine part of S can't be seen and is zero.
+    options
+        How.
+    progress
+        Told about every fit.
+
+    Raises
+    ------
+    InputError
+        If there are too few photographs, of different sizes, without speckle, of different
+        things, or without enough shifts.
+    """
+    options = options or CalibrationOptions()
+    photographs = _checked(images)
+    known = shifts is not None
+    start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
+    free = (not known, not known, not known and options.rotations)
+    report = _reporter(progress, len(options.blurs_px) + len(options.degrees))
+    coarse, fit = _coarse_fit(
+        photographs, normalised_illumination(photographs, start), free, options, report
+    )
+    _require_shifts(fit.poses)
+    _require_matches(fit)
+    trials, stride = _trials(photographs, coarse, fit, free, options, report)
+    _require_matches(min(trials, key=lambda trial: trial[1].bic)[1])
+    progress(1, 1, "calibrate")
+    return calibration_of(trials, known, sampled_noise(options.blurs_px[-1], options.order, stride))
+
+
+def _coarse_fit(
+    photographs: Sequence[NDArray[np.float32]],
+    poses: Sequence[Pose],
+    moving: tuple[bool, bool, bool],
+    options: CalibrationOptions,
+    report: Callable[[], None],
+) -> tuple[PolynomialModel, Fit]:
+    """Shifts and a cubic S from blurred photographs."""
+    rows, cols = photographs[0].shape
+    degree = min(_COARSE_DEGREE, options.degrees[-1])
+    model = PolynomialModel((rows, cols), degree, fixed=3 if moving[0] else 1)
+    c = model.start
+    for blur in options.blurs_px[:-1]:
+        # Where they don't match yet, a fit of the light would sooner wipe out the contrast.
+        views = _views(photographs, poses, (*moving, False, False), blur, options.order)
+        points, _ = _points((rows, cols), poses, options.points // 4)
+        fit = fit_views(model, c, views, points, tolerance_px=0.02, max_iterations=10)
+        c, poses = fit.coefficients, fit.poses
+        report()
+    return model, fit
+
+
+def _trials(
+    photographs: Sequence[NDArray[np.float32]],
+    model: PolynomialModel,
+    fit: Fit,
+    moving: tuple[bool, bool, bool],
+    options: CalibrationOptions,
+    report: Callable[[], None],
+) -> tuple[list[tuple[PolynomialModel, Fit]], float]:
+    """One fit a degree, the best one to the end; and the stride of the points [px]."""
+    free = (*moving, True, True)
+    views = _views(photographs, fit.poses, free, options.blurs_px[-1], options.order)
+    points, stride = _points(model.shape, fit.poses, options.points)
+    trials: list[tuple[PolynomialModel, Fit]] = []
+    c = fit.coefficients
+    for degree in options.degrees:
+        # Coefficients that a degree lacks keep the others from settling soon, and don't matter.
+        model, c = model.of_degree(c, degree)
+        fit = fit_views(model, c, views, points, tolerance_px=1e-3, max_iterations=6)
+        c, views = fit.coefficients, with_poses(views, fit.poses)
+        trials.append((model, fit))
+        report()
+        if _has_risen_twice([fit.bic for _, fit in trials]):
+            break
+    best = int(np.argmin([fit.bic for _, fit in trials]))
+    model, fit = trials[best]
+    settled = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
+    trials[best] = model, settled
+    return trials, stride
+
+
+def _checked(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
+    if len(images) < 3:
+        raise InputError(
+            "expected a calibration set of at least 3 photographs, shifted along two directions, "
+            f"got {len(images)}: a calibration set without enough shifts"
+        )
+    found = [np.asarray(image, dtype=np.float32) for image in images]
+    for n, image in enumerate(found):
+        if image.ndim != 2 or image.shape != found[0].shape or min(image.shape) < 64:
+            raise InputError(
+                "expected calibration photographs of one size, at least 64 x 64 px, got "
+                f"{image.shape} for number {n + 1} and {found[0].shape} for number 1"
+            )
+        if not np.isfinite(image).all():
+            raise InputError(f"expected finite grey levels in calibration photograph {n + 1}")
+        require_contrast(image, f"calibration photograph {n + 1},")
+    return found
+
+
+def _given(shifts: ArrayLike | None, count: int) -> FloatArray:
+    found = np.asarray(shifts, dtype=np.float64)
+    if found.shape != (count, 2) or not np.isfinite(found).all():
+        raise InputError(
+            f"expected {count} finite shifts (row, col) [px], one for each calibration "
+            f"photograph, got shape {found.shape}"
+        )
+    relative: FloatArray = found - found[0]
+    return relative
+
+
+def _rough_shifts(photographs: Sequence[NDArray[np.float32]]) -> FloatArray:
+    """(m, 2) shifts since the first photograph [px], within some px, from binned photographs."""
+    factor = max(1, max(photographs[0].shape) // _COARSE_PX)
+    register: Any = phase_cross_correlation  # which has no types
+    small = [_binned(image, factor) for image in photographs]
+    everywhere = np.ones(small[0].shape, dtype=np.bool_)
+    found = np.zeros((len(small), 2))
+    for n, image in enumerate(small[1:], start=1):
+        found[n] = -register(
+            small[0], image, reference_mask=everywhere, moving_mask=everywhere, overlap_ratio=0.2
+        )[0]
+    return found * factor
+
+
+def _binned(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    rows, cols = (n // factor for n in image.shape)
+    blocks = image[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _views(
+    photographs: Sequence[NDArray[np.float32]],
+    poses: Sequence[Pose],
+    free: tuple[bool, ...],
+    blur: float,
+    order: int,
+) -> list[View]:
+    """Photographs as splines; the first one stays where it is."""
+    views = []
+    for n, (image, pose) in enumerate(zip(photographs, poses, strict=True)):
+        blurred = ndimage.gaussian_filter(image, blur) if blur > 0.0 else image
+        own = free if n else (False,) * 5
+        spline = SplineImage.of(blurred, order)
+        views.append(View(spline, pose, own, border_px=max(_BORDER_PX, blur)))
+    return views
+
+
+def _points(
+    shape: tuple[int, ...], poses: Sequence[Pose], count: int
+) -> tuple[tuple[FloatArray, FloatArray], float]:
+    """Even grid of ideal positions that any photograph may show, about ``count`` in each.
+
+    Returns ((rows, columns), stride) [px].
+    """
+    shifts = np.array([pose.shift for pose in poses])
+    low, high = -shifts.max(axis=0) - 20.0, np.array(shape) - shifts.min(axis=0) + 20.0
+    stride = max(1.0, float(np.sqrt(np.prod(shape) / count)))
+    axes = [np.arange(a, b, stride) for a, b in zip(low, high, strict=True)]
+    row, col = np.meshgrid(*axes, indexing="ij")
+    return (row.ravel(), col.ravel()), stride
+
+
+def _reporter(progress: Progress, steps: int) -> Callable[[], None]:
+    done = itertools.count(1)
+
+    def report() -> None:
+        progress(next(done), steps, "calibrate")
+
+    return report
+
+
+def _has_risen_twice(values: Sequence[float]) -> bool:
+    return len(values) > 2 and values[-3] < values[-2] < values[-1]
+
+
+def _require_matches(fit: Fit) -> None:
+    worst = int(np.argmin(fit.matches))
+    if fit.matches[worst] < _MATCH:
+        raise InputError(
+            "expected calibration photographs of one target, shifted in its plane, got number "
+            f"{worst + 1} whose grey levels correlate with the others' by "
+            f"{fit.matches[worst]:.2f} only; leave it out, or give the shifts"
+        )
+
+
+def _require_shifts(poses: Sequence[Pose]) -> None:
+    """Raise InputError unless the shifts span the plane: S can't be told from them otherwise."""
+    shifts = np.array([pose.shift for pose in poses])
+    along, across = np.linalg.svd(shifts, compute_uv=False)
+    longest = float(np.hypot(*shifts.T).max())
+    if longest < _LEAST_SHIFT or across < _LEAST_BREADTH * along:
+        raise InputError(
+            f"expected shifts of {_LEAST_SHIFT:g} px or more along two directions, got "
+            f"{longest:.1f} px at most and {across / max(along, 1e-9):.3f} as much across: "
+            "a calibration set without enough shifts; photograph the target shifted both ways"
+        )

@@ -1,0 +1,316 @@
+"""A distortion that makes several photographs of one flat target agree, by least squares.
+
+Photograph i shows the ideal position x of the target's pattern at phi_S(T_i(x)), T_i a rigid
+motion. The pattern P(x) is not known; the minimum over P of sum_i (c_i I_i(phi_S(T_i x)) + o_i -
+P(x))^2 is at the mean of those photographs that show x, so what is minimised is the scatter about
+it. No photograph is privileged, noise in different photographs stays independent, and the
+covariance of the unknowns is sigma^2 M^-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.imaging.distortion.calibration.model import DistortionModel
+from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.scaled_eigen import ScaledEigen
+
+POSE_UNKNOWNS = 5
+"""Of a photograph: shift along rows and columns, rotation, contrast, brightness."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the target is in a photograph, and how bright that is.
+
+    T(x) = centre + R (x - centre) + shift, a small rotation from the columns' to the rows' axis.
+
+    Parameters
+    ----------
+    shift
+        (row, col) [px].
+    angle
+        Rotation [rad].
+    contrast, brightness
+        c and o: c I + o is as bright as the first photograph.
+    """
+
+    shift: tuple[float, float] = (0.0, 0.0)
+    angle: float = 0.0
+    contrast: float = 1.0
+    brightness: float = 0.0
+
+    def stepped(self, step: FloatArray) -> Pose:
+        """Add the five unknowns' changes."""
+        return Pose(
+            (self.shift[0] + float(step[0]), self.shift[1] + float(step[1])),
+            self.angle + float(step[2]),
+            self.contrast + float(step[3]),
+            self.brightness + float(step[4]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A photograph and what is unknown of it.
+
+    Parameters
+    ----------
+    spline
+        The photograph.
+    pose
+        Where the target is in it.
+    free
+        (5,) whether shift (2), rotation, contrast and brightness are unknown.
+    distorted
+        False if the photograph has no distortion, as one of a known pair.
+    border_px
+        Width of the margin that is left out: spline and blur know only its mirror image [px].
+    """
+
+    spline: SplineImage
+    pose: Pose = field(default_factory=Pose)
+    free: tuple[bool, ...] = (False,) * POSE_UNKNOWNS
+    distorted: bool = True
+    border_px: float = 4.0
+
+
+def with_poses(views: Sequence[View], poses: Sequence[Pose]) -> list[View]:
+    """The same views, in other poses."""
+    return [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
+
+
+def normalised_illumination(
+    images: Sequence[NDArray[np.float32]], shifts: FloatArray | None = None
+) -> list[Pose]:
+    """Poses with (m, 2) shifts [px] that give all images the mean and spread of the first one."""
+    mean, spread = float(images[0].mean(dtype=np.float64)), float(images[0].std(dtype=np.float64))
+    poses = []
+    for n, image in enumerate(images):
+        contrast = spread / float(image.std(dtype=np.float64))
+        brightness = mean - contrast * float(image.mean(dtype=np.float64))
+        row, col = (0.0, 0.0) if shifts is None else shifts[n]
+        poses.append(Pose((float(row), float(col)), 0.0, contrast, brightness))
+    return poses
+
+
+_CHUNK = 4096
+"""Points that are looked at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where the least squares ended.
+
+    Parameters
+    ----------
+    coefficients
+        (k,) of the model.
+    poses
+        One a view.
+    inverse
+        (K, K) inverse of the normal matrix: of the coefficients, then of each view's unknowns.
+    free
+        (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
+    sum_of_squares, freedom
+        Scatter about the mean [grey levels squared], and its degrees of freedom.
+    matches
+        (views,) correlation of each photograph with the mean of the others [-].
+    iterations, converged
+        How many steps, and whether the last one was short enough.
+    condition_number
+        Of the normal matrix, scaled to a unit diagonal.
+    """
+
+    coefficients: FloatArray
+    poses: tuple[Pose, ...]
+    inverse: FloatArray
+    free: NDArray[np.bool_]
+    sum_of_squares: float
+    freedom: int
+    matches: FloatArray
+    iterations: int
+    converged: bool
+    condition_number: float
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the scatter, the noise as the spline passes it [grey levels squared]."""
+        return self.sum_of_squares / self.freedom
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion: N log(residual^2) + unknowns log N for N values."""
+        unknowns, values = len(self.inverse), self.freedom + len(self.inverse)
+        return float(values * np.log(self.sum_of_squares / values) + unknowns * np.log(values))
+
+
+def fit_views(
+    model: DistortionModel,
+    c: FloatArray,
+    views: Sequence[View],
+    points: tuple[FloatArray, FloatArray],
+    tolerance_px: float = 1e-5,
+    max_iterations: int = 30,
+) -> Fit:
+    """Find the model's coefficients and the views' poses by Gauss-Newton.
+
+    Parameters
+    ----------
+    model, c
+        The distortions to choose from, and (k,) coefficients to begin with.
+    views
+        Photographs with the poses to begin with.
+    points
+        (n,) rows and columns of ideal positions to look at [px].
+    tolerance_px
+        Largest change of S or of a shift [px] at which to stop.
+    max_iterations
+        The most steps.
+    """
+    poses = [view.pose for view in views]
+    free = np.array([view.free for view in views])
+    half_size = 0.5 * max(views[0].spline.shape)
+    px = np.array([1.0, 1.0, half_size, 0.0, 0.0])
+    iterations = 0
+    while iterations < max_iterations:
+        iterations += 1
+        equations = _assemble(model, c, views, poses, points)
+        eigen = ScaledEigen.of(equations.matrix)
+        step = -eigen.solve(equations.gradient)
+        own = np.zeros(free.shape)
+        own[free] = step[len(c) :]
+        c = c + step[: len(c)]
+        poses = [pose.stepped(change) for pose, change in zip(poses, own, strict=True)]
+        length = max(np.abs(step[: len(c)] / model.scale).max(), np.abs(own * px).max())
+        if length < tolerance_px:
+            break
+    return Fit(
+        coefficients=c,
+        poses=tuple(poses),
+        inverse=eigen.inverse(),
+        free=free,
+        sum_of_squares=equations.sum_of_squares,
+        freedom=max(1, equations.freedom - len(step)),
+        matches=equations.matches,
+        iterations=iterations,
+        converged=bool(length < tolerance_px),
+        condition_number=eigen.condition_number,
+    )
+
+
+@dataclass
+class _Equations:
+    matrix: FloatArray
+    gradient: FloatArray
+    sum_of_squares: float
+    freedom: int
+    matches: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewSample:
+    """A view at some points: grey levels v and their derivatives, 0 where it doesn't show them."""
+
+    inside: NDArray[np.bool_]
+    value: FloatArray
+    columns: FloatArray
+
+
+def _assemble(
+    model: DistortionModel,
+    c: FloatArray,
+    views: Sequence[View],
+    poses: Sequence[Pose],
+    points: tuple[FloatArray, FloatArray],
+) -> _Equations:
+    """Normal equations of the scatter about the mean, chunk by chunk."""
+    k = len(c)
+    last = k + np.cumsum([sum(view.free) for view in views])
+    where = [
+        np.r_[np.arange(k), np.arange(end - sum(view.free), end)]
+        for view, end in zip(views, last, strict=True)
+    ]
+    size = int(last[-1])
+    matrix, gradient = np.zeros((size, size)), np.zeros(size)
+    squares, freedom = 0.0, 0
+    sums = np.zeros((len(views), 6))  # what each view's correlation with the mean needs
+    distortion = model.distortion(c)
+    for first in range(0, points[0].size, _CHUNK):
+        row, col = (a[first : first + _CHUNK] for a in points)
+        samples = [
+            _sample(model, c, distortion, view, pose, row, col)
+            for view, pose in zip(views, poses, strict=True)
+        ]
+        count = np.sum([sample.inside for sample in samples], axis=0)
+        weight = 1.0 / np.maximum(count, 1)
+        mean = weight * np.sum([sample.value for sample in samples], axis=0)
+        seen = count > 1
+        total = np.zeros((size, row.size))
+        for n, (sample, at) in enumerate(zip(samples, where, strict=True)):
+            used = sample.inside & seen
+            deviation = np.where(used, sample.value - mean, 0.0)
+            columns = sample.columns * used
+            matrix[np.ix_(at, at)] += columns @ columns.T
+            gradient[at] += columns @ deviation
+            total[at] += columns
+            squares += float(deviation @ deviation)
+            others = (mean * count - sample.value)[used] / (count[used] - 1)
+            sums[n] += _moments(sample.value[used], others)
+        matrix -= (total * weight) @ total.T
+        freedom += int((count[seen] - 1).sum())
+    return _Equations(matrix, gradient, squares, freedom, _correlations(sums))
+
+
+def _sample(
+    model: DistortionModel,
+    c: FloatArray,
+    distortion: Distortion,
+    view: View,
+    pose: Pose,
+    row: FloatArray,
+    col: FloatArray,
+) -> _ViewSample:
+    rows, cols = view.spline.shape
+    arm_row, arm_col = row - 0.5 * (rows - 1), col - 0.5 * (cols - 1)
+    cos, sin = np.cos(pose.angle), np.sin(pose.angle)
+    at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]
+    at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + pose.shift[1]
+    seen_row, seen_col = distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
+    border = view.border_px
+    inside = (seen_row >= border) & (seen_row <= rows - 1 - border)
+    inside &= (seen_col >= border) & (seen_col <= cols - 1 - border)
+    value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
+    value[inside], d_row[inside], d_col[inside] = view.spline.sample(
+        seen_row[inside], seen_col[inside]
+    )
+    slope = pose.contrast * np.stack([d_row, d_col])
+    columns = np.zeros((len(c) + POSE_UNKNOWNS, row.size))
+    if view.distorted:
+        s_row, s_col = model.sensitivities(c, at_row, at_col)
+        columns[: len(c)] = slope[0] * s_row + slope[1] * s_col
+        slope = slope + np.einsum("i...,ij...->j...", slope, distortion.gradient(at_row, at_col))
+    turn_row, turn_col = -sin * arm_row - cos * arm_col, cos * arm_row - sin * arm_col
+    columns[len(c) :] = [*slope, slope[0] * turn_row + slope[1] * turn_col, value, inside]
+    kept = np.r_[np.ones(len(c), np.bool_), view.free]
+    levelled = np.where(inside, pose.contrast * value + pose.brightness, 0.0)
+    return _ViewSample(inside, levelled, columns[kept])
+
+
+def _moments(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a.size, a.sum(), b.sum(), a @ a, b @ b, a @ b])
+
+
+def _correlations(sums: FloatArray) -> FloatArray:
+    """Correlation coefficients from sums over 1, a, b, a^2, b^2, a b; 0 without points."""
+    n, a, b, aa, bb, ab = sums.T
+    n = np.maximum(n, 1.0)
+    spread = np.sqrt(np.maximum((aa / n - (a / n) ** 2) * (bb / n - (b / n) ** 2), 0.0))
+    covariance = ab / n - a * b / n**2
+    return np.where(spread > 0.0, covariance / np.where(spread > 0.0, spread, 1.0), 0.0)

@@ -1,0 +1,216 @@
+"""A lens from two images of one scene, without and with its distortion.
+
+Such pairs are made in a computer, or by two lenses one of which is ideal. The target doesn't move,
+so all of S can be seen, its affine part included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.optimize import least_squares
+
+from modeharvest.imaging.distortion.calibration.fit import (
+    Fit,
+    Pose,
+    View,
+    fit_views,
+    normalised_illumination,
+)
+from modeharvest.imaging.distortion.calibration.model import (
+    CameraModel,
+    DistortionModel,
+    PolynomialModel,
+)
+from modeharvest.imaging.distortion.calibration.result import sampled_noise
+from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion
+from modeharvest.imaging.photographs.files import require_contrast
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+_BLURS_PX = (12.0, 6.0, 3.0, 0.7)
+_COARSE_POINTS, _COARSE_DEGREE = 30_000, 3
+_MARGIN_PX = 8.0
+"""Nearer to the edge of the image blur and spline see beyond the edge of the scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecoveredLens:
+    """A lens as found from a pair.
+
+    Parameters
+    ----------
+    distortion
+        What the model made of it.
+    coefficients, covariance
+        (k,) and (k, k) of the model's unknowns.
+    model
+        Which these are.
+    match
+        Correlation of the images once the distortion is taken out [-].
+    noise_sd
+        Of an image, from what is left over [grey levels].
+    bic
+        Bayesian information criterion; of two models of one pair take that with the lower one.
+    sentence
+        What was found.
+    """
+
+    distortion: Distortion
+    coefficients: FloatArray
+    covariance: FloatArray
+    model: DistortionModel
+    match: float
+    noise_sd: float
+    bic: float
+    sentence: str
+
+    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Standard deviation of S along rows and columns [px] at ideal positions [px]."""
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
+        variance = np.einsum("ckn,kl,cln->cn", columns, self.covariance, columns)
+        along_row, along_col = np.sqrt(np.maximum(variance, 0.0)).reshape(2, *row.shape)
+        return along_row, along_col
+
+
+def recover_camera(
+    undistorted: ArrayLike,
+    distorted: ArrayLike,
+    model: DistortionModel | None = None,
+    mask: ArrayLike | None = None,
+    points: int = 200_000,
+    order: int = 5,
+) -> RecoveredLens:
+    """Find the lens that shows the scene of one image as another.
+
+    Parameters
+    ----------
+    undistorted, distorted
+        (rows, cols) grey levels of one scene.
+    model
+        What the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
+        ``fixed=0``. By default an OpenCV camera with unknown cx, cy, k1, k2, k3; its focal length
+        is taken as the larger size of the image, because another f with other k is the same S.
+    mask
+        (rows, cols) where the undistorted image counts.
+    points
+        About how many pixels to look at.
+    order
+        Of the spline that samples the images: 5 or 3.
+
+    Raises
+    ------
+    InputError
+        If sizes differ, an image is blank, or the images don't show the same scene.
+    """
+    images = [np.asarray(image, dtype=np.float32) for image in (undistorted, distorted)]
+    _require_pair(images)
+    rows, cols = images[0].shape
+    model = model or _unknown_camera(rows, cols)
+    # Far from the solution a cubic is led less astray than a camera or a high degree.
+    coarse: DistortionModel = PolynomialModel((rows, cols), _COARSE_DEGREE, fixed=0)
+    c, poses = coarse.start, normalised_illumination(images)
+    for blur in _BLURS_PX[:-1]:
+        at, _ = _points(rows, cols, _COARSE_POINTS, mask)
+        fit = fit_views(coarse, c, _views(images, poses, blur, order, False), at, 0.02, 10)
+        c = fit.coefficients
+    at, stride = _points(rows, cols, points, mask)
+    c = _nearest(model, coarse.distortion(c), (rows, cols))
+    views = _views(images, poses, _BLURS_PX[-1], order, True)
+    fit = fit_views(model, c, views, at, tolerance_px=1e-5)
+    return _recovered(model, fit, sampled_noise(_BLURS_PX[-1], order, stride))
+
+
+def _views(
+    images: list[NDArray[np.float32]], poses: Sequence[Pose], blur: float, order: int, light: bool
+) -> list[View]:
+    """The image without and that with distortion; of the latter the light may change."""
+    ideal, seen = (SplineImage.of(ndimage.gaussian_filter(i, blur), order) for i in images)
+    free = (False, False, False, light, light)
+    return [View(ideal, poses[0], distorted=False), View(seen, poses[1], free)]
+
+
+def _nearest(model: DistortionModel, distortion: Distortion, shape: tuple[int, int]) -> FloatArray:
+    """Coefficients with which a model comes nearest to a distortion over the image."""
+    axes = [np.linspace(0.0, n - 1.0, 21) for n in shape]
+    row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    wanted = np.stack(distortion.shift(row, col))
+    scale = model.scale
+
+    def misfit(scaled: FloatArray) -> FloatArray:
+        return (np.stack(model.distortion(scaled * scale).shift(row, col)) - wanted).ravel()
+
+    def slope(scaled: FloatArray) -> FloatArray:
+        columns = model.sensitivities(scaled * scale, row, col) * scale[:, None]
+        return np.asarray(np.moveaxis(columns, 1, -1).reshape(-1, scale.size))
+
+    found = least_squares(misfit, model.start / scale, slope, method="lm")
+    return np.asarray(found.x * scale)
+
+
+def _unknown_camera(rows: int, cols: int) -> CameraModel:
+    focal = float(max(rows, cols))
+    return CameraModel(CameraDistortion(focal, focal, 0.5 * (cols - 1), 0.5 * (rows - 1)))
+
+
+def _require_pair(images: list[NDArray[np.float32]]) -> None:
+    first, second = images
+    if first.ndim != 2 or first.shape != second.shape or min(first.shape) < 64:
+        raise InputError(
+            "expected two images of one size, at least 64 x 64 px, got "
+            f"{first.shape} without and {second.shape} with distortion"
+        )
+    for image, what in zip(images, ("undistorted", "distorted"), strict=True):
+        if not np.isfinite(image).all():
+            raise InputError(f"expected finite grey levels in the {what} image")
+        require_contrast(image, what)
+
+
+def _points(
+    rows: int, cols: int, count: int, mask: ArrayLike | None
+) -> tuple[tuple[FloatArray, FloatArray], float]:
+    """Pixels of the undistorted image to look at, and their stride [px]."""
+    stride = max(1, round(np.sqrt(rows * cols / count)))
+    axes: list[FloatArray] = [np.arange(_MARGIN_PX, n - _MARGIN_PX, stride) for n in (rows, cols)]
+    row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    if mask is not None:
+        inside = np.asarray(mask, dtype=np.bool_)
+        if inside.shape != (rows, cols) or not inside.any():
+            raise InputError(
+                f"expected a mask of {rows} x {cols} px with something in it, got {inside.shape}"
+            )
+        kept = inside[row.astype(np.intp), col.astype(np.intp)]
+        return (row[kept], col[kept]), float(stride)
+    return (row, col), float(stride)
+
+
+def _recovered(model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> RecoveredLens:
+    if fit.matches.min() < 0.5 or not fit.converged:
+        raise InputError(
+            "expected two images of one scene, without and with distortion, got a pair whose grey "
+            f"levels correlate by {fit.matches.min():.2f} only; check the files, or try another "
+            "model"
+        )
+    one, many = noise
+    k = len(fit.coefficients)
+    lens = model.distortion(fit.coefficients)
+    covariance = fit.inverse[:k, :k] * (fit.variance * many / one)
+    noise_sd = float(np.sqrt(fit.variance / one))
+    what = "a camera" if isinstance(model, CameraModel) else "a polynomial"
+    if isinstance(model, PolynomialModel):
+        what += f" of degree {model.degree}"
+    sentence = (
+        f"The distorted image is the undistorted one through {what} with {k} unknowns; what is "
+        f"left is like a noise of {noise_sd:.3g} grey levels in each (correlation "
+        f"{fit.matches.min():.5f})."
+    )
+    return RecoveredLens(
+        lens, fit.coefficients, covariance, model, float(fit.matches.min()), noise_sd, fit.bic,
+        sentence,
+    )  # fmt: skip

@@ -1,0 +1,271 @@
+"""A calibrated distortion: S, the choice of its degree, its covariance, and what can't be observed.
+
+The noise of a photograph follows from the residual by what becomes of white noise where a blurred
+image is sampled between its pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from modeharvest.imaging.distortion.calibration.fit import Fit
+from modeharvest.imaging.distortion.calibration.model import PolynomialModel
+from modeharvest.imaging.distortion.lens import PolynomialDistortion
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import FloatArray
+
+_FINE = 16
+"""Samples per px of the response to a single noisy pixel."""
+
+
+def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, float]:
+    """Variance of a sample, and of the mean of many samples, of white noise of variance 1.
+
+    Parameters
+    ----------
+    blur_px
+        Standard deviation of the blur before the spline [px].
+    order
+        Of the spline, 3 or 5.
+    stride_px
+        Distance between samples along rows and columns [px].
+
+    Returns
+    -------
+    one, many
+        Mean variance of a sample over all positions between pixels; and that times how much
+        neighbouring samples have in common: the variance that a field sees that varies slowly
+        from sample to sample. ``many`` is 1 for a stride of 1 px: no information is lost there.
+    """
+    lags, correlations = _correlations(blur_px, order, stride_px)
+    one = float(correlations[lags == 0.0].sum())
+    return one**2, float(correlations.sum()) ** 2
+
+
+def undistorted_noise(order: int = 5) -> tuple[float, float]:
+    """Variance of white noise of variance 1 in an undistorted image, and where that is sampled.
+
+    The residual of a correlation of two undistorted images holds the first of f and the second of
+    g: its variance is their sum times that of the camera's noise. The unknowns see slower waves,
+    of which no noise is lost: their covariance is that of the camera's noise itself.
+
+    Parameters
+    ----------
+    order
+        Of both splines, 3 or 5.
+    """
+    _, correlations = _correlations(0.0, order, 1.0)
+    once = float(correlations.max())
+    # Sampling noise with correlations R at a phase that is anything: sum over lags of R R.
+    return once**2, float((correlations**2).sum()) ** 2
+
+
+def _correlations(
+    blur_px: float, order: int, stride_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lags [px] along an axis, and covariances of sampled noise at them."""
+    reach = int(np.ceil(16 + 6 * blur_px))
+    impulse = np.zeros((24, 2 * reach + 1))
+    impulse[:, reach] = 1.0  # a line, so that the other axis has no say
+    if blur_px > 0.0:
+        impulse = ndimage.gaussian_filter1d(impulse, blur_px, axis=1)
+    along = np.arange(2 * reach * _FINE) / _FINE
+    response, _, _ = SplineImage.of(impulse, order, np.float64).sample(12.0, along)
+    count = int(reach / stride_px)
+    lags = stride_px * np.arange(-count, count + 1, dtype=np.float64)
+    shifted = np.interp(along + lags[:, None], along, response, left=0.0, right=0.0)
+    correlations: NDArray[np.float64] = shifted @ response / _FINE
+    return lags, correlations
+
+
+@dataclass(frozen=True)
+class DegreeTrial:
+    """What a degree of S gave.
+
+    Parameters
+    ----------
+    degree, unknowns
+        Total degree; number of all unknowns.
+    residual_rms
+        Scatter of the photographs about their mean [grey levels].
+    bic
+        Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
+        for N values; the degree with 0 is taken [-].
+    change_px
+        Rms per component over the image by which S differs from the degree before [px].
+    sd_px
+        Rms per component over the image of S's standard deviation [px].
+    """
+
+    degree: int
+    unknowns: int
+    residual_rms: float
+    bic: float
+    change_px: float
+    sd_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A lens's distortion as found, and how well.
+
+    Parameters
+    ----------
+    distortion
+        S, without the part that cannot be observed (see ``sentences``).
+    shifts, shifts_sd
+        (m, 2) motion of the target since the first photograph, along rows and columns [px], and
+        its standard deviation; 0 where given.
+    angles, angles_sd
+        (m,) its rotation, from the columns' to the rows' axis [rad], and its standard deviation.
+    trials
+        One for each degree.
+    noise_sd
+        Noise of a photograph, estimated from what is left over [grey levels].
+    matches
+        (m,) correlation of each photograph with the mean of the others [-].
+    covariance
+        (n, n) of S's unknown coefficients [px^2], those of the rows' component first.
+    fixed
+        How many terms of each component could not be seen and are zero.
+    sentences
+        What was found, and what could not be.
+    """
+
+    distortion: PolynomialDistortion
+    shifts: FloatArray
+    shifts_sd: FloatArray
+    angles: FloatArray
+    angles_sd: FloatArray
+    trials: tuple[DegreeTrial, ...]
+    noise_sd: float
+    matches: FloatArray
+    covariance: FloatArray
+    fixed: int
+    sentences: tuple[str, ...] = field(default=())
+
+    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Standard deviation of S along rows and columns [px] at ideal positions [px].
+
+        That of the photographs' noise; what a polynomial of this degree can't follow is not in it.
+        """
+        return _sd(self.distortion, self.covariance, self.fixed, row, col)
+
+
+def calibration_of(
+    trials: Sequence[tuple[PolynomialModel, Fit]], known: bool, noise: tuple[float, float]
+) -> Calibration:
+    """Choose the degree with the lowest BIC and say what is known of it.
+
+    Parameters
+    ----------
+    trials
+        One a degree.
+    known
+        Whether shifts were given.
+    noise
+        What became of white noise of variance 1 in a sample, and in the mean of many
+        (:func:`~modeharvest.imaging.distortion.calibration.result.sampled_noise`).
+    """
+    model, fit = min(trials, key=lambda trial: trial[1].bic)
+    one, many = noise
+    k = len(fit.coefficients)
+    covariance: FloatArray = fit.inverse * (fit.variance * many / one)
+    own = np.zeros(fit.free.shape)
+    own[fit.free] = np.sqrt(np.diag(covariance)[k:])
+    found = Calibration(
+        distortion=model.distortion(fit.coefficients),
+        shifts=np.array([pose.shift for pose in fit.poses]),
+        shifts_sd=own[:, :2],
+        angles=np.array([pose.angle for pose in fit.poses]),
+        angles_sd=own[:, 2],
+        trials=_trials(trials, many / one),
+        noise_sd=float(np.sqrt(fit.variance / one)),
+        matches=fit.matches,
+        covariance=covariance[:k, :k],
+        fixed=model.fixed,
+    )
+    return replace(found, sentences=calibration_text(found, known))
+
+
+def _trials(
+    fitted: Sequence[tuple[PolynomialModel, Fit]], factor: float
+) -> tuple[DegreeTrial, ...]:
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in fitted[0][0].shape)
+    at = row[:, None], col[None, :]
+    least = min(fit.bic for _, fit in fitted)
+    trials: list[DegreeTrial] = []
+    before: FloatArray = np.zeros((2, 25, 25))
+    for model, fit in fitted:
+        k = len(fit.coefficients)
+        lens = model.distortion(fit.coefficients)
+        now = np.stack(lens.shift(*at))
+        covariance = fit.inverse[:k, :k] * fit.variance * factor
+        sd = _sd(lens, covariance, model.fixed, *at)
+        trials.append(
+            DegreeTrial(
+                degree=model.degree,
+                unknowns=len(fit.inverse),
+                residual_rms=float(np.sqrt(fit.variance)),
+                bic=fit.bic - least,
+                change_px=float(np.sqrt(np.mean((now - before) ** 2))),
+                sd_px=float(np.sqrt(np.mean(np.square(sd)))),
+            )
+        )
+        before = now
+    return tuple(trials)
+
+
+def _sd(
+    lens: PolynomialDistortion, covariance: FloatArray, fixed: int, row: ArrayLike, col: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    basis = lens.basis(row, col)[..., fixed:]
+    n = basis.shape[-1]
+    along_row, along_col = (
+        np.sqrt(np.maximum(((basis @ part) * basis).sum(axis=-1), 0.0))
+        for part in (covariance[:n, :n], covariance[n:, n:])
+    )
+    return np.asarray(along_row), np.asarray(along_col)
+
+
+def calibration_text(found: Calibration, known: bool) -> tuple[str, ...]:
+    """What was found, and what could not be."""
+    chosen = next(t for t in found.trials if t.bic == 0.0)
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
+    size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
+    turned = np.abs(found.angles).max()
+    said = [
+        f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
+        f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
+        f"{chosen.sd_px:.4f} px rms over the image.",
+    ]
+    if chosen is found.trials[-1] and len(found.trials) > 1:
+        said.append(
+            f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
+            f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
+        )
+    if known:
+        said.append(
+            "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
+            "constant part can't be observed and is zero at the polynomial's mean."
+        )
+    else:
+        said.append(
+            "The shifts were not known, so the affine part of S can't be observed and is zero: "
+            "scale and skew of the image are open, as with any pixel size that isn't measured."
+        )
+    if turned > 0.0:
+        said.append(
+            f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
+            f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
+        )
+    said.append(
+        "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
+        "or a change of the distance to the lens would be taken for distortion."
+    )
+    return tuple(said)

@@ -1,0 +1,347 @@
+"""Optical distortions: polynomial, OpenCV's camera model, sampled; their exact inverse.
+
+A lens shows the ideal image position p at phi_S(p) = p + S(p), the paper's Eq. (r2). Here S is in
+px and in the image frame: components along the rows' index (down) and the columns' index (right).
+
+Source of the camera model: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html, without thin
+prisms and tilts.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import astuple, dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
+from scipy.interpolate import RectBivariateSpline
+
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+_CHUNK = 8192
+"""Points that are inverted at a time, so that they stay in the cache."""
+_SETTLED_PX = 1e-7
+"""Newton's error is squared by a step: one this short leaves less than rounding."""
+_STEPS = 30
+
+
+class Distortion(ABC):
+    """A mapping of ideal image positions to those where a lens shows them.
+
+    Kinds say :meth:`shift` and :meth:`gradient`; the mapping and its inverse follow. Positions
+    are (row, col) in px, whole numbers at pixel centres, of any shapes that broadcast together;
+    an open grid, (rows, 1) and (1, cols), is fastest.
+    """
+
+    @abstractmethod
+    def shift(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """S: the components (d_row, d_col) [px] at ideal positions [px]."""
+
+    @abstractmethod
+    def gradient(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
+
+    def observed(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """phi_S: where ideal positions (row, col) are seen [px]."""
+        d_row, d_col = self.shift(row, col)
+        return np.add(row, d_row), np.add(col, d_col)
+
+    def ideal(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Invert phi_S: the ideal positions of what is seen at (row, col) [px].
+
+        By Newton's method, to rounding (better than 1e-10 px); NaN where a position is NaN.
+
+        Raises
+        ------
+        InputError
+            If the mapping is not one-to-one there: it folds.
+        """
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        seen = np.stack([row.ravel(), col.ravel()])
+        found = np.empty_like(seen)
+        for first in range(0, seen.shape[1], _CHUNK):
+            part = slice(first, first + _CHUNK)
+            found[:, part] = self._newton(seen[:, part])
+        return found[0].reshape(row.shape), found[1].reshape(row.shape)
+
+    def _newton(self, seen: FloatArray) -> FloatArray:
+        """(2, n) ideal positions of (2, n) seen ones."""
+        found = seen - np.stack(self.shift(*seen))
+        for _ in range(_STEPS):
+            misfit = np.stack(self.observed(*found)) - seen
+            (rr, rc), (cr, cc) = self.gradient(*found)
+            det = (1.0 + rr) * (1.0 + cc) - rc * cr
+            if (det <= 0.0).any():
+                raise _folds(seen[:, int(np.argmax(det <= 0.0))])
+            found[0] -= ((1.0 + cc) * misfit[0] - rc * misfit[1]) / det
+            found[1] -= ((1.0 + rr) * misfit[1] - cr * misfit[0]) / det
+            length = np.abs(misfit).max(axis=0) / np.minimum(det, 1.0)
+            if not (length > _SETTLED_PX).any():  # NaN counts as settled
+                return found
+        raise _folds(seen[:, int(np.nanargmax(length))])
+
+
+def _folds(position: FloatArray) -> InputError:
+    return InputError(
+        "expected a distortion that is one-to-one over the image, got one that folds at row "
+        f"{position[0]:.0f}, column {position[1]:.0f}; check its coefficients and their units"
+    )
+
+
+def require_finite(values: FloatArray, what: str) -> None:
+    """Raise InputError if a number of a distortion isn't one."""
+    if not np.isfinite(values).all():
+        raise InputError(f"distortion: expected finite {what}, got NaN or infinity")
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialDistortion(Distortion):
+    """S as a polynomial of a total degree, in products of Chebyshev polynomials.
+
+    S(row, col) = sum over i + j <= degree of c_ij T_i(xi) T_j(eta), where xi and eta run from
+    -1 to 1 from the first to the last column and row. Beyond the image it goes on as it is.
+
+    Parameters
+    ----------
+    shape
+        (rows, cols) of the image [px].
+    coefficients
+        (2, n) c_ij along the rows' and the columns' index [px], n = (degree + 1)(degree + 2)/2,
+        by rising i + j, in each of them by rising j: 1, xi, eta, T_2(xi), xi eta, T_2(eta), ...
+    """
+
+    shape: tuple[int, int]
+    coefficients: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+        object.__setattr__(self, "coefficients", np.array(self.coefficients, dtype=np.float64))
+        if min(self.shape) < 2:
+            raise InputError(f"distortion: expected an image of 2 x 2 px or more, got {self.shape}")
+        c = self.coefficients
+        if c.ndim != 2 or len(c) != 2 or self.size_of(self.degree) != c.shape[1]:
+            raise InputError(
+                "distortion: expected (2, n) coefficients with n = 1, 3, 6, 10, ... for degree "
+                f"0, 1, 2, 3, ..., got shape {c.shape}"
+            )
+        require_finite(c, "coefficients")
+
+    @staticmethod
+    def size_of(degree: int) -> int:
+        """Count the coefficients of one component."""
+        return (degree + 1) * (degree + 2) // 2
+
+    @staticmethod
+    def orders(degree: int) -> tuple[tuple[int, int], ...]:
+        """(i, j) of each coefficient: i along the columns' index, j along the rows'."""
+        return tuple((total - j, j) for total in range(degree + 1) for j in range(total + 1))
+
+    @property
+    def degree(self) -> int:
+        """Total degree."""
+        return int((np.sqrt(8 * self.coefficients.shape[-1] + 1) - 3) / 2 + 1e-9)
+
+    @cached_property
+    def _tables(self) -> tuple[FloatArray, FloatArray]:
+        """(2, n, n) coefficients [component, j, i], and (2, 2, n, n) those of the derivatives."""
+        n, (rows, cols) = self.degree + 1, self.shape
+        table = np.zeros((2, n, n))
+        i, j = np.array(self.orders(self.degree)).T
+        table[:, j, i] = self.coefficients
+        slopes = np.zeros((2, 2, n, n))
+        if n > 1:
+            slopes[:, 0, :-1, :] = chebyshev.chebder(table, axis=1) * (2.0 / (rows - 1))
+            slopes[:, 1, :, :-1] = chebyshev.chebder(table, axis=2) * (2.0 / (cols - 1))
+        return table, slopes
+
+    def shift(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """S: the components (d_row, d_col) [px] at ideal positions [px]."""
+        d_row, d_col = self._evaluate(self._tables[0], row, col)
+        return d_row, d_col
+
+    def gradient(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
+        return self._evaluate(self._tables[1], row, col)
+
+    def basis(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(..., n): every product T_i(xi) T_j(eta), in the order of the coefficients."""
+        eta, xi = self._normalised(row, col)
+        along_col, along_row = (_powers(t, self.degree) for t in (xi, eta))
+        return np.stack([along_col[i] * along_row[j] for i, j in self.orders(self.degree)], axis=-1)
+
+    def _normalised(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        rows, cols = self.shape
+        eta = 2.0 * np.asarray(row, dtype=np.float64) / (rows - 1) - 1.0
+        xi = 2.0 * np.asarray(col, dtype=np.float64) / (cols - 1) - 1.0
+        return eta, xi
+
+    def _evaluate(self, tables: FloatArray, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(..., positions) sums for tables (..., n, n), each by one matrix product along col."""
+        eta, xi = self._normalised(row, col)
+        along_row, along_col = _powers(eta, self.degree), _powers(xi, self.degree)
+        partial = np.tensordot(tables, along_col, axes=1)  # (..., j, positions of col)
+        if eta.ndim == 2 and eta.shape[1] == 1 and xi.shape[:1] == (1,):
+            return np.asarray(along_row[:, :, 0].T @ partial[..., 0, :])
+        axis = tables.ndim - 2
+        total = np.take(partial, 0, axis) * along_row[0]
+        for j in range(1, len(along_row)):
+            total = total + np.take(partial, j, axis) * along_row[j]
+        return np.asarray(total)
+
+
+def _powers(t: FloatArray, degree: int) -> FloatArray:
+    """T_0(t) ... T_degree(t), stacked along a new first axis."""
+    values = chebyshev.chebvander(t, degree).reshape(*t.shape, degree + 1)
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+
+@dataclass(frozen=True)
+class CameraDistortion(Distortion):
+    """The lens of OpenCV's camera model (Brown-Conrady, with its rational extension).
+
+    With x = (col - cx) / fx, y = (row - cy) / fy and r^2 = x^2 + y^2 an ideal position is seen at
+
+        x' = x q + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y q + p1 (r^2 + 2 y^2) + 2 p2 x y,
+        q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+
+    col' = cx + fx x', row' = cy + fy y'. The ideal image has the same fx, fy, cx, cy.
+
+    Parameters
+    ----------
+    fx, fy
+        Focal lengths [px].
+    cx, cy
+        Principal point, column and row [px]; whole numbers are pixel centres, as in OpenCV.
+    k1, k2, p1, p2, k3, k4, k5, k6
+        Coefficients [-], in OpenCV's order.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(np.array(astuple(self)), "camera parameters")
+        if not (self.fx > 0.0 and self.fy > 0.0):
+            raise InputError(
+                f"distortion: expected focal lengths above 0 px, got {self.fx} and {self.fy}"
+            )
+
+    def _normalised(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        x: FloatArray = np.subtract(col, self.cx, dtype=np.float64) / self.fx
+        y: FloatArray = np.subtract(row, self.cy, dtype=np.float64) / self.fy
+        return x, y
+
+    def shift(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """S: the components (d_row, d_col) [px] at ideal positions [px]."""
+        x, y = self._normalised(row, col)
+        x2, y2, xy = x * x, y * y, x * y
+        s = x2 + y2
+        top = s * (self.k1 + s * (self.k2 + s * self.k3))
+        below = s * (self.k4 + s * (self.k5 + s * self.k6))
+        more = (top - below) / (1.0 + below)  # q - 1 without cancellation
+        d_col = self.fx * (x * more + 2.0 * self.p1 * xy + self.p2 * (s + 2.0 * x2))
+        d_row = self.fy * (y * more + self.p1 * (s + 2.0 * y2) + 2.0 * self.p2 * xy)
+        return np.asarray(d_row), np.asarray(d_col)
+
+    def gradient(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
+        x, y = np.broadcast_arrays(*self._normalised(row, col))
+        s = x * x + y * y
+        top = s * (self.k1 + s * (self.k2 + s * self.k3))
+        below = s * (self.k4 + s * (self.k5 + s * self.k6))
+        more = (top - below) / (1.0 + below)
+        d_top = self.k1 + s * (2.0 * self.k2 + 3.0 * s * self.k3)
+        d_below = self.k4 + s * (2.0 * self.k5 + 3.0 * s * self.k6)
+        slope = 2.0 * (d_top - (1.0 + more) * d_below) / (1.0 + below)  # dq/dx = slope x
+        p1, p2 = self.p1, self.p2
+        xx = more + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        xy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        yy = more + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        aspect = self.fy / self.fx
+        return np.array([[yy, aspect * xy], [xy / aspect, xx]])
+
+
+@dataclass(frozen=True, eq=False)
+class SampledDistortion(Distortion):
+    """S given on a grid, with a bicubic spline through it.
+
+    Beyond the grid it goes on linearly from the edge.
+
+    Parameters
+    ----------
+    rows, cols
+        (n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each.
+    field
+        (2, n, m) S along the rows' and the columns' index [px].
+    """
+
+    rows: FloatArray
+    cols: FloatArray
+    field: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "cols", "field"):
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+            require_finite(getattr(self, name), name)
+        if any(a.ndim != 1 or a.size < 4 or (np.diff(a) <= 0).any() for a in self._axes):
+            raise InputError(
+                "distortion: expected at least 4 ascending rows and cols of a sampled field [px], "
+                f"got {self.rows.size} and {self.cols.size}"
+            )
+        if self.field.shape != (2, self.rows.size, self.cols.size):
+            raise InputError(
+                f"distortion: expected a field of shape {(2, self.rows.size, self.cols.size)} "
+                f"like its rows and cols, got {self.field.shape}"
+            )
+
+    @property
+    def _axes(self) -> tuple[FloatArray, FloatArray]:
+        return self.rows, self.cols
+
+    @cached_property
+    def _splines(self) -> tuple[RectBivariateSpline, RectBivariateSpline]:
+        along_row, along_col = (RectBivariateSpline(*self._axes, f, s=0) for f in self.field)
+        return along_row, along_col
+
+    def _evaluate(
+        self, row: ArrayLike, col: ArrayLike, orders: tuple[tuple[int, int], ...]
+    ) -> tuple[list[tuple[FloatArray, ...]], FloatArray, FloatArray]:
+        """Derivatives of both components at the nearest point of the grid, and how far that is."""
+        row, col = np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
+        near_row = np.clip(row, self.rows[0], self.rows[-1])
+        near_col = np.clip(col, self.cols[0], self.cols[-1])
+        is_grid = row.ndim == 2 and row.shape[1] == 1 and col.shape[:1] == (1,)
+        found = []
+        for spline in self._splines:
+            if is_grid and (np.diff(row[:, 0]) > 0).all() and (np.diff(col[0]) > 0).all():
+                # Where the axes were clipped they don't ascend strictly, which is allowed.
+                at = near_row[:, 0], near_col[0]
+                values = tuple(spline(*at, dx=i, dy=j) for i, j in orders)
+            else:
+                values = tuple(spline.ev(near_row, near_col, dx=i, dy=j) for i, j in orders)
+            found.append(values)
+        return found, row - near_row, col - near_col
+
+    def shift(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """S: the components (d_row, d_col) [px] at ideal positions [px]."""
+        found, dr, dc = self._evaluate(row, col, ((0, 0), (1, 0), (0, 1), (1, 1)))
+        d_row, d_col = (s + s_r * dr + (s_c + s_rc * dr) * dc for s, s_r, s_c, s_rc in found)
+        return d_row, d_col
+
+    def gradient(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
+        found, dr, dc = self._evaluate(row, col, ((1, 0), (0, 1), (1, 1)))
+        return np.array([[s_r + s_rc * dc, s_c + s_rc * dr] for s_r, s_c, s_rc in found])

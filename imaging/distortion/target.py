@@ -1,0 +1,107 @@
+"""Photographs of a flat speckled target that a stage shifts: what a distortion is calibrated from.
+
+The target fills the image and moves rigidly, so whatever else is seen to move is the lens. The
+point of the target that the first photograph shows at the ideal position x is at x + t in one
+whose shift is t; a pixel p shows the target at phi_S^-1(p) - t, evaluated exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.imaging.distortion.undistort import Positions
+from modeharvest.imaging.sensor import Sensor
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+
+@dataclass(frozen=True)
+class CalibrationTarget:
+    """A target and the shifts of the stage that carries it.
+
+    Parameters
+    ----------
+    shifts_px
+        Intended shifts (along columns, along rows) [px], one for each photograph.
+    stage_sd_px
+        Standard deviation of the stage's error, of each component of each shift [px].
+    seed
+        Seed of the stage's errors, and of the target's speckle.
+    speckle
+        The target's pattern, but for its seeds; the specimen's where it is None.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range.
+    """
+
+    shifts_px: tuple[tuple[float, float], ...] = (
+        (0.0, 0.0), (100.0, 0.0), (0.0, 100.0), (-250.0, 60.0), (60.0, -250.0), (200.0, 200.0),
+    )  # fmt: skip
+    stage_sd_px: float = 0.3
+    seed: int = 0
+    speckle: SpeckleSpec | None = None
+
+    def __post_init__(self) -> None:
+        if not self.shifts_px or not np.isfinite(self.shifts_px).all():
+            raise InputError(
+                "calibration: expected finite shifts (along columns, along rows) [px], got "
+                f"{self.shifts_px}"
+            )
+        if not 0.0 <= self.stage_sd_px <= 1000.0:
+            raise InputError(
+                f"calibration: expected a stage_sd_px of 0 to 1000 px, got {self.stage_sd_px}"
+            )
+        if self.seed < 0:
+            raise InputError(f"calibration: expected a seed of 0 or more, got {self.seed}")
+
+    @property
+    def true_shifts(self) -> FloatArray:
+        """(m, 2) where the stage went, along (rows, columns) [px]."""
+        intended = np.array(self.shifts_px)[:, ::-1]
+        error = np.random.default_rng(self.seed).normal(0.0, 1.0, intended.shape)
+        return np.asarray(intended + self.stage_sd_px * error)
+
+
+def photograph_target(
+    target: CalibrationTarget,
+    speckle: SpeckleSpec,
+    seen: Positions,
+    sensor: Sensor,
+    bits: int,
+) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
+    """Make the photographs, one after the other, each with its name.
+
+    Parameters
+    ----------
+    target
+        Shifts and pattern.
+    speckle
+        The pattern if the target has none of its own, but for its seeds.
+    seen
+        (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
+    sensor, bits
+        The camera.
+
+    Yields
+    ------
+    name, (rows, cols) grey levels
+        "calibration_00", ... and an exposure as the camera stores it.
+    """
+    rows, cols = seen[0].shape
+    pattern = Speckle(_reseeded(target.speckle or speckle, target.seed), (rows, cols))
+    for k, (down, right) in enumerate(target.true_shifts):
+        name = f"calibration_{k:02d}"
+        irradiance = pattern(seen[0] - down, seen[1] - right).astype(np.float32)
+        yield name, sensor.expose(np.float32(sensor.light(name)) * irradiance, bits, name)
+
+
+def _reseeded(speckle: SpeckleSpec, seed: int) -> SpeckleSpec:
+    ink = None if speckle.ink is None else replace(speckle.ink, seed=seed)
+    return replace(speckle, seed=seed, ink=ink)

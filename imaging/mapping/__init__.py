@@ -1,0 +1,1 @@
+"""The inverse isoparametric mapping: which element covers a pixel, and where in it."""

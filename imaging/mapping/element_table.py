@@ -1,0 +1,266 @@
+"""The elements of a mesh over the pixels of an image, tabulated for the compiled kernels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import (
+    bezier_matrix,
+    lattice_points,
+    monomial_gradients,
+    reference_element,
+    sub_elements,
+    to_bernstein,
+)
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+
+BEYOND = (0.25, 0.1, 0.03)
+"""How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""
+CLEAR_OF_EDGES = 1e-6
+"""In xi, eta; pixels on an edge come out within some 1e-9."""
+UNASSIGNED, EDGE, INSIDE, OVERLAPPING, NOT_WANTED = 0, 1, 2, 3, 4
+"""States of a pixel: not claimed yet, claimed on an element's edge, inside it, inside two."""
+_AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
+
+
+class ElementTable(NamedTuple):
+    """A mesh of m elements with k sides each; positions are (row, col).
+
+    polynomials : (m, 2, 9) position relative to the centre [px].
+    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
+    sides : (m, k, 2, 3) coefficients of 1, u, u^2 of the position along each side, 0 <= u <= 1,
+        relative to the centre [px].
+    centres : (m, 2) whole pixels.
+    affine : (m,) whether the polynomials have no terms of higher than the first degree.
+    row_from, row_to : (m,) the image rows row_from ... row_to - 1 may hold pixels of it.
+    corners : (k, 2) local coordinates of the corners, where side i begins and side i - 1 ends.
+    bezier : (p, 9) from polynomials to control points.
+    slopes : (len(BEYOND), 9, 2 q) from polynomials to the Bernstein coefficients of the two
+        derivatives over the reference domain enlarged.
+    quarters : (4, 3) sub-elements.
+    middle : both local coordinates of the reference domain's middle.
+    triangular : triangles or quadrilaterals.
+    """
+
+    polynomials: FloatArray
+    absolute: FloatArray
+    sides: FloatArray
+    centres: FloatArray
+    affine: BoolArray
+    row_from: IntArray
+    row_to: IntArray
+    corners: FloatArray
+    bezier: FloatArray
+    slopes: FloatArray
+    quarters: FloatArray
+    middle: float
+    triangular: bool
+
+
+class Pixels(NamedTuple):
+    """What is found, over some rows of an image, pixels in the order of memory.
+
+    element : (n,) int32 element, -1 where none is.
+    values : (c, n) fields at the pixels, NaN where no element is.
+    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted, and then
+        ``values`` are left as they were where no element is.
+    first_row : of these pixels in the image.
+    cols : pixels a row.
+    x0, y0, pixel_size : of the image's grid [mm].
+    """
+
+    element: NDArray[np.int32]
+    values: FloatArray
+    residual: NDArray[np.float32]
+    first_row: int
+    cols: int
+    x0: float
+    y0: float
+    pixel_size: float
+
+
+def tabulate_elements(
+    nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid
+) -> ElementTable:
+    """Lay a mesh (nodes (n, 2) [mm], cells (m, k)) over the pixels of a grid."""
+    reference = reference_element(element)
+    triangular = reference.triangular
+    count, sides = len(cells), 3 if triangular else 4
+    slopes = np.stack([_enlarged_slopes(triangular, beyond) for beyond in BEYOND])
+    elements = ElementTable(
+        np.empty((count, 2, 9)), np.empty((count, 2, 9)), np.empty((count, sides, 2, 3)),
+        np.empty((count, 2)), np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.int64),
+        np.empty(count, dtype=np.int64), np.ascontiguousarray(reference.nodes[:sides]),
+        bezier_matrix(triangular), slopes, sub_elements(triangular),
+        _middle(triangular), triangular,
+    )  # fmt: skip
+    position_px = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)
+    nodes_yx = np.ascontiguousarray(nodes, dtype=np.float64)
+    _tabulate(elements, nodes_yx, position_px, np.ascontiguousarray(cells, dtype=np.int64),
+         reference.coefficients, grid.rows)  # fmt: skip
+    return elements
+
+
+def _middle(triangular: bool) -> float:
+    """Both local coordinates of a reference domain's middle."""
+    return 1.0 / 3.0 if triangular else 0.0
+
+
+def _enlarged_slopes(triangular: bool, beyond: float) -> FloatArray:
+    """(9, 2 q) derivatives along xi, then along eta, as Bernstein coefficients."""
+    centre = _middle(triangular)
+    factor = 1.0 + beyond * (3.0 if triangular else 1.0)
+    points = centre + factor * (lattice_points(triangular, 2) - centre)
+    control = np.einsum("qp,pmi->miq", to_bernstein(triangular, 2), monomial_gradients(points))
+    return np.asarray(control.reshape(9, -1))
+
+
+@compiled(parallel=True)
+def _tabulate(
+    elements: ElementTable,
+    nodes: FloatArray,
+    position_px: FloatArray,
+    cells: IntArray,
+    coefficients: FloatArray,
+    rows: int,
+) -> None:
+    for e in prange(len(cells)):
+        _tabulate_element(elements, e, nodes, position_px, cells[e], coefficients, rows)
+
+
+@compiled(relaxed=True)
+def _tabulate_element(
+    elements: ElementTable,
+    e: int,
+    nodes: FloatArray,
+    position_px: FloatArray,
+    cell: IntArray,
+    coefficients: FloatArray,
+    rows: int,
+) -> None:
+    """Fill in what belongs to element ``e`` with the nodes ``cell``."""
+    for i in range(2):
+        mean = 0.0
+        for a in cell:
+            mean += position_px[a, i]
+        elements.centres[e, i] = np.rint(mean / cell.size)
+    _combine(elements, e, nodes, position_px, cell, coefficients)
+    low, high, bent = np.inf, -np.inf, 0.0
+    for side in range(elements.sides.shape[1]):
+        _side(elements, e, side, position_px, cell)
+        c = elements.sides[e, side, 0]
+        low = min(low, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
+        high = max(high, c[0], c[0] + 0.5 * c[1], c[0] + c[1] + c[2])
+    for i in range(2):
+        for m in range(3, 9):
+            bent += abs(elements.polynomials[e, i, m])
+    elements.affine[e] = bent <= _AFFINE_PX
+    elements.row_from[e] = min(max(int(np.ceil(low - 1e-9 + elements.centres[e, 0])), 0), rows)
+    last = int(np.floor(high + 1e-9 + elements.centres[e, 0]))
+    elements.row_to[e] = min(max(last + 1, 0), rows)
+
+
+@compiled(relaxed=True)
+def _combine(
+    elements: ElementTable,
+    e: int,
+    nodes: FloatArray,
+    position_px: FloatArray,
+    cell: IntArray,
+    coefficients: FloatArray,
+) -> None:
+    """Polynomials from nodes, in pixels and in millimetres."""
+    elements.polynomials[e] = 0.0
+    elements.absolute[e] = 0.0
+    for a in range(cell.size):
+        x, y = nodes[cell[a]]
+        row = position_px[cell[a], 0] - elements.centres[e, 0]
+        col = position_px[cell[a], 1] - elements.centres[e, 1]
+        for m in range(9):
+            part = coefficients[m, a]
+            elements.polynomials[e, 0, m] += part * row
+            elements.polynomials[e, 1, m] += part * col
+            elements.absolute[e, 0, m] += part * x
+            elements.absolute[e, 1, m] += part * y
+
+
+@compiled(relaxed=True)
+def _side(
+    elements: ElementTable, e: int, side: int, position_px: FloatArray, cell: IntArray
+) -> None:
+    """Position along a side: from its corner to the next, through the node between, if any."""
+    sides = elements.sides.shape[1]
+    for i in range(2):
+        a = position_px[cell[side], i] - elements.centres[e, i]
+        b = position_px[cell[(side + 1) % sides], i] - elements.centres[e, i]
+        bulge = 0.0
+        if cell.size > sides:
+            between = position_px[cell[sides + side], i] - elements.centres[e, i]
+            bulge = 2.0 * a - 4.0 * between + 2.0 * b
+        elements.sides[e, side, i, 0] = a
+        elements.sides[e, side, i, 1] = b - a - bulge
+        elements.sides[e, side, i, 2] = bulge
+
+
+@compiled(relaxed=True)
+def proved_reach(polynomial: FloatArray, slopes: FloatArray, centre: float) -> float:
+    """How far beyond its edges, in (xi, eta), an element's map is one to one, proved; else 0.
+
+    Sufficient on a convex domain: ||A^-1 J - 1|| < 1 there, with A the Jacobian in the middle;
+    the norm is convex, so the Bernstein coefficients of J bound it.
+    """
+    a = np.empty((2, 2))
+    for i in range(2):
+        c = polynomial[i]
+        a[i, 0] = c[1] + centre * (2.0 * c[3] + c[4])
+        a[i, 1] = c[2] + centre * (c[4] + 2.0 * c[5])
+    inverse = 1.0 / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
+    count = slopes.shape[2] // 2
+    for k in range(slopes.shape[0]):
+        largest = 0.0
+        for q in range(count):
+            far = 0.0
+            for along in range(2):
+                p, r = 0.0, 0.0
+                for m in range(9):
+                    p += polynomial[0, m] * slopes[k, m, along * count + q]
+                    r += polynomial[1, m] * slopes[k, m, along * count + q]
+                first = inverse * (a[1, 1] * p - a[0, 1] * r) - (1.0 if along == 0 else 0.0)
+                second = inverse * (a[0, 0] * r - a[1, 0] * p) - (1.0 if along == 1 else 0.0)
+                far += first * first + second * second
+            largest = max(largest, far)
+        if largest < 1.0:
+            return BEYOND[k]
+    return 0.0
+
+
+@compiled()
+def bands(
+    row_from: IntArray, row_to: IntArray, rows: int, height: int
+) -> tuple[IntArray, IntArray]:
+    """(start, visits): the elements that reach into each band of ``height`` rows.
+
+    Those of band b are ``visits[start[b]:start[b + 1]]``, ascending.
+    """
+    count = (rows + height - 1) // height
+    start = np.zeros(count + 1, dtype=np.int64)
+    for e in range(row_from.size):
+        if row_to[e] > row_from[e]:
+            for b in range(row_from[e] // height, (row_to[e] - 1) // height + 1):
+                start[b + 1] += 1
+    for b in range(count):
+        start[b + 1] += start[b]
+    visits = np.empty(start[-1], dtype=np.int64)
+    cursor = start[:-1].copy()
+    for e in range(row_from.size):
+        if row_to[e] > row_from[e]:
+            for b in range(row_from[e] // height, (row_to[e] - 1) // height + 1):
+                visits[cursor[b]] = e
+                cursor[b] += 1
+    return start, visits

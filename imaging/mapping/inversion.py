@@ -1,0 +1,304 @@
+"""Compiled kernels: the inverse of one element's map, (row, col) to (xi, eta), and its start.
+
+The extreme points of an element on a row of pixels lie on its sides, whose positions are
+quadratic in the parameter along them; so the row's pixels in it are bounded by the roots of
+quadratic equations. There the local coordinates are known; between the two a cubic with the right
+values and slopes at both ends is a start for Newton's method.
+
+A batch of pixels runs through Newton's method in step, a loop without branches that the compiler
+turns into vector instructions; what it gives is checked pixel by pixel. Where that fails, an
+exhaustive search takes over: the element is halved until the Bézier control points' box of a part
+can't hold the pixel or Newton's method finds it.
+
+Coordinates are (row, col) in px relative to a whole pixel near the element's centre.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modeharvest.imaging.compiled import compiled
+from modeharvest.util.arrays import FloatArray
+
+Coefficients = tuple[float, ...]
+
+ACCEPTED_PX = 1e-10
+ON_EDGE = 1e-9  # pixels this far outside in xi, eta still belong to the element
+_NEWTON_STEPS = 25
+_BATCH_STEPS = 8
+_NEARLY_PX = 1e-7  # so near, the next step ends at rounding: convergence is quadratic
+_DEEPEST = 9  # quarters of quarters in the exhaustive search
+_ROUNDING_PX = 1e-13
+
+
+@compiled(inline=True)
+def coefficients(a: FloatArray) -> Coefficients:
+    """Keep a polynomial (9,) in registers; as an array it might overlap what is written."""
+    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
+
+
+@compiled(inline=True, relaxed=True)
+def value(a: Coefficients, curved: bool, s: float, t: float) -> float:
+    """Evaluate a polynomial; ``curved``: it has terms of third and fourth degree."""
+    p = a[0] + s * (a[1] + s * a[3] + t * a[4]) + t * (a[2] + t * a[5])
+    if curved:
+        p += s * t * (s * a[6] + t * a[7] + s * t * a[8])
+    return p
+
+
+@compiled(inline=True, relaxed=True)
+def value_and_slopes(
+    a: Coefficients, curved: bool, s: float, t: float
+) -> tuple[float, float, float]:
+    """Evaluate a polynomial and its derivatives along s and t."""
+    p = a[0] + s * (a[1] + s * a[3] + t * a[4]) + t * (a[2] + t * a[5])
+    p_s = a[1] + 2.0 * s * a[3] + t * a[4]
+    p_t = a[2] + s * a[4] + 2.0 * t * a[5]
+    if curved:
+        st = s * t
+        p += st * (s * a[6] + t * a[7] + st * a[8])
+        p_s += t * (2.0 * s * a[6] + t * a[7] + 2.0 * st * a[8])
+        p_t += s * (s * a[6] + 2.0 * t * a[7] + 2.0 * st * a[8])
+    return p, p_s, p_t
+
+
+@compiled(inline=True)
+def outside(triangular: bool, s: float, t: float) -> float:
+    """How far (s, t) lies outside the reference domain; 0 or negative inside."""
+    if triangular:
+        return max(-s, -t, s + t - 1.0)
+    return max(abs(s), abs(t)) - 1.0
+
+
+@compiled(relaxed=True)
+def invert(
+    polynomial: FloatArray,
+    triangular: bool,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    count: int,
+) -> None:
+    """Solve position(s, t) = (row, col) for the first ``count`` pixels from the start in s, t.
+
+    What it gives may be wrong.
+    """
+    a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+    for _ in range(_BATCH_STEPS):
+        if _step(a, b, not triangular, row, col, s, t, count) <= _NEARLY_PX**2:
+            break
+
+
+@compiled(relaxed=True)
+def _step(
+    a: Coefficients,
+    b: Coefficients,
+    curved: bool,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    count: int,
+) -> float:
+    """One Newton step for all; the sum of squared residuals before it."""
+    total = 0.0
+    for k in range(count):
+        p, p_s, p_t = value_and_slopes(a, curved, s[k], t[k])
+        q, q_s, q_t = value_and_slopes(b, curved, s[k], t[k])
+        p -= row[k]
+        q -= col[k]
+        total += p * p + q * q
+        inverse = 1.0 / (p_s * q_t - p_t * q_s)
+        s[k] += (p_t * q - q_t * p) * inverse
+        t[k] += (q_s * p - p_s * q) * inverse
+    return total
+
+
+@compiled()
+def _newton(
+    a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, s: float, t: float
+) -> tuple[bool, float, float]:
+    """Solve position(s, t) = (row, col) from a start; (converged, s, t)."""
+    before = np.inf
+    for _ in range(_NEWTON_STEPS):
+        p, p_s, p_t = value_and_slopes(a, curved, s, t)
+        q, q_s, q_t = value_and_slopes(b, curved, s, t)
+        p -= row
+        q -= col
+        residual = p * p + q * q
+        if residual <= _ROUNDING_PX**2 or (
+            residual <= ACCEPTED_PX**2 and residual >= 0.25 * before
+        ):
+            return True, s, t
+        before = residual
+        determinant = p_s * q_t - p_t * q_s
+        if determinant == 0.0:
+            return False, s, t
+        ds = (p_t * q - q_t * p) / determinant
+        dt = (q_s * p - p_s * q) / determinant
+        longest = max(abs(ds), abs(dt))
+        if longest > 2.0:  # a leap this long is no use of a local model
+            ds *= 2.0 / longest
+            dt *= 2.0 / longest
+        s += ds
+        t += dt
+    return False, s, t
+
+
+@compiled()
+def _may_hold(
+    a: FloatArray, bezier: FloatArray, s: float, t: float, scale: float, row: float, col: float
+) -> bool:
+    """Whether the control points' box of the part (s, t) + scale (s', t') holds the pixel."""
+    b = np.empty(9)
+    for k in range(2):
+        c = a[k]
+        b[0] = c[0] + s * (c[1] + s * c[3] + t * c[4]) + t * (c[2] + t * c[5])
+        b[0] += s * t * (s * c[6] + t * c[7] + s * t * c[8])
+        b[1] = scale * (c[1] + 2.0 * s * c[3] + t * c[4])
+        b[1] += scale * t * (2.0 * s * c[6] + t * c[7] + 2.0 * s * t * c[8])
+        b[2] = scale * (c[2] + s * c[4] + 2.0 * t * c[5])
+        b[2] += scale * s * (s * c[6] + 2.0 * t * c[7] + 2.0 * s * t * c[8])
+        b[3] = scale**2 * (c[3] + t * c[6] + t * t * c[8])
+        b[4] = scale**2 * (c[4] + 2.0 * s * c[6] + 2.0 * t * c[7] + 4.0 * s * t * c[8])
+        b[5] = scale**2 * (c[5] + s * c[7] + s * s * c[8])
+        b[6] = scale**3 * (c[6] + 2.0 * t * c[8])
+        b[7] = scale**3 * (c[7] + 2.0 * s * c[8])
+        b[8] = scale**4 * c[8]
+        low, high = np.inf, -np.inf
+        for i in range(bezier.shape[0]):
+            corner = 0.0
+            for m in range(9):
+                corner += bezier[i, m] * b[m]
+            low, high = min(low, corner), max(high, corner)
+        target = row if k == 0 else col
+        slack = 1e-9 * (1.0 + high - low)
+        if target < low - slack or target > high + slack:
+            return False
+    return True
+
+
+@compiled()
+def search(
+    polynomial: FloatArray,
+    bezier: FloatArray,
+    quarters: FloatArray,
+    triangular: bool,
+    row: float,
+    col: float,
+) -> tuple[bool, float, float]:
+    """Exhaustive search: halve the element, drop parts that can't hold the pixel, try the rest."""
+    a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+    stack = np.empty((4 * _DEEPEST + 4, 4))
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0.0, 0.0, 1.0, 0.0
+    top = 1
+    while top > 0:
+        top -= 1
+        s0, t0, scale, depth = stack[top]
+        if not _may_hold(polynomial, bezier, s0, t0, scale, row, col):
+            continue
+        middle = scale / 3.0 if triangular else 0.0
+        converged, s, t = _newton(a, b, not triangular, row, col, s0 + middle, t0 + middle)
+        if converged and outside(triangular, s, t) <= ON_EDGE:
+            return True, s, t
+        if depth < _DEEPEST:
+            for i in range(4):
+                stack[top, 0] = s0 + scale * quarters[i, 0]
+                stack[top, 1] = t0 + scale * quarters[i, 1]
+                stack[top, 2] = scale * quarters[i, 2]
+                stack[top, 3] = depth + 1.0
+                top += 1
+    return False, 0.0, 0.0
+
+
+End = tuple[float, float, float]
+"""Column relative to the element's centre [px], and the local coordinates there."""
+
+_CLOSE_PX = 1e-6  # rows that miss a side or a corner by less meet it; pixels are looked at anyway
+_CLOSE = 1e-6  # the same along a side
+
+
+@compiled(relaxed=True)
+def ends(sides: FloatArray, corners: FloatArray, row: float) -> tuple[End, End]:
+    """Where a row (relative to the centre [px]) first and last meets the element's sides.
+
+    The first column is infinite if it doesn't. For ``sides`` and ``corners`` see Elements.
+    """
+    low, low_at, high, high_at = np.inf, 0.0, -np.inf, 0.0
+    for side in range(sides.shape[0]):
+        c0, b, a = sides[side, 0, 0] - row, sides[side, 0, 1], sides[side, 0, 2]
+        u, v = _roots(a, b, c0)
+        corner = 0.0 if abs(c0) <= _CLOSE_PX else np.nan
+        for at in (u, v, corner):
+            col = sides[side, 1, 0] + at * (sides[side, 1, 1] + at * sides[side, 1, 2])
+            # Which root counts is hard to predict, so there are selections instead of branches.
+            on_side = (at >= -_CLOSE) & (at <= 1.0 + _CLOSE)  # NaN isn't
+            lower, higher = on_side & (col < low), on_side & (col > high)
+            low, low_at = col if lower else low, side + at if lower else low_at
+            high, high_at = col if higher else high, side + at if higher else high_at
+    return _end(corners, low, low_at), _end(corners, high, high_at)
+
+
+@compiled(inline=True, relaxed=True)
+def _end(corners: FloatArray, col: float, at: float) -> End:
+    """``at`` is the number of the side plus the parameter along it."""
+    whole = np.floor(at)
+    side, after = int(whole) % len(corners), (int(whole) + 1) % len(corners)
+    u = at - whole
+    s = corners[side, 0] + u * (corners[after, 0] - corners[side, 0])
+    t = corners[side, 1] + u * (corners[after, 1] - corners[side, 1])
+    return col, s, t
+
+
+@compiled(inline=True, relaxed=True)
+def _roots(a: float, b: float, c: float) -> tuple[float, float]:
+    """Roots of a u^2 + b u + c, NaN where there is none; c may be off by _CLOSE_PX."""
+    if a == 0.0:
+        return -c / b, np.nan
+    discriminant = b * b - 4.0 * a * c
+    if discriminant < 0.0:
+        if discriminant < -4.0 * abs(a) * _CLOSE_PX:
+            return np.nan, np.nan
+        discriminant = 0.0
+    q = -0.5 * (b + np.copysign(np.sqrt(discriminant), b))
+    return q / a, c / q
+
+
+@compiled(relaxed=True)
+def start_cubic(
+    polynomial: FloatArray,
+    curved: bool,
+    low: End,
+    high: End,
+    col: float,
+    s: FloatArray,
+    t: FloatArray,
+) -> None:
+    """Start for the pixels col, col + 1, ... of a row between its two ends."""
+    length = max(high[0] - low[0], 1e-3)
+    ds_low, dt_low = _along_row(polynomial, curved, low[1], low[2])
+    ds_high, dt_high = _along_row(polynomial, curved, high[1], high[2])
+    s1, s2, s3 = _hermite(low[1], high[1], ds_low * length, ds_high * length)
+    t1, t2, t3 = _hermite(low[2], high[2], dt_low * length, dt_high * length)
+    step = 1.0 / length
+    begin = (col - low[0]) * step
+    for k in range(s.size):
+        x = begin + k * step
+        s[k] = low[1] + x * (s1 + x * (s2 + x * s3))
+        t[k] = low[2] + x * (t1 + x * (t2 + x * t3))
+
+
+@compiled(inline=True, relaxed=True)
+def _along_row(polynomial: FloatArray, curved: bool, s: float, t: float) -> tuple[float, float]:
+    """Derivatives of (xi, eta) along a row of pixels [1/px]."""
+    _, p_s, p_t = value_and_slopes(coefficients(polynomial[0]), curved, s, t)
+    _, q_s, q_t = value_and_slopes(coefficients(polynomial[1]), curved, s, t)
+    inverse = 1.0 / (p_s * q_t - p_t * q_s)
+    return -p_t * inverse, p_s * inverse
+
+
+@compiled(inline=True, relaxed=True)
+def _hermite(y0: float, y1: float, d0: float, d1: float) -> tuple[float, float, float]:
+    """Coefficients of x, x^2, x^3 of the cubic from y0 with slope d0 at 0 to y1, d1 at 1."""
+    return d0, 3.0 * (y1 - y0) - 2.0 * d0 - d1, 2.0 * (y0 - y1) + d0 + d1

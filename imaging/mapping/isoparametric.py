@@ -1,0 +1,204 @@
+"""The inverse isoparametric mapping: which element covers a pixel, and where in it.
+
+For each pixel centre x of an image, find the element e and the local coordinates xi with
+sum_a N_a(xi) x_a = x, where x_a are the element's node positions in the state the image shows.
+The paper inverts the same mapping to make its virtual images (section "Virtual Experiments").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping import rasterise
+from modeharvest.imaging.mapping.element_table import Pixels, bands, tabulate_elements
+from modeharvest.imaging.mapping.elements import (
+    polynomials,
+    reference_element,
+    require_positive_jacobian,
+)
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Every pixel of an image in terms of a mesh.
+
+    Parameters
+    ----------
+    element
+        (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
+        does. A pixel on a shared edge or node belongs to the element of the lowest number.
+    xi
+        (rows, cols, 2) local coordinates (xi, eta) in it [-]; NaN where no element is.
+    residual_px
+        (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px]; NaN
+        where no element is.
+    doubly_covered
+        How many pixels lie inside more than one element: the mesh overlaps there.
+    """
+
+    element: NDArray[np.int32]
+    xi: FloatArray
+    residual_px: NDArray[np.float32]
+    doubly_covered: int = 0
+
+    @property
+    def mask(self) -> BoolArray:
+        """(rows, cols) True where there is material."""
+        return np.asarray(self.element >= 0)
+
+    @property
+    def max_residual_px(self) -> float:
+        """The largest residual of the inverse mapping [px]; 0 if no pixel is covered."""
+        mask = self.mask
+        return float(self.residual_px[mask].max()) if mask.any() else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class MappedBack:
+    """Fields at the pixels of an image.
+
+    Parameters
+    ----------
+    element
+        (rows, cols) int32, as in :class:`Located`.
+    values
+        (c, rows, cols) fields at the pixel centres; NaN where no element is.
+    residual_px, doubly_covered
+        As in :class:`Located`.
+    """
+
+    element: NDArray[np.int32]
+    values: FloatArray
+    residual_px: NDArray[np.float32]
+    doubly_covered: int = 0
+
+
+def locate(
+    nodes: FloatArray,
+    cells: IntArray,
+    element: str,
+    grid: PixelGrid,
+    where: str = "mesh",
+    wanted: BoolArray | None = None,
+) -> Located:
+    """Find element and local coordinates of every pixel centre of a grid.
+
+    Parameters
+    ----------
+    nodes
+        (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
+    cells
+        (m, k) node numbers of each element.
+    element
+        T3, T6, Q4, Q8 or Q9.
+    grid
+        The pixels.
+    where
+        What to call the mesh in an error.
+    wanted
+        (rows, cols) True where to look; by default everywhere. Other pixels count as background.
+
+    Raises
+    ------
+    InputError
+        If a Jacobian isn't positive everywhere in some element.
+    """
+    found = map_back(nodes, cells, element, grid, np.empty((len(nodes), 0)), where, wanted)
+    return Located(
+        found.element, np.moveaxis(found.values, 0, -1), found.residual_px, found.doubly_covered
+    )
+
+
+def map_back(
+    nodes: FloatArray,
+    cells: IntArray,
+    element: str,
+    grid: PixelGrid,
+    nodal: FloatArray,
+    where: str = "mesh",
+    wanted: BoolArray | None = None,
+) -> MappedBack:
+    """Evaluate nodal fields at every pixel centre of a grid.
+
+    The same as :func:`locate` and :func:`interpolate`, in one pass: faster, and without the
+    memory for local coordinates.
+
+    Parameters
+    ----------
+    nodes, cells, element, grid, where, wanted
+        As for :func:`locate`.
+    nodal
+        (n, c) fields at the nodes, for example their undeformed positions. Without any field
+        (c = 0) the values are the two local coordinates.
+
+    Raises
+    ------
+    InputError
+        If a Jacobian isn't positive everywhere in some element.
+    """
+    require_positive_jacobian(nodes, cells, element, where)
+    elements = tabulate_elements(nodes, cells, element, grid)
+    start, visits = bands(elements.row_from, elements.row_to, grid.rows, rasterise.BAND)
+    size, fields = grid.rows * grid.cols, polynomials(element, cells, nodal)
+    pixels = Pixels(
+        np.empty(size, dtype=np.int32), np.empty((fields.shape[1] or 2, size)),
+        np.empty(size, dtype=np.float32), 0, grid.cols, float(grid.x0), float(grid.y0),
+        float(grid.pixel_size),
+    )  # fmt: skip
+    everywhere = np.empty(0, dtype=np.bool_)
+    twice = rasterise.rasterise(
+        elements, fields, pixels,
+        everywhere if wanted is None else np.ascontiguousarray(wanted).ravel(),
+        start, visits, in_turn(start.size - 1),
+    )  # fmt: skip
+    return MappedBack(
+        pixels.element.reshape(grid.shape), pixels.values.reshape(-1, *grid.shape),
+        pixels.residual.reshape(grid.shape), int(twice),
+    )  # fmt: skip
+
+
+def in_turn(bands: int) -> IntArray:
+    """Order of the bands that gives each thread as many from every part of the image."""
+    threads = numba.get_num_threads()
+    return np.concatenate([np.arange(k, bands, threads) for k in range(threads)])
+
+
+def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArray) -> FloatArray:
+    """Values of a nodal field at located pixels by the element's own shape functions.
+
+    Parameters
+    ----------
+    located
+        From :func:`locate`, with the same cells.
+    nodal
+        (n, c) field at the nodes, for example the displacement [mm].
+
+    Returns
+    -------
+    (c, rows, cols) values, NaN where there is no material.
+
+    Raises
+    ------
+    InputError
+        If the field is not of shape (n, c).
+    """
+    if nodal.ndim != 2:
+        raise InputError(f"expected a nodal field of shape (n, c), got {nodal.shape}")
+    coefficients = polynomials(element, cells, np.asarray(nodal, dtype=np.float64))
+    triangular = reference_element(element).triangular
+    return _evaluate(coefficients, triangular, located.element, located.xi)
+
+
+def _evaluate(
+    coefficients: FloatArray, triangular: bool, owner: NDArray[np.int32], xi: FloatArray
+) -> FloatArray:
+    out = np.empty((coefficients.shape[1], *owner.shape))
+    rasterise.evaluate(coefficients, not triangular, owner, xi, out)
+    return out

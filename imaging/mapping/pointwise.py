@@ -1,0 +1,269 @@
+"""The inverse isoparametric mapping at points anywhere in the image plane.
+
+Where ``isoparametric`` fills a regular grid element by element, this finds the element for each of
+many scattered points, as a lens shows them at its pixels. The plane is cut into buckets that list
+the elements reaching into them; an element that may hold a point by its Bézier control points' box
+is inverted by Newton's method, and only where no element claims the point, exhaustively.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import (
+    bezier_matrix,
+    polynomials,
+    reference_element,
+    require_positive_jacobian,
+    sub_elements,
+)
+from modeharvest.imaging.mapping.inversion import (
+    ON_EDGE,
+    Coefficients,
+    coefficients,
+    outside,
+    search,
+    value,
+    value_and_slopes,
+)
+from modeharvest.imaging.mapping.isoparametric import Located
+from modeharvest.util.arrays import FloatArray, IntArray
+
+_BUCKET_PX = 16
+_BLOCK = 1024  # points that one thread takes at a time
+_STEPS = 20
+_SETTLED = 1e-8  # in xi, eta: Newton's error is squared by a step, so this one left rounding
+_RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
+_SLACK_PX = 1e-7
+
+
+class _Elements(NamedTuple):
+    """A mesh as the kernels see it: m elements.
+
+    polynomials : (m, 2, 9) (row, col) relative to the centre [px].
+    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
+    boxes : (m, 4) least row and column, greatest row and column [px].
+    centres : (m, 2) whole pixels (row, col).
+    bezier : (p, 9) from polynomials to control points.
+    quarters : (4, 3) sub-elements.
+    triangular : triangles or quadrilaterals.
+    """
+
+    polynomials: FloatArray
+    absolute: FloatArray
+    boxes: FloatArray
+    centres: FloatArray
+    bezier: FloatArray
+    quarters: FloatArray
+    triangular: bool
+
+
+class _Buckets(NamedTuple):
+    """Which elements may hold the points of a square of the image plane.
+
+    start, members : members[start[b]:start[b + 1]] are the elements of bucket b, ascending.
+    top, left : where the first bucket begins [px].
+    rows, cols : how many buckets.
+    """
+
+    start: IntArray
+    members: IntArray
+    top: float
+    left: float
+    rows: int
+    cols: int
+
+
+def locate_points(
+    nodes: FloatArray,
+    cells: IntArray,
+    element: str,
+    grid: PixelGrid,
+    row: ArrayLike,
+    col: ArrayLike,
+    where: str = "mesh",
+) -> Located:
+    """Find element and local coordinates of points given by their image positions.
+
+    Parameters
+    ----------
+    nodes
+        (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
+    cells
+        (m, k) node numbers of each element.
+    element
+        T3, T6, Q4, Q8 or Q9.
+    grid
+        What positions in px mean; they need not lie on it.
+    row, col
+        Positions of the points [px], of shapes that broadcast to two dimensions.
+    where
+        What to call the mesh in an error.
+
+    Returns
+    -------
+    Located
+        With arrays of the points' shape; points beside the mesh, and NaN, belong to no element.
+        A point on a shared edge belongs to the element of the lowest number. How many points lie
+        inside more than one element is not counted.
+
+    Raises
+    ------
+    InputError
+        If a Jacobian isn't positive everywhere in some element.
+    """
+    require_positive_jacobian(nodes, cells, element, where)
+    row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+    elements = _elements(nodes, cells, element, grid)
+    owner = np.empty(row.size, dtype=np.int32)
+    xi = np.empty((row.size, 2))
+    residual = np.empty(row.size, dtype=np.float32)
+    frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
+    points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
+    _locate(elements, _buckets(elements.boxes), *points, frame, owner, xi, residual)
+    shape = row.shape
+    return Located(owner.reshape(shape), xi.reshape(*shape, 2), residual.reshape(shape))
+
+
+def _elements(nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid) -> _Elements:
+    triangular = reference_element(element).triangular
+    position = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[cells]
+    centres = np.rint(position.mean(axis=1))
+    relative = polynomials(element, np.arange(cells.size).reshape(cells.shape),
+                           (position - centres[:, None]).reshape(-1, 2))  # fmt: skip
+    bezier = bezier_matrix(triangular)
+    control = relative @ bezier.T
+    boxes = np.concatenate(
+        [centres + control.min(axis=2) - _SLACK_PX, centres + control.max(axis=2) + _SLACK_PX],
+        axis=1,
+    )
+    absolute = polynomials(element, cells, nodes)
+    quarters = sub_elements(triangular)
+    return _Elements(relative, absolute, boxes, centres, bezier, quarters, triangular)
+
+
+def _buckets(boxes: FloatArray) -> _Buckets:
+    top, left = boxes[:, :2].min(axis=0)
+    first = ((boxes[:, :2] - [top, left]) // _BUCKET_PX).astype(np.int64)
+    last = ((boxes[:, 2:] - [top, left]) // _BUCKET_PX).astype(np.int64)
+    rows, cols = (int(n) for n in last.max(axis=0) + 1)
+    start, members = _fill_buckets(first, last, rows, cols)
+    return _Buckets(start, members, float(top), float(left), rows, cols)
+
+
+@compiled()
+def _fill_buckets(
+    first: IntArray, last: IntArray, rows: int, cols: int
+) -> tuple[IntArray, IntArray]:
+    start = np.zeros(rows * cols + 1, dtype=np.int64)
+    for e in range(first.shape[0]):
+        for i in range(first[e, 0], last[e, 0] + 1):
+            for j in range(first[e, 1], last[e, 1] + 1):
+                start[i * cols + j + 1] += 1
+    for b in range(rows * cols):
+        start[b + 1] += start[b]
+    members = np.empty(start[-1], dtype=np.int64)
+    cursor = start[:-1].copy()
+    for e in range(first.shape[0]):
+        for i in range(first[e, 0], last[e, 0] + 1):
+            for j in range(first[e, 1], last[e, 1] + 1):
+                members[cursor[i * cols + j]] = e
+                cursor[i * cols + j] += 1
+    return start, members
+
+
+@compiled(parallel=True)
+def _locate(
+    elements: _Elements,
+    buckets: _Buckets,
+    row: FloatArray,
+    col: FloatArray,
+    frame: tuple[float, float, float],
+    owner: NDArray[np.int32],
+    xi: FloatArray,
+    residual: NDArray[np.float32],
+) -> None:
+    """Fill owner, xi and residual; a thread writes its own points only."""
+    for block in prange((row.size + _BLOCK - 1) // _BLOCK):
+        for k in range(block * _BLOCK, min((block + 1) * _BLOCK, row.size)):
+            e, s, t = _owner(elements, buckets, row[k], col[k])
+            owner[k], xi[k, 0], xi[k, 1], residual[k] = e, s, t, np.nan
+            if e >= 0:
+                residual[k] = _residual(elements, e, s, t, row[k], col[k], frame)
+
+
+@compiled()
+def _owner(
+    elements: _Elements, buckets: _Buckets, row: float, col: float
+) -> tuple[int, float, float]:
+    """(element, xi, eta) of a point: first by Newton's method alone, then exhaustively."""
+    i = np.floor((row - buckets.top) / _BUCKET_PX)
+    j = np.floor((col - buckets.left) / _BUCKET_PX)
+    if not (0 <= i < buckets.rows and 0 <= j < buckets.cols):
+        return -1, np.nan, np.nan
+    bucket = int(i) * buckets.cols + int(j)
+    triangular, middle = elements.triangular, 1.0 / 3.0 if elements.triangular else 0.0
+    for exhaustively in (False, True):
+        for e in buckets.members[buckets.start[bucket] : buckets.start[bucket + 1]]:
+            box = elements.boxes[e]
+            if not (box[0] <= row <= box[2] and box[1] <= col <= box[3]):
+                continue
+            polynomial = elements.polynomials[e]
+            down, right = row - elements.centres[e, 0], col - elements.centres[e, 1]
+            if exhaustively:
+                found, s, t = search(
+                    polynomial, elements.bezier, elements.quarters, triangular, down, right
+                )
+            else:
+                a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+                found, s, t = _newton(a, b, not triangular, down, right, middle)
+            if found and outside(triangular, s, t) <= ON_EDGE:
+                return e, s, t
+    return -1, np.nan, np.nan
+
+
+@compiled()
+def _newton(
+    a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, middle: float
+) -> tuple[bool, float, float]:
+    """Solve position(s, t) = (row, col) from the middle; (converged, s, t)."""
+    s = t = middle
+    for _ in range(_STEPS):
+        p, p_s, p_t = value_and_slopes(a, curved, s, t)
+        q, q_s, q_t = value_and_slopes(b, curved, s, t)
+        determinant = p_s * q_t - p_t * q_s
+        if determinant == 0.0:
+            return False, s, t
+        ds = (p_t * (q - col) - q_t * (p - row)) / determinant
+        dt = (q_s * (p - row) - p_s * (q - col)) / determinant
+        s += ds
+        t += dt
+        if max(abs(ds), abs(dt)) < _SETTLED:
+            return True, s, t
+        if max(abs(s), abs(t)) > _RUNAWAY:
+            return False, s, t
+    return False, s, t
+
+
+@compiled(inline=True)
+def _residual(
+    elements: _Elements,
+    e: int,
+    s: float,
+    t: float,
+    row: float,
+    col: float,
+    frame: tuple[float, float, float],
+) -> float:
+    """Distance of the mapped (s, t) from the point, in the physical plane [px]."""
+    x0, y0, h = frame
+    x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
+    right = x0 + h * col - value(x, not elements.triangular, s, t)
+    down = y0 - h * row - value(y, not elements.triangular, s, t)
+    return float(np.sqrt(right * right + down * down) / h)

@@ -1,0 +1,322 @@
+"""Compiled kernels: which element covers a pixel, and fields there.
+
+The image is cut into bands of rows. A band visits, in ascending order, the elements that reach
+into it, and writes its own pixels only: no races, and the same result for any number of
+threads. Within an element, a row's pixels are limited to those between its two ends on the
+element's sides, however curved. They are collected over the rows and inverted together.
+
+Coordinates are (row, col) in px relative to the element's centre, a whole number of pixels, so
+rounding is that of the element's size and not of the image's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from modeharvest.imaging.compiled import compiled
+from modeharvest.imaging.mapping.affine import fill_affine
+from modeharvest.imaging.mapping.element_table import (
+    CLEAR_OF_EDGES,
+    EDGE,
+    INSIDE,
+    NOT_WANTED,
+    OVERLAPPING,
+    UNASSIGNED,
+    ElementTable,
+    Pixels,
+    proved_reach,
+)
+from modeharvest.imaging.mapping.inversion import (
+    ACCEPTED_PX,
+    ON_EDGE,
+    coefficients,
+    ends,
+    invert,
+    outside,
+    search,
+    start_cubic,
+    value,
+)
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+
+BAND = 32  # rows
+_BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache
+_MARGIN_PX = 1e-3  # beyond a row's ends; these are found much more closely
+
+
+class Batch(NamedTuple):
+    """Pixels of one element on their way through the kernels: arrays of equal length.
+
+    row, col : relative to the element's centre [px].
+    s, t : local coordinates.
+    off : squared residual in the kernels' own coordinates [px^2].
+    residual : distance in the physical plane, by the nodes' own coordinates [px].
+    where : place among the pixels.
+    """
+
+    row: FloatArray
+    col: FloatArray
+    s: FloatArray
+    t: FloatArray
+    off: FloatArray
+    residual: FloatArray
+    where: IntArray
+
+
+@compiled(parallel=True)
+def rasterise(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    wanted: BoolArray,
+    start: IntArray,
+    visits: IntArray,
+    order: IntArray,
+) -> int:
+    """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
+
+    ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
+    the local coordinates. ``wanted`` (n,) tells where to look, everywhere if it is empty. The
+    elements of band b are ``visits[start[b]:start[b + 1]]``; ``order`` is that of the bands.
+    """
+    rows = pixels.element.size // pixels.cols
+    twice = 0
+    for i in prange(order.size):
+        top = order[i] * BAND
+        visited = visits[start[order[i]] : start[order[i] + 1]]
+        twice += fill(elements, fields, pixels, wanted, visited, top, min(top + BAND, rows))
+    return twice
+
+
+@compiled()
+def fill(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    wanted: BoolArray,
+    visited: IntArray,
+    top: int,
+    bottom: int,
+) -> int:
+    """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many are covered twice."""
+    begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
+    state = np.zeros(end - begin, dtype=np.uint8)
+    pixels.element[begin:end] = -1
+    if wanted.size:
+        asked = wanted[top * pixels.cols : bottom * pixels.cols]
+        for k in range(asked.size):
+            state[k] = UNASSIGNED if asked[k] else NOT_WANTED
+    real = np.empty((6, _BATCH))
+    batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
+                  np.empty(_BATCH, dtype=np.int64))  # fmt: skip
+    for e in visited:
+        first, last = max(top, elements.row_from[e]), min(bottom, elements.row_to[e])
+        if elements.affine[e]:
+            fill_affine(elements, fields, pixels, e, first, last, state, begin)
+        else:
+            _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
+    return _leave(pixels.element, pixels.values, pixels.residual, state, begin)
+
+
+@compiled()
+def _leave(
+    element: NDArray[np.int32],
+    values: FloatArray,
+    residual: NDArray[np.float32],
+    state: NDArray[np.uint8],
+    begin: int,
+) -> int:
+    """Mark what nobody claimed as background; count what two did."""
+    twice = 0
+    for k in range(state.size):
+        twice += state[k] == OVERLAPPING
+    if residual.size:  # else these pixels are on their way elsewhere
+        for k in range(state.size):
+            if element[begin + k] < 0:
+                residual[begin + k] = np.nan
+                for field in range(values.shape[0]):
+                    values[field, begin + k] = np.nan
+    return twice
+
+
+@compiled()
+def _fill_element(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    e: int,
+    first: int,
+    last: int,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
+) -> None:
+    """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
+    centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
+    polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
+    curved, cols, first_row = not elements.triangular, pixels.cols, pixels.first_row
+    rows_, cols_, s, t, where = batch.row, batch.col, batch.s, batch.t, batch.where
+    count = 0
+    for image_row in range(first, last):
+        row = float(image_row - centre_row)
+        low, high = ends(sides, corners, row)
+        if not low[0] <= high[0]:
+            continue
+        col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
+        past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
+        at = (image_row - first_row) * cols
+        while col < past and state[at + col - begin] == NOT_WANTED:
+            col += 1
+        while col < past and state[at + past - 1 - begin] == NOT_WANTED:
+            past -= 1
+        while col < past:
+            if count == _BATCH:
+                _claim(elements, fields, pixels, e, state, begin, batch, count)
+                count = 0
+            stop = min(past, col + _BATCH - count)
+            n, col_from = stop - col, float(col - centre_col)
+            start_cubic(polynomial, curved, low, high, col_from, s[count : count + n],
+                        t[count : count + n])  # fmt: skip
+            for k in range(n):
+                rows_[count + k] = row
+                cols_[count + k] = col_from + k
+                where[count + k] = at + col + k
+            count += n
+            col = stop
+    _claim(elements, fields, pixels, e, state, begin, batch, count)
+
+
+@compiled()
+def _claim(
+    elements: ElementTable,
+    fields: FloatArray,
+    pixels: Pixels,
+    e: int,
+    state: NDArray[np.uint8],
+    begin: int,
+    batch: Batch,
+    count: int,
+) -> None:
+    """Invert a batch; claim those of its pixels that are inside and nobody's yet."""
+    polynomial, triangular = elements.polynomials[e], elements.triangular
+    row, col, s, t, off, residual, where = batch
+    element, residuals = pixels.element, pixels.residual
+    invert(polynomial, triangular, row, col, s, t, count)
+    _check(elements, pixels, e, row, col, s, t, off, residual, count)
+    reach = np.nan  # it is proved when first needed
+    claimed = 0
+    for k in range(count):
+        depth = -outside(triangular, s[k], t[k])
+        if depth < -ON_EDGE and np.isnan(reach):
+            reach = proved_reach(polynomial, elements.slopes, elements.middle)
+        if off[k] > ACCEPTED_PX**2 or (depth < -ON_EDGE and depth <= -reach):
+            # A root found outside, where the map is still one to one, is the only one; here
+            # there may be another inside.
+            found, s[k], t[k] = search(
+                polynomial, elements.bezier, elements.quarters, triangular, row[k], col[k]
+            )
+            if not found:
+                continue
+            depth = -outside(triangular, s[k], t[k])
+            _check(elements, pixels, e, row[k:], col[k:], s[k:], t[k:], off[k:], residual[k:], 1)
+        if depth < -ON_EDGE:
+            continue
+        at = where[k]
+        if state[at - begin] == UNASSIGNED:
+            state[at - begin] = INSIDE if depth > CLEAR_OF_EDGES else EDGE
+            element[at] = e
+            if residuals.size:
+                residuals[at] = residual[k]
+            where[claimed], s[claimed], t[claimed] = at, s[k], t[k]
+            claimed += 1
+        elif depth > CLEAR_OF_EDGES and state[at - begin] == INSIDE:
+            state[at - begin] = OVERLAPPING
+    _write(fields, pixels.values, e, triangular, where, s, t, claimed)
+
+
+@compiled(relaxed=True)
+def _check(
+    elements: ElementTable,
+    pixels: Pixels,
+    e: int,
+    row: FloatArray,
+    col: FloatArray,
+    s: FloatArray,
+    t: FloatArray,
+    off: FloatArray,
+    residual: FloatArray,
+    count: int,
+) -> None:
+    """Compute the residuals of the first ``count`` pixels, two ways: see Batch."""
+    curved = not elements.triangular
+    a = coefficients(elements.polynomials[e, 0])
+    b = coefficients(elements.polynomials[e, 1])
+    for k in range(count):
+        p = value(a, curved, s[k], t[k]) - row[k]
+        q = value(b, curved, s[k], t[k]) - col[k]
+        off[k] = p * p + q * q
+    if not pixels.residual.size:
+        return
+    x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
+    h = pixels.pixel_size
+    y0, x0 = pixels.y0 - h * elements.centres[e, 0], pixels.x0 + h * elements.centres[e, 1]
+    for k in range(count):
+        down = y0 - h * row[k] - value(y, curved, s[k], t[k])
+        right = x0 + h * col[k] - value(x, curved, s[k], t[k])
+        residual[k] = np.sqrt(down * down + right * right) / h
+
+
+@compiled(relaxed=True)
+def _write(
+    fields: FloatArray,
+    values: FloatArray,
+    e: int,
+    triangular: bool,
+    where: IntArray,
+    s: FloatArray,
+    t: FloatArray,
+    count: int,
+) -> None:
+    """Write the fields, or the local coordinates, at the first ``count`` pixels of a batch."""
+    if fields.shape[1] == 0:
+        for k in range(count):
+            values[0, where[k]] = s[k]
+            values[1, where[k]] = t[k]
+    for field in range(fields.shape[1]):
+        a, out = coefficients(fields[e, field]), values[field]
+        for k in range(count):
+            out[where[k]] = value(a, not triangular, s[k], t[k])
+
+
+@compiled(parallel=True, relaxed=True)
+def evaluate(
+    polynomials: FloatArray,
+    curved: bool,
+    element: NDArray[np.int32],
+    xi: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols).
+
+    ``xi`` (rows, cols, 2) may lie in memory in any order.
+    """
+    cols = element.shape[1]
+    for row in prange(element.shape[0]):
+        begin = 0
+        while begin < cols:
+            e = element[row, begin]
+            end = begin + 1
+            while end < cols and element[row, end] == e:
+                end += 1
+            for k in range(out.shape[0]):
+                if e < 0:
+                    out[k, row, begin:end] = np.nan
+                else:
+                    a = coefficients(polynomials[e, k])
+                    for col in range(begin, end):
+                        out[k, row, col] = value(a, curved, xi[row, col, 0], xi[row, col, 1])
+            begin = end

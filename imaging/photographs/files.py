@@ -1,0 +1,326 @@
+"""Image files: the numbers that are stored, right side up; masks and grey images; TIFF written.
+
+TIFF is read by tifffile, which keeps 16-bit colour; its compressions that tifffile leaves to
+another package (LZW, JPEG, ...) are read by Pillow where that loses nothing. PNG and JPEG are
+read by Pillow. Files are checked on the way in, and whole or absent on the way out.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import skimage.color
+import skimage.io
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, reading, require_plausible
+
+
+def require_contrast(grey: NDArray[Any], what: str) -> None:
+    """Raise InputError for a blank image."""
+    if grey.min() == grey.max():
+        raise InputError(
+            f"expected a speckle in the {what} image, got the constant grey level {grey.flat[0]}"
+        )
+
+
+TIFF = {".tif", ".tiff"}
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
+_ORIENTATION = 274
+"""The tag of TIFF and of Exif."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredImage:
+    """What a file holds.
+
+    Parameters
+    ----------
+    levels
+        (rows, cols) or (rows, cols, channels) uint8, uint16, float32 or float64.
+    notes
+        Sentences about pages left out and turns made.
+    """
+
+    levels: NDArray[Any]
+    notes: tuple[str, ...]
+
+
+def read_stored(path: Path) -> StoredImage:
+    """Read a TIFF, PNG or JPEG.
+
+    Raises
+    ------
+    InputError
+        One line: the file is missing, empty, damaged, or its numbers can't be read unchanged.
+    """
+    remedy = "if it is a damaged file, copy it or take it again"
+    with reading(path, "a photograph (TIFF, PNG or JPEG)", remedy), warnings.catch_warnings():
+        warnings.simplefilter("error")  # how Pillow tells of files cut short
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its size is looked at
+        is_tiff = path.suffix.lower() in TIFF
+        return _checked(_read_tiff(path) if is_tiff else _read_other(path), path)
+
+
+def _checked(stored: StoredImage, path: Path) -> StoredImage:
+    levels = stored.levels
+    plane = levels.ndim == 2 or (levels.ndim == 3 and levels.shape[2] in (1, 2, 3, 4))
+    if not plane or levels.size == 0:
+        raise InputError(
+            f"expected one picture of rows x columns at {path}, got an array of shape "
+            f"{levels.shape}; split it into single files"
+        )
+    if levels.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise InputError(
+            f"expected 8-bit, 16-bit or float grey levels at {path}, got {levels.dtype}; convert "
+            "it to one of them"
+        )
+    return stored
+
+
+def _read_tiff(path: Path) -> StoredImage:
+    with tifffile.TiffFile(path) as file:
+        page, count = file.pages.first, len(file.pages)
+        notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
+        require_plausible(path, page.nbytes)
+        try:
+            levels = np.asarray(page.asarray())
+        except (ValueError, ImportError) as error:
+            if "imagecodecs" not in str(error) and not isinstance(error, ImportError):
+                raise
+            return _by_pillow(path, page, notes)
+        if page.axes == "SYX":  # colours one after the other
+            levels = np.moveaxis(levels, 0, -1)
+        if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and levels.dtype.kind == "u":
+            levels = np.iinfo(levels.dtype).max - levels
+            notes.append("It stores white as 0 and was inverted.")
+        if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
+            levels = np.moveaxis(page.colormap[:, levels], 0, -1)
+        if levels.dtype == np.bool_:
+            levels = np.where(levels, np.uint8(255), np.uint8(0))
+        tag = page.tags.get(_ORIENTATION)
+        turned, said = _upright(levels, int(tag.value) if tag is not None else 1)
+        return StoredImage(turned, (*notes, *said))
+
+
+def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> StoredImage:
+    if page.samplesperpixel > 1 and page.bitspersample != 8:
+        # Pillow would drop the lower bits without a word.
+        codec = tifffile.COMPRESSION(page.compression).name
+        raise InputError(
+            f"expected a TIFF that can be read unchanged at {path}, got {page.bitspersample}-bit "
+            f"colour with {codec} compression; save it without compression, or "
+            "install imagecodecs"
+        )
+    with Image.open(path) as picture:
+        return _from_pillow(picture, notes)
+
+
+def _read_other(path: Path) -> StoredImage:
+    with Image.open(path) as picture:
+        require_plausible(path, float(picture.width) * picture.height)
+        if picture.format == "PNG" and _png_is_deep_colour(path):
+            raise InputError(
+                f"expected 8-bit colour, or grey of up to 16 bits, in the PNG {path}, got 16-bit "
+                "colour, which can't be read unchanged; save it as TIFF or as grey PNG"
+            )
+        count = int(getattr(picture, "n_frames", 1))
+        notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
+        return _from_pillow(picture, notes)
+
+
+def _from_pillow(picture: Image.Image, notes: list[str]) -> StoredImage:
+    orientation = int(picture.getexif().get(_ORIENTATION, 1))
+    turned = ImageOps.exif_transpose(picture)
+    if orientation in _TURNS:
+        notes = [*notes, _turn_note(orientation)]
+    if turned.mode in ("1", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
+        turned = turned.convert("L" if turned.mode == "1" else "RGB")
+    levels = np.asarray(turned)
+    if levels.dtype == np.int32 and levels.min() >= 0 and levels.max() < 2**16:
+        levels = levels.astype(np.uint16)  # how some versions hand out 16-bit grey PNG
+    return StoredImage(np.asarray(levels), tuple(notes))
+
+
+def _png_is_deep_colour(path: Path) -> bool:
+    with path.open("rb") as file:
+        header = file.read(26)
+    return header[12:16] == b"IHDR" and header[24] == 16 and header[25] in (2, 6)
+
+
+_TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored about its diagonal",
+    6: "turned clockwise by 90 degrees",
+    7: "mirrored about its other diagonal",
+    8: "turned anticlockwise by 90 degrees",
+}
+
+
+def _turn_note(orientation: int) -> str:
+    return f"It was {_TURNS[orientation]}, as its orientation tag says."
+
+
+def _upright(levels: NDArray[Any], orientation: int) -> tuple[NDArray[Any], tuple[str, ...]]:
+    """Obey the orientation tag: 1 to 8, by which corner the first row and column start from."""
+    if orientation not in _TURNS:
+        return levels, ()
+    if orientation >= 5:
+        levels = levels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        levels = levels[::-1]
+    if orientation in (2, 3, 6, 7):
+        levels = levels[:, ::-1]
+    return np.ascontiguousarray(levels), (_turn_note(orientation),)
+
+
+_TIFF = {".tif", ".tiff"}
+
+
+def read_image(path: Path | str) -> NDArray[np.float32]:
+    """Read a grey image.
+
+    Whole-number images are scaled to fractions of their type's full scale (uint8: /255,
+    uint16: /65535); floating-point images are taken as they are; colour becomes grey by luma
+    (0.2125 R + 0.7154 G + 0.0721 B), an alpha channel is dropped.
+
+    Returns
+    -------
+    (rows, cols) float32, row 0 at the top.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cut short, not one plane image, holds NaN or infinity, or all
+        its pixels are equal.
+    """
+    raw = _read(Path(path))
+    if raw.dtype == np.bool_ or raw.dtype.kind not in "uf":
+        raise InputError(
+            f"expected an image of unsigned integers or floats at {path}, got {raw.dtype}; "
+            "convert it to 8-bit, 16-bit or float TIFF"
+        )
+    grey = _grey(raw, path)
+    image = np.asarray(grey, dtype=np.float32)
+    if not np.isfinite(image).all():
+        count = int((~np.isfinite(image)).sum())
+        raise InputError(
+            f"expected finite grey values at {path}, got {count} NaN or infinite px; "
+            "replace them and exclude them by a mask"
+        )
+    if image.min() == image.max():
+        raise InputError(
+            f"expected an image with contrast at {path}, got {image.flat[0]:g} in every pixel"
+        )
+    return image
+
+
+def read_mask(path: Path | str) -> BoolArray:
+    """Read a mask: True where the file isn't zero, that is, where there is material.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cut short, not one plane image, or zero everywhere.
+    """
+    raw = _read(Path(path))
+    if raw.ndim == 3:
+        raw = raw[..., :3].max(axis=2) if raw.shape[2] > 2 else raw[..., 0]
+    mask = _require_plane(raw, path) != 0
+    if not mask.any():
+        raise InputError(
+            f"expected a mask with material (values above 0) at {path}, got black everywhere"
+        )
+    return np.asarray(mask)
+
+
+def require_same_shape(
+    image: NDArray[Any], other: NDArray[Any], what: str, other_what: str
+) -> None:
+    """Raise InputError unless two images have the same size.
+
+    ``what`` and ``other_what`` name them, best with their file names.
+    """
+    if image.shape != other.shape:
+        raise InputError(
+            f"expected images of one size, got {what} with {_size(image)} and {other_what} with "
+            f"{_size(other)} (rows x cols px); crop or make them again so that they match"
+        )
+
+
+def write_image(path: Path | str, image: NDArray[Any]) -> None:
+    """Write a float32, uint8 or uint16 image (rows, cols) as TIFF, whole or not at all.
+
+    Values are stored as they are (float64 is rounded to float32); for a camera's grey levels
+    see :func:`quantise`. Bool (a mask) is written as 0 and 255.
+
+    Raises
+    ------
+    InputError
+        If the name is not of a TIFF file, the image not plane, or of another type.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _TIFF:
+        raise InputError(f"expected a file name ending in .tif or .tiff, got {path}")
+    if image.ndim != 2:
+        raise InputError(f"expected an image of shape (rows, cols) for {path}, got {image.shape}")
+    if image.dtype == np.bool_:
+        image = np.where(image, np.uint8(255), np.uint8(0))
+    elif image.dtype == np.float64:
+        image = image.astype(np.float32)
+    elif image.dtype not in (np.float32, np.uint8, np.uint16):
+        raise InputError(f"expected float32, uint8 or uint16 for {path}, got {image.dtype}")
+    # In memory first: on a full disk it would say how many values it could not write, not why.
+    memory = io.BytesIO()
+    tifffile.imwrite(memory, image, photometric="minisblack")
+    with atomic(path) as temporary:
+        # Not its buffer: memory that is lent to a failed write can't be freed.
+        temporary.write_bytes(memory.getvalue())
+
+
+def _read(path: Path) -> NDArray[Any]:
+    remedy = "the file may be cut short, make or copy it again"
+    with reading(path, "a whole TIFF, PNG or JPEG image", remedy):
+        if path.suffix.lower() in _TIFF:
+            with tifffile.TiffFile(path) as file:
+                require_plausible(path, file.series[0].nbytes)
+                return np.asarray(file.asarray())
+        with Image.open(path) as picture:
+            require_plausible(path, float(picture.width) * picture.height)
+        return np.asarray(skimage.io.imread(path))
+
+
+def _grey(raw: NDArray[Any], path: Path | str) -> NDArray[Any]:
+    scale = float(np.iinfo(raw.dtype).max) if raw.dtype.kind == "u" else 1.0
+    if raw.ndim == 3 and raw.shape[2] in (3, 4):
+        return np.asarray(skimage.color.rgb2gray(raw[..., :3] / scale))
+    if raw.ndim == 3 and raw.shape[2] == 2:
+        raw = raw[..., 0]
+    return np.asarray(_require_plane(raw, path) / scale)
+
+
+def _require_plane(raw: NDArray[Any], path: Path | str) -> NDArray[Any]:
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[..., 0]
+    if raw.ndim != 2 or raw.size == 0:
+        raise InputError(
+            f"expected one plane image (rows x cols) at {path}, got an array of shape {raw.shape}; "
+            "split stacks into single files"
+        )
+    return raw
+
+
+def _size(image: NDArray[Any]) -> str:
+    return " x ".join(str(n) for n in image.shape)

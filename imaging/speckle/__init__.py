@@ -1,0 +1,1 @@
+"""Speckle patterns that are known exactly everywhere, and their fast evaluation."""

@@ -1,0 +1,241 @@
+"""A speckle pattern that is known exactly everywhere: one layer, or grains of ink on it.
+
+The one layer is a thresholded and blurred Gaussian field (see ``layer``). The second is ink that an
+air brush leaves on a powdered surface, as on the specimen of the paper's section "Real
+Experiments": the ink's own field i, 0 ... 1, darkens what it lies on,
+
+    I = p (1 - darkness i).
+
+Both are trigonometric polynomials, hence their product is; it is evaluated factor by factor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modeharvest.imaging.speckle.layer import Grains, Layer
+from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+
+SpectralUnit = Literal["cycles/px", "rad/px"]
+_CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
+_NARROWEST_BLUR_PX = 0.75  # 3 x 3 samples a pixel
+_WIDEST_BLUR_PX = 100.0  # beyond it no speckle is left
+_LOWEST_FREQUENCY = 1e-4  # cycles/px: grains of thousands of pixels
+_WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations away
+
+
+@dataclass(frozen=True)
+class Ink:
+    """A second layer: grains of ink, thresholded from a Gaussian field of their own and blurred.
+
+    Parameters
+    ----------
+    standard_deviation
+        Standard deviation of the Gaussian field's spectral density [cycles/px].
+    blur_px
+        Standard deviation of the Gaussian blur [px].
+    coverage
+        Share of the area under ink [-].
+    darkness
+        Share of the light that ink takes away [-].
+    seed
+        Seed of the random numbers; streams differ from those of the layer below.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range.
+    """
+
+    standard_deviation: float = 0.05
+    blur_px: float = 1.5
+    coverage: float = 0.4
+    darkness: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require_band_limited(self.standard_deviation, self.blur_px, "ink")
+        if not (0.0 < self.coverage < 1.0 and 0.0 < self.darkness <= 1.0):
+            raise InputError(
+                "ink: expected a coverage in 0 ... 1 and a darkness above 0 and at most 1, got "
+                f"coverage {self.coverage}, darkness {self.darkness}"
+            )
+        if self.seed < 0:
+            raise InputError(f"ink: expected a seed of 0 or more, got {self.seed}")
+
+    @property
+    def grains(self) -> Grains:
+        """What the layer is made of."""
+        return Grains(
+            self.standard_deviation, self.blur_px, (0.0, 1.0), self.coverage, (self.seed, 1)
+        )
+
+
+@dataclass(frozen=True)
+class SpeckleSpec:
+    """What the speckle looks like.
+
+    Parameters
+    ----------
+    standard_deviation
+        Standard deviation of the spectral density of the Gaussian field, in ``unit``.
+    unit
+        "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px"
+        (2 pi times coarser); the paper leaves it open.
+    blur_px
+        Standard deviation of the Gaussian blur [px], at least 0.75.
+    dark, bright
+        Grey levels of the two phases before the blur, as fractions of full scale [-].
+    seed
+        Seed of the random numbers.
+    ink
+        A second layer; none by default.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range.
+    """
+
+    standard_deviation: float = 1.0 / 20.0
+    unit: SpectralUnit = "cycles/px"
+    blur_px: float = 3.0
+    dark: float = 0.2
+    bright: float = 1.0
+    seed: int = 0
+    ink: Ink | None = None
+
+    def __post_init__(self) -> None:
+        if self.unit not in _CYCLES:
+            raise InputError(f"speckle: expected a unit among {list(_CYCLES)}, got {self.unit!r}")
+        _require_band_limited(self.cycles_per_px, self.blur_px, "speckle")
+        if not 0.0 <= self.dark < self.bright <= 1.0:
+            raise InputError(
+                "speckle: expected grey levels 0 <= dark < bright <= 1, got "
+                f"dark {self.dark}, bright {self.bright}"
+            )
+        if self.seed < 0:
+            raise InputError(f"speckle: expected a seed of 0 or more, got {self.seed}")
+
+    @property
+    def cycles_per_px(self) -> float:
+        """The spectral standard deviation in cycles/px."""
+        return self.standard_deviation * _CYCLES[self.unit]
+
+    @property
+    def grains(self) -> Grains:
+        """What the pattern, or the layer under the ink, is made of: half dark, half bright."""
+        return Grains(self.cycles_per_px, self.blur_px, (self.dark, self.bright), 0.5, self.seed)
+
+
+def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> None:
+    if not _NARROWEST_BLUR_PX <= blur_px <= _WIDEST_BLUR_PX:
+        raise InputError(
+            f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px and at most "
+            f"{_WIDEST_BLUR_PX:g} px, got {blur_px} px"
+        )
+    widest = _WIDEST_FREQUENCY * Grains(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
+    if not _LOWEST_FREQUENCY <= cycles_per_px <= widest:
+        raise InputError(
+            f"{what}: expected a spectral standard deviation from {_LOWEST_FREQUENCY:g} to "
+            f"{widest:g} cycles/px with a blur of {blur_px} px, got {cycles_per_px} cycles/px"
+        )
+
+
+class Speckle:
+    """One speckle pattern: exact intensities at whole pixels and anywhere between.
+
+    Parameters
+    ----------
+    spec
+        What it looks like.
+    shape
+        (rows, cols) of the image it has to cover [px]. The pattern is periodic with the next
+        sizes that suit an FFT; the realisation depends on them, hence on ``shape``.
+
+    Attributes
+    ----------
+    period : (rows, cols) of the period [px].
+    """
+
+    def __init__(self, spec: SpeckleSpec, shape: tuple[int, int]) -> None:
+        if min(shape) < 8:
+            raise InputError(f"speckle: expected an image of at least 8 x 8 px, got {shape}")
+        self.spec = spec
+        self.shape = shape
+        self._base = Layer(spec.grains, shape)
+        self._ink = None if spec.ink is None else Layer(spec.ink.grains, shape)
+        self._darkness = 0.0 if spec.ink is None else spec.ink.darkness
+        self.period: tuple[int, int] = self._base.period
+
+    def binary(self) -> FloatArray:
+        """Return the base layer's two phases before the blur, over the period's samples [-]."""
+        return self._base.binary()
+
+    def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
+        """(rows, cols) exact intensities at whole pixels [fraction of full scale].
+
+        ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
+        multiplied by those of its row and its column frequency (see Aperture.transfer). Not with
+        ink, whose waves are products.
+
+        Raises
+        ------
+        InputError
+            If there is a transfer and ink.
+        """
+        base = self._base.image(transfer)
+        if self._ink is None:
+            return base
+        if transfer is not None:
+            raise InputError("speckle: expected one layer where pixels average, got two")
+        return base * (1.0 - self._darkness * self._ink.image())
+
+    def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """Intensities at image positions (row, col) [px], of the positions' shape.
+
+        They are off by at most ``bound``, at most 6e-8 of full scale a layer, and in fact by
+        less than a hundredth of that; NaN where a position is.
+        """
+        base = self._base(row, col)
+        if self._ink is not None:
+            base *= 1.0 - self._darkness * self._ink(row, col)
+        return base
+
+    @property
+    def spline(self) -> PeriodicSpline:
+        """The base layer as a spline, made when first asked for."""
+        return self._base.spline
+
+    @property
+    def bound(self) -> float:
+        """Proved bound of a call's error [fraction of full scale]."""
+        ink = 0.0 if self._ink is None else self._darkness * self._ink.spline.bound
+        return self.spline.bound + ink + ink * self.spline.bound
+
+    def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
+        """Exact intensities at image positions (row, col) [px], of the positions' shape.
+
+        ``eps`` is the relative precision of the non-uniform FFT.
+        """
+        base = self._base.exact(row, col, eps)
+        if self._ink is None:
+            return base
+        return base * (1.0 - self._darkness * self._ink.exact(row, col, eps))
+
+    def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
+        """(2, ...) exact derivatives along (row, col) at image positions (row, col) [1/px]."""
+        slope = self._base.gradient(row, col, eps)
+        if self._ink is None:
+            return slope
+        light = 1.0 - self._darkness * self._ink.exact(row, col, eps)
+        shade = self._darkness * self._ink.gradient(row, col, eps)
+        return np.asarray(light * slope - self._base.exact(row, col, eps) * shade)

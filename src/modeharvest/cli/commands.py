@@ -1,0 +1,247 @@
+"""Commands that run a case: virtual experiments, infinite lattices, photographs, studies.
+
+What the commands need is imported where they need it, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars, warn
+from modeharvest.util.errors import InputError
+
+if TYPE_CHECKING:
+    from modeharvest.runs.case import TwinCase
+    from modeharvest.runs.experiment import Run
+    from modeharvest.runs.lattice.pipeline import LatticeAnalysis
+
+
+def cases(
+    name: Annotated[str | None, typer.Argument(help="Print this case's TOML file.")] = None,
+) -> None:
+    """List the shipped cases and their commands, or print one as a start for your own.
+
+    For example: modeharvest cases paper-virtual > mine.toml
+    """
+    from modeharvest.runs.case import case_text, lattice_cases, shipped_cases
+
+    if name is not None:
+        print(case_text(name), end="")
+        return
+    lattices = lattice_cases()
+    for shipped, title in shipped_cases().items():
+        commands = "bloch, modes" if shipped in lattices else "run"
+        print(f"{shipped:18}{commands:14}{title}")
+
+
+def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Run a whole case: simulate, image, correlate, validate.
+
+    Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
+    same command again after an interruption: finished stages are not repeated. The twin of a real
+    experiment is photographed, harvested from its photographs alone, and set against its truth.
+    """
+    from modeharvest.report.terminal import print_experiment
+    from modeharvest.runs.case import TwinCase, read_case
+
+    checked = read_case(case)
+    if isinstance(checked, TwinCase):
+        _run_twin(checked, out, solution)
+        return
+    with _stages(case, out, solution) as stages:
+        summary = stages.all()
+    print_experiment(summary, out)
+
+
+def fem(case: CaseName, out: OutFolder) -> None:
+    """Simulate the compression test (needs dolfinx): DIR/solution.h5 and .vtu.
+
+    Finds the critical strain, proves stability by the tangent's inertia, follows the buckled
+    branch. Under mpirun it runs in parallel.
+    """
+    from modeharvest.report.terminal import critical_line
+
+    with _stages(case, out) as stages:
+        solution = stages.fem()
+    critical = solution.info.get("critical")
+    material = solution.info["material"]
+    print(critical_line(None if critical is None else critical["strain"], material))
+    for s in solution.snapshots:
+        print(f"{100 * s.nominal_strain:6.2f} %  {s.branch:9}  negative pivots {s.negative_pivots}")
+    for warning in solution.info.get("warnings", []):
+        warn(warning)
+    outcome = str(solution.info.get("outcome", "complete"))
+    if outcome != "complete":
+        raise InputError(f"simulation {outcome}; what was reached is in {out / 'solution.h5'}")
+
+
+def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Make speckle images and their truth from a solution: DIR/images."""
+    with _stages(case, out, solution) as stages:
+        images = stages.image()
+    rows, cols = images.grid.shape
+    print(f"{len(images.strains) + 1} images of {rows} x {cols} px in {images.folder}")
+    print(f"largest residual of the inverse mapping {images.max_residual_px:.1e} px")
+    for warning in images.info.get("warnings", []):
+        warn(warning)
+
+
+def correlate(case: CaseName, out: OutFolder) -> None:
+    """Measure the images by micromorphic IDIC: DIR/correlation."""
+    with _stages(case, out) as stages:
+        results = stages.correlate()
+    for strain, result in results.items():
+        print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
+
+
+def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+    """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
+    from modeharvest.report.terminal import print_experiment
+
+    with _stages(case, out, solution) as stages:
+        summary = stages.validate()
+    print_experiment(summary, out)
+
+
+@contextmanager
+def _stages(case: str, out: Path, solution: Path | None = None) -> Iterator[Run]:
+    """The stages of a case, under progress bars."""
+    from modeharvest.runs.case import read_case
+
+    checked = read_case(case)  # before the heavy imports, so that a typo is told at once
+    from modeharvest.runs.experiment import Run
+
+    with bars() as progress:
+        yield Run(checked, out, progress, solution)
+
+
+def _run_twin(case: TwinCase, out: Path, solution: Path | None) -> None:
+    """Make a twin's photographs, harvest them, and compare with the truth."""
+    from modeharvest.report.terminal import print_harvest
+    from modeharvest.runs.twin import TwinRun
+
+    with bars() as progress:
+        summary = TwinRun(case, out, progress, solution).all()
+    print_harvest(summary, out / "harvest")
+
+
+def bloch(case: CaseName, out: OutFolder) -> None:
+    """Analyse an infinite lattice: what makes it buckle first, of all waves (needs dolfinx).
+
+    Leaves the first critical load and waves with their proof, the lowest eigenvalues against the
+    wave vector at several loads (dispersion.csv, dispersion.h5), report.html and summary.json.
+    """
+    from modeharvest.report.terminal import print_lattice
+
+    with _analysis(case, out) as analysis:
+        summary = analysis.bloch()
+    print_lattice(summary, out)
+
+
+def modes(case: CaseName, out: OutFolder) -> None:
+    """Find an infinite lattice's modes, buckled branches and mode families (needs dolfinx).
+
+    Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
+    cell, branches with their energies, spectra, and the Fourier mode families found in them.
+    """
+    from modeharvest.report.terminal import print_lattice
+
+    with _analysis(case, out) as analysis:
+        summary = analysis.all()
+    print_lattice(summary, out)
+
+
+@contextmanager
+def _analysis(case: str, out: Path) -> Iterator[LatticeAnalysis]:
+    """The analysis of a lattice's case, under progress bars."""
+    from modeharvest.runs.lattice.case import read_lattice_case
+
+    checked = read_lattice_case(case)  # before the heavy imports, so that a typo is told at once
+    from modeharvest.runs.lattice.pipeline import LatticeAnalysis
+
+    with bars() as progress:
+        yield LatticeAnalysis(checked, out, progress, case)
+
+
+def _example(wanted: bool) -> None:
+    if wanted:
+        from modeharvest.runs.photographs.case import EXAMPLE
+
+        print(EXAMPLE, end="")
+        raise typer.Exit
+
+
+def harvest(
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT.toml", help="What there are photographs of.")
+    ],
+    out: OutFolder,
+    example: Annotated[
+        bool,
+        typer.Option(
+            "--example",
+            callback=_example,
+            is_eager=True,
+            help="Print a commented EXPERIMENT.toml with every option, and stop.",
+        ),
+    ] = False,
+) -> None:
+    """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
+
+    The TOML file names the reference and the deformed images, the pixel size and the cell size;
+    all else is found or has a default. Begin with 'modeharvest harvest --example >
+    experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
+    again after an interruption: finished photographs are not measured again.
+    """
+    from modeharvest.report.terminal import print_harvest
+    from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
+
+    with bars() as progress:
+        summary = harvest_photographs(experiment, out, progress)
+    print_harvest(summary, out)
+
+
+def study(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY",
+            help="robustness, noise, systematic, modes or resolution; or a TOML file of your own.",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for everything the study leaves.", metavar="DIR")
+    ],
+    workers: Annotated[
+        int | None, typer.Option(help="Processes on this machine; 2 by default.", metavar="N")
+    ] = None,
+    memory: Annotated[
+        str, typer.Option(help="Most that each of them may take.", metavar="BYTES")
+    ] = "4GiB",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="A dask scheduler instead, e.g. tcp://host:8786.", metavar="ADDRESS"),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer cases, larger pixels: a first look.")
+    ] = False,
+    solution: SolutionFile = None,
+) -> None:
+    """Study how good the measurement is: many cases, run by several processes.
+
+    Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
+    interruption: finished cases are not repeated.
+    """
+    from modeharvest.report.terminal import print_study
+    from modeharvest.runs.study import study_with_options
+
+    with bars() as progress:
+        summary = study_with_options(
+            name, out, workers, memory, scheduler, quick, solution, progress
+        )
+    print_study(summary, out)

@@ -1,0 +1,1 @@
+"""Reports for readers: pages, figures, tables and terminal output; nothing here computes results."""

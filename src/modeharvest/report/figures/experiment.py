@@ -1,0 +1,296 @@
+"""Figures of a virtual experiment: every panel of the paper's figures for every snapshot, and more.
+
+What is drawn is listed once, in :data:`PANELS`, with its caption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Solution
+from modeharvest.idic.spectra.pattern import WavePattern
+from modeharvest.idic.spectra.spectrum import Spectrum
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.report.figures import maps as fields
+from modeharvest.report.figures.curves import draw_density, pattern_density
+from modeharvest.report.figures.maps import ColourScale, DisplacementFunction, MapFrame
+from modeharvest.report.figures.style import GLOW
+from modeharvest.util.arrays import FloatArray
+from modeharvest.validation.truth import Comparison, lengths
+
+UM = 1e3  # micrometres in a millimetre
+DRAWN_SHAPE = 0.16
+"""Largest displacement that the modes are drawn with [l]."""
+FINE = 740
+"""Cells along a map's longer side where a field is as fine as the speckle."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentReportData:
+    """All that the pictures show.
+
+    Parameters
+    ----------
+    solution, images
+        Of the run.
+    comparisons
+        One for each snapshot.
+    spectra
+        For each snapshot, its spectral densities and what is read off them.
+    pitch
+        Unit cell size l [mm].
+    """
+
+    solution: Solution
+    images: ImageSet
+    comparisons: Sequence[Comparison]
+    spectra: Sequence[tuple[Spectrum, WavePattern]]
+    pitch: float
+
+    @cached_property
+    def sheet(self) -> MapFrame:
+        """The frame of smooth fields."""
+        return MapFrame.of(self.solution.mesh, self.images.grid)
+
+    @cached_property
+    def fine_sheet(self) -> MapFrame:
+        """The frame of fields as fine as the speckle."""
+        return MapFrame.of(self.solution.mesh, self.images.grid, FINE)
+
+    @cached_property
+    def material(self) -> NDArray[np.bool_]:
+        """Where there is material, on :attr:`sheet`'s grid."""
+        seen = self.sheet.average(np.where(self.comparisons[0].mask, 1.0, np.nan))
+        return np.asarray(np.isfinite(seen))
+
+    @cached_property
+    def density_end(self) -> float:
+        """Largest density of any snapshot's pattern [mm⁶]; all densities are drawn up to it."""
+        return max((pattern_density(*pair) for pair in self.spectra), default=0.0)
+
+    @property
+    def has_mode(self) -> bool:
+        """Whether the ansatz has a mode to show."""
+        return all(c.result.ansatz.modes for c in self.comparisons)
+
+    def shape_scale(self, k: int) -> float:
+        """By how much phi_1 of snapshot k is drawn, for a largest displacement of SHAPE l [mm]."""
+        largest = lengths(self.comparisons[k].result.phi(grid=self.sheet.grid))
+        top = float(largest.max())
+        return DRAWN_SHAPE * self.pitch / top if top > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class SnapshotPanel:
+    """One quantity, drawn for every snapshot.
+
+    Parameters
+    ----------
+    key
+        Its name in the page.
+    symbol
+        HTML.
+    title
+        In words.
+    paper
+        The panel's name in the paper, empty if it has none.
+    caption
+        What is seen, HTML.
+    draw
+        Makes the picture of snapshot k.
+    needs_mode
+        Whether there must be a mode.
+    exact
+        Whether the picture's pixels are to be kept exactly.
+    """
+
+    key: str
+    symbol: str
+    title: str
+    paper: str
+    caption: str
+    draw: Callable[[ExperimentReportData, int], Figure]
+    needs_mode: bool = False
+    exact: bool = False
+
+
+def measured_motion(atlas: ExperimentReportData, k: int) -> DisplacementFunction:
+    """The displacement that IDIC found in snapshot k."""
+    result = atlas.comparisons[k].result
+    return lambda x, y: result.ansatz.displacement(result.unknowns, x, y)
+
+
+def _image(atlas: ExperimentReportData, k: int) -> Figure:
+    images, strain = atlas.images, atlas.comparisons[k].strain
+    return fields.draw_image(
+        atlas.sheet, images.deformed(strain), images.deformed_mask(strain), images.grid,
+        atlas.solution.at(strain).displacement,
+    )  # fmt: skip
+
+
+def _density(component: int) -> Callable[[ExperimentReportData, int], Figure]:
+    return lambda atlas, k: draw_density(*atlas.spectra[k], component, atlas.density_end)
+
+
+def _v0(component: int) -> Callable[[ExperimentReportData, int], Figure]:
+    def draw(atlas: ExperimentReportData, k: int) -> Figure:
+        v0 = UM * atlas.comparisons[k].result.v0(atlas.sheet.grid)[..., component]
+        return fields.draw_field(atlas.sheet, v0, ColourScale.signed(_on_material(atlas, v0), "µm"))
+
+    return draw
+
+
+def _v1(atlas: ExperimentReportData, k: int) -> Figure:
+    result, grid = atlas.comparisons[k].result, atlas.sheet.grid
+    taper = result.ansatz.modes[0].taper
+    support = taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :]
+    v1 = np.where(support > 0.0, UM * result.v(grid=grid), np.nan)
+    inside = _on_material(atlas, np.where(support == 1.0, v1, np.nan))
+    return fields.draw_field(
+        atlas.sheet, v1, replace(ColourScale.signed(inside, "µm"), extend="both")
+    )
+
+
+def _phi1(atlas: ExperimentReportData, k: int) -> Figure:
+    result, scale = atlas.comparisons[k].result, atlas.shape_scale(k)
+    return fields.draw_shape(
+        atlas.sheet, lambda x, y: scale * result.ansatz.phi(0, result.unknowns, x, y)
+    )
+
+
+def _fluctuation(component: int) -> Callable[[ExperimentReportData, int], Figure]:
+    def draw(atlas: ExperimentReportData, k: int) -> Figure:
+        result = atlas.comparisons[k].result
+        field = UM * result.fluctuation(grid=atlas.sheet.grid)[..., component]
+        return fields.draw_field(
+            atlas.sheet, field, ColourScale.signed(_on_material(atlas, field), "µm"),
+            lambda x, y: result.ansatz.fluctuation(0, result.unknowns, x, y),
+        )  # fmt: skip
+
+    return draw
+
+
+def _residual(atlas: ExperimentReportData, k: int) -> Figure:
+    sheet = atlas.fine_sheet
+    residual = sheet.sample(atlas.comparisons[k].residual)
+    return fields.draw_field(
+        sheet, residual, ColourScale.signed(residual, "", 0.99), measured_motion(atlas, k)
+    )
+
+
+def _length_of(name: str) -> Callable[[ExperimentReportData, int], Figure]:
+    """The length of one of the comparison's vector fields."""
+
+    def draw(atlas: ExperimentReportData, k: int) -> Figure:
+        comparison, sheet = atlas.comparisons[k], atlas.sheet
+        length = UM * sheet.average(lengths(getattr(comparison, name)))
+        scale = ColourScale.size(length, "µm", 0.998)
+        return fields.draw_field(sheet, length, scale, measured_motion(atlas, k))
+
+    return draw
+
+
+def draw_hero(atlas: ExperimentReportData, k: int) -> Figure:
+    """The deformed image of snapshot k turning into the pattern that was measured in it."""
+    images, comparison, sheet = atlas.images, atlas.comparisons[k], atlas.sheet
+    field = comparison.result.fluctuation(grid=sheet.grid) if atlas.has_mode else comparison.w
+    length = UM * lengths(field)
+    if not atlas.has_mode:
+        length = sheet.average(length)
+    end = ColourScale.size(_on_material(atlas, length), "µm")
+    return fields.draw_blend(
+        sheet, images.deformed(comparison.strain), images.deformed_mask(comparison.strain),
+        images.grid, length, ColourScale(GLOW, 0.0, end.high, "µm"), measured_motion(atlas, k),
+    )  # fmt: skip
+
+
+def _on_material(atlas: ExperimentReportData, field: FloatArray) -> FloatArray:
+    """The values where there is material: the polynomials mean nothing elsewhere."""
+    return np.where(atlas.material, field, np.nan)
+
+
+PANELS = (
+    SnapshotPanel(
+        "image", "", "Deformed image", "spect_virt (a)",
+        "The speckle as the camera would see it. Each pixel is evaluated exactly at its reference "
+        "point; nothing is interpolated from the reference image.",
+        _image,
+    ),
+    SnapshotPanel(
+        "Sxx", "S<sub>xx</sub>", "Spectral density along x", "spect_virt (b)",
+        "Of the true displacement without its affine part. The colours end at the pattern's own "
+        "density, the same for all snapshots; what is beyond, on the axes, comes from the "
+        "specimen's edges. Rings: the wave vectors found (faint: the largest peak where there is "
+        "no pattern).",
+        _density(0),
+    ),
+    SnapshotPanel(
+        "Syy", "S<sub>yy</sub>", "Spectral density along y", "spect_virt (c)",
+        "A wave and its mirror image on either diagonal make four peaks at (±½, ±½): a pattern "
+        "that repeats after two cells.",
+        _density(1),
+    ),
+    SnapshotPanel(
+        "v0x", "v<sub>0</sub> · e<sub>x</sub>", "Smooth field along x", "virt (a) and (i)",
+        "The applied compression, a nearly linear profile.",
+        _v0(0),
+    ),
+    SnapshotPanel(
+        "v0y", "v<sub>0</sub> · e<sub>y</sub>", "Smooth field along y", "virt (b) and (j)",
+        "Lateral expansion before buckling. The pattern, once it is there, undoes it near the "
+        "specimen's centre: the auxetic effect. The far edges still expand.",
+        _v0(1),
+    ),
+    SnapshotPanel(
+        "v1", "v<sub>1</sub>", "Amplitude of the mode", "virt (c) and (k)",
+        "Where the pattern lives; blank where φ<sub>1</sub> is zero and v<sub>1</sub> means "
+        "nothing. The values are large because φ<sub>1</sub> is scaled to 0.04. Near the corners "
+        "it also takes up part of the edge effect.",
+        _v1, True,
+    ),
+    SnapshotPanel(
+        "phi1", "φ<sub>1</sub>", "The mode", "virt (d) and (l)",
+        "The identified mode as a deformed configuration over the undeformed outline, enlarged "
+        "to a largest displacement of 0.16 l.",
+        _phi1, True,
+    ),
+    SnapshotPanel(
+        "flucx", "v<sub>1</sub>φ<sub>1</sub> · e<sub>x</sub>", "Correlated fluctuation along x",
+        "virt (e) and (m)", "In the deformed configuration of this contribution alone.",
+        _fluctuation(0), True,
+    ),
+    SnapshotPanel(
+        "flucy", "v<sub>1</sub>φ<sub>1</sub> · e<sub>y</sub>", "Correlated fluctuation along y",
+        "virt (f) and (n)", "In the deformed configuration of this contribution alone.",
+        _fluctuation(1), True,
+    ),
+    SnapshotPanel(
+        "residual", "f − g∘φ", "Residual", "virt (g) and (o)",
+        "Grey levels as a fraction of full scale, in the deformed configuration; single pixels, "
+        "not averages. The colours end at the 99th percentile.",
+        _residual, exact=True,
+    ),
+    SnapshotPanel(
+        "w", "‖w‖", "Microfluctuation field", "virt (h) and (p)",
+        "Truth − IDIC, all that the measurement does not say, in the deformed configuration. "
+        "The colours end at the 99.8th percentile.",
+        _length_of("w"),
+    ),
+    SnapshotPanel(
+        "best", "‖u − u<sub>best</sub>‖", "What the model can't say", "",
+        "Truth − best fit of the same unknowns to the true displacement: no measurement with "
+        "this ansatz can do better.",
+        _length_of("best_error"),
+    ),
+    SnapshotPanel(
+        "loss", "‖u<sub>IDIC</sub> − u<sub>best</sub>‖", "What the measurement loses", "",
+        "IDIC − best fit: what is lost on top, on its own, smaller scale.",
+        _length_of("idic_to_best"),
+    ),
+)  # fmt: skip

@@ -1,0 +1,240 @@
+"""Boundaries as curves to draw: of a mesh, of a mask, of a piece of an infinite lattice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from matplotlib.path import Path
+from numpy.typing import NDArray
+from skimage.measure import approximate_polygon, find_contours
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.periodicity import find_periodicity
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+
+_CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshBoundary:
+    """The edges that belong to one element only, in closed loops.
+
+    Parameters
+    ----------
+    nodes
+        (n, 2) node positions of the mesh [mm].
+    loops
+        For each loop (m, 3) node numbers: first corner, mid-side, second corner of each edge,
+        material on the left. Without mid-side nodes, the second column repeats the first.
+    """
+
+    nodes: FloatArray
+    loops: tuple[IntArray, ...]
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> MeshBoundary:
+        """Find the outline of a mesh."""
+        edges = _boundary_edges(mesh)
+        following = {int(a): k for k, a in enumerate(edges[:, 0])}
+        loops, seen = [], np.zeros(len(edges), dtype=bool)
+        for first in range(len(edges)):
+            loop, k = [], first
+            while not seen[k]:
+                seen[k] = True
+                loop.append(k)
+                k = following.get(int(edges[k, 2]), first)
+            if loop:
+                loops.append(edges[loop])
+        return cls(mesh.nodes, tuple(loops))
+
+    def path(self, displacement: FloatArray | None = None) -> Path:
+        """The outline, displaced by (n, 2) at the mesh's nodes [mm]; holes stay open when filled.
+
+        A quadratic edge is a parabola, which a Bezier curve of second order draws exactly.
+        """
+        nodes = self.nodes if displacement is None else self.nodes + displacement
+        vertices, codes = [], []
+        for loop in self.loops:
+            a, middle, b = (nodes[loop[:, k]] for k in range(3))
+            curved = loop[:, 1] != loop[:, 0]
+            control = np.where(curved[:, None], 2.0 * middle - 0.5 * (a + b), 0.5 * (a + b))
+            points = np.stack([control, b], axis=1).reshape(-1, 2)
+            vertices.append(np.vstack([a[:1], points, a[:1]]))
+            codes += [Path.MOVETO, *[Path.CURVE3] * len(points), Path.CLOSEPOLY]
+        return Path(np.vstack(vertices), codes)
+
+
+def _boundary_edges(mesh: Mesh) -> IntArray:
+    """(m, 3) corner, mid-side, corner of the edges that only one cell has."""
+    corners = _CORNERS[mesh.element]
+    has_middle = mesh.cells.shape[1] > corners
+    edges = []
+    for k in range(corners):
+        a, b = mesh.cells[:, k], mesh.cells[:, (k + 1) % corners]
+        edges.append(np.stack([a, mesh.cells[:, corners + k] if has_middle else a, b], axis=1))
+    every = np.vstack(edges)
+    pairs = np.sort(every[:, [0, 2]], axis=1)
+    _, number, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(every[count[number.ravel()] == 1])
+
+
+CELLS = 900
+"""Along the mask's longer side, at most about that many cells; an outline needs no more."""
+_TOLERANCE = 0.3  # cells that corners may be off, once straight runs have become one edge
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonBoundary(MeshBoundary):
+    """An outline whose edges are straight."""
+
+    def path(self, displacement: FloatArray | None = None) -> Path:
+        """The outline, displaced by (n, 2) at its corners [mm]; holes stay open when filled."""
+        moved = self.nodes if displacement is None else self.nodes + displacement
+        vertices: list[FloatArray] = [np.empty((0, 2))]
+        codes: list[np.uint8] = []
+        for loop in self.loops:
+            vertices += [moved[loop[:, 0]], moved[loop[:1, 0]]]
+            codes += [Path.MOVETO, *[Path.LINETO] * (len(loop) - 1), Path.CLOSEPOLY]
+        return Path(np.vstack(vertices), codes)
+
+
+def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> PolygonBoundary:
+    """Follow the edge of a mask.
+
+    Parameters
+    ----------
+    mask
+        (rows, cols) True on material.
+    grid
+        Its pixels.
+    least
+        Area [mm²] below which holes and islands are left out, as specks.
+
+    Returns
+    -------
+    PolygonOutline
+        Off the mask's edge by at most about a third of a cell; none for an empty mask.
+    """
+    factor = max(1, round(max(grid.shape) / CELLS))
+    cells = grid.binned(factor)
+    cover = np.pad(
+        _material_share(mask, factor), 1
+    )  # or what touches the image's edge would stay open
+    nodes: list[FloatArray] = [np.empty((0, 2))]
+    loops, count = [], 0
+    for contour in find_contours(cover, 0.5):  # type: ignore[no-untyped-call]
+        rounded = approximate_polygon(contour, _TOLERANCE)  # type: ignore[no-untyped-call]
+        corners = rounded[:-1] - 1.0
+        x, y = cells.to_mm(corners[:, 0], corners[:, 1])
+        if len(corners) < 3 or _polygon_area(x, y) <= least:
+            continue
+        first = count + np.arange(len(corners))
+        loops.append(np.stack([first, first, np.roll(first, -1)], axis=1))
+        nodes.append(np.stack([x, y], axis=1))
+        count += len(corners)
+    return PolygonBoundary(np.vstack(nodes), tuple(loops))
+
+
+def _material_share(mask: BoolArray, factor: int) -> NDArray[np.float32]:
+    """Share of material in blocks of pixels; incomplete blocks are dropped."""
+    rows, cols = (size // factor for size in mask.shape)
+    blocks = mask[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
+
+
+def _polygon_area(x: FloatArray, y: FloatArray) -> float:
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+_SPARE = 0.15  # of the window: how much further the copies reach, for what a deformation brings in
+
+
+@dataclass(frozen=True, eq=False)
+class LatticePatch:
+    """Copies of a cell, joined where they touch.
+
+    Parameters
+    ----------
+    mesh
+        Of all copies together, undeformed [mm].
+    outline
+        Its outline: holes and the ragged outer edge, which the window cuts off.
+    lattice
+        (2, 2) lattice vectors of the cell as rows [mm].
+    node, copy
+        (N,) which node of the cell each node is, and (N, 2) in which copy.
+    centre
+        (2,) middle of the cell and of the window [mm].
+    window
+        (2,) width and height [mm].
+    """
+
+    mesh: Mesh
+    outline: MeshBoundary
+    lattice: FloatArray
+    node: IntArray
+    copy: IntArray
+    centre: FloatArray
+    window: FloatArray
+
+    @classmethod
+    def of(cls, mesh: Mesh, lattice: FloatArray, window: tuple[float, float]) -> LatticePatch:
+        """Fill a window [mm] about the middle of a periodic cell with copies of it."""
+        lattice, size = np.asarray(lattice, dtype=np.float64), np.asarray(window)
+        found = find_periodicity(mesh, lattice)
+        copies = _cells_in_window(mesh, lattice, size)
+        # A node of the lattice: its master's number, and the copy the master would be in.
+        shifts = (copies[:, None] + found.shift).reshape(-1, 2)
+        names = np.column_stack([shifts, np.tile(found.master, len(copies))])
+        _, first, number = np.unique(names, axis=0, return_index=True, return_inverse=True)
+        node, copy = first % len(mesh.nodes), copies[first // len(mesh.nodes)]
+        numbers = number.reshape(len(copies), -1)
+        cells = numbers[:, mesh.cells].reshape(-1, 6)
+        joined = Mesh(mesh.nodes[node] + copy @ lattice, cells, "T6")
+        return cls(joined, MeshBoundary.of(joined), lattice, node, copy, _middle(mesh), size)
+
+    @property
+    def limits(self) -> tuple[float, float, float, float]:
+        """(left, right, bottom, top) of the window [mm]."""
+        (left, bottom), (right, top) = self.centre - self.window / 2, self.centre + self.window / 2
+        return (left, right, bottom, top)
+
+    @property
+    def cell_corners(self) -> FloatArray:
+        """(4, 2) corners of the parallelogram of the lattice vectors about the middle [mm]."""
+        a1, a2 = self.lattice
+        return np.array([self.centre + 0.5 * (s * a1 + t * a2)
+                         for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))])  # fmt: skip
+
+    def moved(self, values: FloatArray, gradient: FloatArray | None = None) -> FloatArray:
+        """(N, 2) displacement of all copies from the cell's, the window's middle staying.
+
+        Parameters
+        ----------
+        values
+            (n, 2) displacement of the cell's nodes [mm]: periodic but for the affine part.
+        gradient
+            (2, 2) F̄ of the affine part [-]; None for a periodic field.
+        """
+        if gradient is None:
+            return np.asarray(values[self.node])
+        stretch = np.asarray(gradient) - np.eye(2)
+        offsets = self.copy @ self.lattice - self.centre
+        return np.asarray(values[self.node] + offsets @ stretch.T)
+
+
+def _middle(mesh: Mesh) -> FloatArray:
+    return np.asarray(0.5 * (mesh.nodes.min(axis=0) + mesh.nodes.max(axis=0)))
+
+
+def _cells_in_window(mesh: Mesh, lattice: FloatArray, window: FloatArray) -> IntArray:
+    """(c, 2) the copies whose bounding box meets the window, with some to spare."""
+    half = 0.5 * (window + np.ptp(mesh.nodes, axis=0)) + _SPARE * window
+    inverse = np.linalg.inv(lattice)
+    corners = np.array([[s, t] for s, t in product((-1, 1), repeat=2)]) * half @ inverse
+    far = np.ceil(np.abs(corners).max(axis=0)).astype(int)
+    every = np.array(list(product(*(range(-n, n + 1) for n in far))), dtype=np.int64)
+    return np.asarray(every[np.all(np.abs(every @ lattice) <= half, axis=1)])

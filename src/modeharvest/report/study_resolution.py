@@ -1,0 +1,392 @@
+"""Report of a resolution study: transfer by degree, noise against resolution, pass band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.ticker import FuncFormatter
+
+from modeharvest.report.figures.style import BLUE, GREEN, INK, MUTED, RED, figure, style
+from modeharvest.report.model import Findings, KeyNumber, Plot, short
+from modeharvest.validation.resolution.buckled import ResolutionSpec
+from modeharvest.validation.resolution.transfer import KEPT
+from modeharvest.validation.resolution.waves import (
+    AXES,
+    QUANTITIES,
+    WAVED,
+    DegreeResolution,
+    Passband,
+    TransferCurves,
+    degrees_of,
+    subset_indicator,
+)
+from modeharvest.validation.studies.resolution import ResolutionStudy, measured_waves, noise_floors
+
+_DEGREES: Colormap = mpl.colormaps["viridis"]
+
+
+def draw_transfer(
+    part: str, curves: TransferCurves, waves: pd.DataFrame, subject: ResolutionSpec
+) -> Plot:
+    """Draw T over the period for waves of a part along both axes, degrees in colours."""
+    pitch = subject.buckled.specimen.pitch
+    degrees = sorted({key[2] for key in curves.own})
+    with style():
+        drawn = figure(9.4, 3.1)
+        both = drawn.subplots(1, 2, sharey=True)
+        for axis, axes in enumerate(both):
+            axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+            for degree in degrees:
+                colour = _colour(degree, degrees)
+                axes.plot(curves.periods / pitch, curves.own[part, axis, degree], color=colour,
+                          label=str(degree), linewidth=1.3)  # fmt: skip
+            if len(waves):
+                here = waves[(waves["wave of"] == part) & (waves["along"] == AXES[axis])]
+                for degree, points in here.groupby("degree"):
+                    axes.plot(points["period [cells]"], points["images"], "o", ms=4,
+                              color=_colour(int(degree), degrees), mec=INK, mew=0.5)  # fmt: skip
+            axes.set(xscale="log", xlabel=f"period along {AXES[axis]} [cells]", ylim=(-0.03, 1.04))
+            axes.grid(color=MUTED, alpha=0.18, lw=0.6)
+            _plain(axes)
+        both[0].set_ylabel("share that is found [–]")
+        both[1].legend(frameon=False, fontsize=7.5, title="degree", title_fontsize=7.5,
+                       loc="lower right")  # fmt: skip
+        drawn.tight_layout()
+    caption = (
+        f"Waves of {part}, over both phases. Lines: best fits of the ansatz to the displacement; "
+        "dots: correlated images. Dotted: 10 % are lost."
+    )
+    if part == "v1":
+        caption += (
+            " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds "
+            "cos(πx/l) / 2."
+        )
+    return Plot(f"transfer-{part}", f"What is found of a wave of {part}", drawn, caption, wide=True)
+
+
+def draw_indicators(degrees: Sequence[DegreeResolution], local: float, made: str) -> Plot:
+    """Draw noise floors over l10 for all degrees, and the line of an affine subset."""
+    with style():
+        drawn = figure(4.6, 3.3)
+        axes = drawn.add_subplot()
+        ends = []
+        for part, floor, colour in (("v0", "v0", BLUE), ("v1", "v1phi1", RED)):
+            x = [np.sqrt(d.finest_px[f"{part} x"] * d.finest_px[f"{part} y"]) for d in degrees]
+            y = [1e3 * d.floor_px[floor] for d in degrees]
+            ends += x
+            label = "v0" if part == "v0" else "v1 φ1"
+            axes.plot(x, y, color=colour, marker="o", ms=4, linewidth=1, label=label)
+            for d, at, high in zip(degrees, x, y, strict=True):
+                axes.annotate(str(d.degree), (at, high), (4, 3), textcoords="offset points",
+                              fontsize=6.5, color=colour)  # fmt: skip
+        line = np.array([min(ends), max(ends)])
+        axes.plot(line, 1e3 * local / line, color=GREEN, linestyle="--", linewidth=1,
+                  label="affine subset of any size (theory)")  # fmt: skip
+        axes.set(xscale="log", yscale="log", xlabel="l₁₀ % [px]", ylabel="noise floor n [10⁻³ px]")
+        axes.grid(color=MUTED, alpha=0.18, lw=0.6)
+        axes.legend(frameon=False, fontsize=7.5)
+        _plain(axes)
+        axes.yaxis.set_major_formatter(_FORMAT)
+        axes.yaxis.set_minor_formatter(_FORMAT)
+        drawn.tight_layout()
+    caption = (
+        f"Numbers: the degree. l₁₀ %: mean of both axes; n: by the covariance; {made}. Along the "
+        "dashed line, and any parallel to it, the indicator n l₁₀ % is the same."
+    )
+    return Plot("indicators", "Noise against resolution", drawn, caption)
+
+
+def draw_passband(passband: Passband, degree: int) -> Plot:
+    """Draw what is found of patterns of other wavelengths, beside the mode and instead of it."""
+    with style():
+        drawn = figure(4.6, 3.3)
+        axes = drawn.add_subplot()
+        axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+        axes.plot(passband.stretch, passband.added, color=BLUE, label="a small one beside it")
+        known = np.isfinite(passband.itself)
+        axes.plot(passband.stretch[known], passband.itself[known], "o", ms=3.5, color=RED,
+                  label="the pattern itself")  # fmt: skip
+        axes.set(xlabel="wave numbers over the mode's [–]", ylabel="share that is found [–]",
+                 ylim=(-0.03, 1.18))  # fmt: skip
+        axes.grid(color=MUTED, alpha=0.18, lw=0.6)
+        axes.legend(frameon=False, fontsize=7.5, loc="upper center", ncols=2)
+        drawn.tight_layout()
+    caption = (
+        f"Degree {degree}; best fits. Line: a small pattern with other wave numbers than the "
+        "mode's, added to it: v0 takes the longest, v1 those next to the mode, between them "
+        "nothing passes. Dots: the pattern itself has them, and the fit starts from the mode: "
+        "its wave numbers are unknowns and follow, until the fit ends elsewhere."
+    )
+    return Plot("passband", "Patterns of other wavelengths", drawn, caption)
+
+
+_FORMAT = FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "1235" else "")
+
+
+def _plain(axes: Axes) -> None:
+    """Write 20 rather than 2 x 10^1."""
+    axes.xaxis.set_major_formatter(_FORMAT)
+    axes.xaxis.set_minor_formatter(_FORMAT)
+    axes.tick_params(axis="both", which="minor", labelsize=7, labelcolor=INK)
+
+
+def _colour(degree: int, degrees: Sequence[int]) -> tuple[float, ...]:
+    """From dark to bright with the degree."""
+    low, high = min(degrees), max(degrees)
+    return _DEGREES(0.9 * (degree - low) / max(1, high - low))
+
+
+_KEPT = 0.85
+"""Share of a wave that is found, from which on images are set against best fits apart [-]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What a resolution study has found.
+
+    Parameters
+    ----------
+    subject
+        What was measured.
+    degrees, chosen
+        All degrees, and the one that is told of most: that of the subject's own v0.
+    curves, passband
+        Best fits of waves, and of patterns of other wavelengths.
+    waves, floors
+        Tables: images against best fits, scatter against covariance.
+    local_px2
+        The indicator of an affine subset [px^2].
+    """
+
+    subject: ResolutionSpec
+    degrees: list[DegreeResolution]
+    chosen: DegreeResolution
+    curves: TransferCurves
+    passband: Passband
+    waves: pd.DataFrame
+    floors: pd.DataFrame
+    local_px2: float
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The same in words, the most important first."""
+        return (
+            self._finest,
+            self._trade_off,
+            self._product,
+            "What a degree gains in resolution it costs in noise, so the indicator does not "
+            "choose: take the smallest degree whose period is below what v0 and v1 are expected "
+            "to show.",
+            *([self._images] if len(self.waves) else []),
+            *([self._noise] if len(self.floors) else []),
+            self._pattern,
+        )
+
+    @property
+    def _pitch_px(self) -> float:
+        return self.subject.buckled.specimen.pitch / self.subject.buckled.pixel_size
+
+    @property
+    def _finest(self) -> str:
+        b, pitch = self.subject.buckled, self._pitch_px
+        width = 2.0 * b.specimen.half_size[0] / b.pixel_size
+        v0, v1 = (self.chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
+        return (
+            f"At degree {self.chosen.degree} a wave along x keeps 90 % of its amplitude from a "
+            f"period of {v0:.0f} px on if it is of v0 ({v0 / pitch:.1f} cells, "
+            f"{100 * v0 / width:.0f} % of the specimen's width), and from {v1:.0f} px on "
+            f"({v1 / pitch:.1f} cells) if it is of v1, which lives in the cellular part only."
+        )
+
+    @property
+    def _trade_off(self) -> str:
+        first, last, pitch = self.degrees[0], self.degrees[-1], self._pitch_px
+        return (
+            f"From degree {first.degree} to {last.degree} that period of v0 falls from "
+            f"{first.finest_px['v0 x'] / pitch:.1f} to {last.finest_px['v0 x'] / pitch:.1f} cells, "
+            f"and the noise floor of v0 rises from {1e3 * first.floor_px['v0']:.2g} to "
+            f"{1e3 * last.floor_px['v0']:.2g} · 10⁻³ px, that of v1 φ1 from "
+            f"{1e3 * first.floor_px['v1phi1']:.2g} to {1e3 * last.floor_px['v1phi1']:.2g} · 10⁻³ "
+            "px."
+        )
+
+    @property
+    def _product(self) -> str:
+        first, last = self.degrees[0], self.degrees[-1]
+        v0 = [d.indicator_px2["v0"] for d in self.degrees]
+        gain = first.finest_px["v0 x"] / last.finest_px["v0 x"]
+        return (
+            f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
+            f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
+            f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 held "
+            f"and without motion from {first.held_px2:.2f} to {last.held_px2:.2f} px²: the rest is "
+            "mostly the noise of φ1's own parameters. An affine subset on the same speckle under "
+            f"the same noise has {self.local_px2:.2f} px², whatever its size (theory)."
+        )
+
+    @property
+    def _images(self) -> str:
+        off, kept = self.waves["difference"].abs(), self.waves["best fit"] >= _KEPT
+        elsewhere = "" if kept.all() else f", elsewhere by {100 * off[~kept].max():.1f} %"
+        anywhere, resolved = self.curves.cross_talk()
+        return (
+            f"Correlated images give what the best fits promise: where these keep "
+            f"{100 * _KEPT:.0f} % or more of a wave of {self.subject.amplitude_px:g} px, its share "
+            f"differs by {100 * off[kept].max():.1f} % of the amplitude at most{elsewhere}. Of a "
+            f"wave of one part up to {100 * resolved:.1f} % is found in the other where it is "
+            f"resolved, up to {100 * anywhere:.0f} % where it isn't."
+        )
+
+    @property
+    def _noise(self) -> str:
+        ratio = self.floors["Monte Carlo / told"]
+        return (
+            f"Scatter under noise is {ratio.min():.2f} to {ratio.max():.2f} times what the "
+            f"results' own covariance tells, each ± {self.floors['±'].mean():.2f}, with and "
+            "without motion."
+        )
+
+    @property
+    def _pattern(self) -> str:
+        """Why l10 means nothing for the pattern itself."""
+        band = self.passband
+        kept = band.stretch[(band.stretch > 0.82) & (band.added >= 0.9)]
+        return (
+            "The pattern itself has a wavelength of 2 cells along x and y, "
+            f"{2 * self._pitch_px:.0f} px, far below those periods, and none of it is lost: it is "
+            "one of the functions that are fitted. A small pattern beside it passes as through a "
+            f"filter, from {kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
+            f"{self.chosen.degree}; but if the pattern itself is up to {100 * band.retuned:.0f} % "
+            "longer or shorter, its wave numbers follow, and all of its amplitude is found: "
+            "l₁₀ % is a filter's number, and φ1 isn't filtered but tuned."
+        )
+
+
+def report_resolution(study: ResolutionStudy, table: pd.DataFrame, folder: Path) -> Findings:
+    """Transfer, noise floors and indicators by degree."""
+    subject = ResolutionSpec.read(folder, table["subject"].iloc[0])
+    return resolution_findings(
+        table, subject, TransferCurves.of(subject, study.degrees), study.seeds
+    )
+
+
+def resolution_findings(
+    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves, seeds: str
+) -> Findings:
+    """Read the table of all cases.
+
+    Parameters
+    ----------
+    table
+        A row for each case of :func:`modeharvest.validation.studies.resolution.one_case`.
+    subject
+        What was measured.
+    curves
+        The best fits of waves at all degrees.
+    seeds
+        In words.
+    """
+    done = table[table["error"] == ""]
+    degrees = degrees_of(done, subject, curves)
+    floors, waves = noise_floors(done, subject), measured_waves(done, subject, curves)
+    chosen = min(degrees, key=lambda d: abs(d.degree - subject.buckled.how.v0_degree))
+    passband = Passband.of(subject, chosen.degree)
+    local = subset_indicator(subject)
+    answers = Answers(subject, degrees, chosen, curves, passband, waves, floors, local)
+    return Findings(
+        numbers={
+            "degrees": [asdict(d) for d in degrees],
+            "affine_subset_indicator_px2": local,
+            "images_against_best_fits": waves.to_dict("records"),
+            "noise": floors.to_dict("records"),
+            "cross_talk": dict(zip(("any_period", "resolved"), curves.cross_talk(), strict=True)),
+            "longest_retuned": passband.retuned,
+        },
+        sentences=answers.sentences,
+        keys=_keys(chosen, subject),
+        plots=(
+            *(draw_transfer(part, curves, waves, subject) for part in WAVED),
+            draw_indicators(degrees, local, seeds),
+            draw_passband(passband, chosen.degree),
+        ),
+        tables={
+            "By degree": _by_degree(degrees, subject),
+            "Images against best fits": waves,
+            "Noise floors": floors,
+        },
+        attachments={
+            "Finest periods": _finest(degrees, subject),
+            "Transfer": _transfer_table(curves, subject),
+        },
+    )
+
+
+def _by_degree(degrees: list[DegreeResolution], subject: ResolutionSpec) -> pd.DataFrame:
+    """A row for each degree."""
+    pitch_px = subject.buckled.specimen.pitch / subject.buckled.pixel_size
+    rows = []
+    for d in degrees:
+        row: dict[str, Any] = {"degree": d.degree, "unknowns": d.unknowns}
+        row |= {f"l10 of {name} [cells]": at / pitch_px for name, at in d.finest_px.items()}
+        row |= {f"n of {name} [10⁻³ px]": 1e3 * d.floor_px[name] for name in QUANTITIES}
+        row |= {f"n l10 of {part} [px²]": d.indicator_px2[part] for part in WAVED}
+        row["of v1, φ1 held [px²]"] = d.held_px2
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _finest(degrees: list[DegreeResolution], subject: ResolutionSpec) -> pd.DataFrame:
+    """A row for each degree and wave: l10 in px, in cells, and over what the wave runs through."""
+    b, rows = subject.buckled, []
+    lengths = {"v0": b.specimen.half_size, "v1": b.specimen.cellular_half_size}
+    for d in degrees:
+        for name, at in d.finest_px.items():
+            part, axis = name.split()
+            length = 2.0 * lengths[part][AXES.index(axis)] / b.pixel_size
+            rows.append({
+                "degree": d.degree, "wave of": part, "along": axis, "l10 [px]": at,
+                "l10 [mm]": at * b.pixel_size, "l10 [cells]": at * b.pixel_size / b.specimen.pitch,
+                "l10 [% of the specimen, of its cellular part for v1]": 100.0 * at / length,
+            })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def _transfer_table(curves: TransferCurves, subject: ResolutionSpec) -> pd.DataFrame:
+    """A row for each curve and period."""
+    px = subject.buckled.pixel_size
+    parts = [
+        pd.DataFrame({
+            "wave of": part, "along": AXES[axis], "degree": degree,
+            "period [mm]": curves.periods, "period [px]": curves.periods / px,
+            "own part": curve, "whole": curves.whole[part, axis, degree],
+        })
+        for (part, axis, degree), curve in curves.own.items()
+    ]  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
+
+
+def _keys(chosen: DegreeResolution, subject: ResolutionSpec) -> tuple[KeyNumber, ...]:
+    pitch = subject.buckled.specimen.pitch / subject.buckled.pixel_size
+    at = f"degree {chosen.degree}"
+    keys = []
+    for part in WAVED:
+        x, y = (chosen.finest_px[f"{part} {axis}"] / pitch for axis in AXES)
+        keys.append(KeyNumber(f"l₁₀ % of {part}", f"{x:.1f} – {y:.1f}", "cells", f"{at}; x – y"))
+    noise = f"{at}; {100 * subject.noise:g} % of noise"
+    keys += [
+        KeyNumber(f"n of {name}", f"{1e3 * chosen.floor_px[floor]:.2f}", "10⁻³ px", noise)
+        for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1"))
+    ]
+    keys += [
+        KeyNumber(f"n l₁₀ % of {part}", short(chosen.indicator_px2[part]), "px²", at)
+        for part in WAVED
+    ]
+    return tuple(keys)

@@ -1,0 +1,335 @@
+"""Benchmarks for DIC codes: a public set of images, and grades for the fields measured on it.
+
+::
+
+    DIR/         reference.tif … benchmark.json README.md      benchmark make
+    DIR-truth/   solution.h5 images/ benchmark.json
+    graded/      report.html scores.json scores.csv            score
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.tables import ALL_ROLES
+from modeharvest.report.grades import write_grading, write_star_grading
+from modeharvest.runs.case import Case, read_case
+from modeharvest.runs.experiment import Run
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import copy_whole, require_writable
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import exclusive
+from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
+from modeharvest.validation.resolution.star import StarSet
+from modeharvest.validation.scoring.benchmark import (
+    SOLUTION,
+    BenchmarkTruth,
+    publish,
+    require_apart,
+    require_no_lens,
+)
+from modeharvest.validation.scoring.conventions import check_conventions
+from modeharvest.validation.scoring.fields import Declared, read_measured
+from modeharvest.validation.scoring.grading import Grading
+from modeharvest.validation.scoring.score import (
+    EDGE_PX,
+    Score,
+    error_spectrum,
+    ranked,
+    regions,
+    score,
+)
+
+
+def grade_star(
+    fields: Mapping[Path, Declared],
+    stills: Mapping[Path, Declared],
+    folder: Path | str,
+    out: Path | str,
+    progress: Progress = silent,
+) -> StarGrading:
+    """Grade fields measured on a star set; leaves a report, JSON and CSV.
+
+    Parameters
+    ----------
+    fields
+        Files of the deformed image, with what they don't say themselves.
+    stills
+        Files of the image without motion, one for each field in the same order; or none.
+    folder
+        The star set.
+    out
+        Folder for the report.
+    progress
+        Listener.
+
+    Returns
+    -------
+    StarGrading
+        Of the fields that can be graded; those that can't be read, are of another set, in
+        millimetres or don't hold the wave are in its ``refused``, each with the reason.
+
+    Raises
+    ------
+    InputError
+        If no field can be graded, or two have one name.
+    """
+    if stills and len(stills) != len(fields):
+        raise InputError(
+            f"expected a --still for each of {len(fields)} fields, or none, got {len(stills)}"
+        )
+    star_set = StarSet.read(folder)
+    require_writable(out)
+    still_of = dict(zip(fields, stills.items(), strict=bool(stills)))
+    grades: list[StarGrade] = []
+    refused: dict[str, str] = {}
+    for n, (path, declared) in enumerate(fields.items()):
+        progress(n, len(fields) + 1, f"resolution: {path.name}")
+        try:
+            moved = _read_star_field(path, declared, star_set)
+            still = _read_star_field(*still_of[path], star_set) if stills else None
+            grade = StarGrade(star_set.spec.star, moved, still)
+        except InputError as error:
+            refused[str(path)] = str(error)
+            continue
+        if any(grade.name == other.name for other in grades):
+            raise InputError(
+                f"expected fields of different names, got {grade.name} twice; give --name"
+            )
+        grades.append(grade)
+    if not grades:
+        raise InputError("; ".join(refused.values()))
+    progress(len(fields), len(fields) + 1, "resolution: report")
+    grading = StarGrading(star_set, tuple(ranked_grades(grades)), refused)
+    write_star_grading(out, grading)
+    progress(1, 1, "resolution")
+    return grading
+
+
+def _read_star_field(path: Path, declared: Declared, star_set: StarSet) -> LocalField:
+    """A field in px on the star's grid; InputError if it is in another unit."""
+    if "mm" in (declared.units, declared.displacement_units):
+        raise InputError(f"{path}: expected a field in px, got mm; a star has no millimetres")
+    declared = replace(declared, units=declared.units or "px")
+    return read_measured(path, star_set.spec.star.grid, star_set.id, declared)
+
+
+REACH_CELLS = 0.25
+"""How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""
+
+T = TypeVar("T")
+
+
+def make_benchmark(
+    case: str | Path | Case,
+    public: Path | str,
+    truth: Path | str | None = None,
+    solution: Path | str | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Simulate a case, image it, and part the images from their truth.
+
+    What is finished is not done again, as in every run.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a Case.
+    public
+        Folder for what anybody may have.
+    truth
+        Folder for the truth; by default beside the public one, with "-truth" after its name.
+    solution
+        Use this solution (HDF5) instead of simulating.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of the public ``benchmark.json``.
+
+    Raises
+    ------
+    InputError
+        If the case's images are distorted, the truth would be in the public folder, the solution
+        is of another case, or another process works in one of the folders.
+    """
+    case, public = case if isinstance(case, Case) else read_case(case), Path(public)
+    require_no_lens(case.imaging)
+    truth = truth_folder(public) if truth is None else Path(truth)
+    require_apart(public, truth)
+    with exclusive(public), exclusive(truth):
+        require_writable(public)
+        run = Run(case, truth, progress, None if solution is None else Path(solution))
+        run.solved()
+        if solution is not None:
+            copy_whole(solution, truth / SOLUTION)
+        return publish(run.image(), case.experiment.specimen, public, truth)
+
+
+def truth_folder(public: Path) -> Path:
+    """Where the truth of a public folder is by default."""
+    named = public if public.name not in ("", "..") else public.resolve()
+    return named.with_name(f"{named.name}-truth")
+
+
+def grade(
+    fields: Mapping[Path, Declared] | Sequence[Path | str],
+    truth: Path | str,
+    strain: float,
+    out: Path | str,
+    edge_px: int = EDGE_PX,
+    progress: Progress = silent,
+) -> Grading:
+    """Grade displacement fields and write ``report.html``, ``scores.json`` and ``scores.csv``.
+
+    Parameters
+    ----------
+    fields
+        Their files, with what the files don't say themselves.
+    truth
+        The truth's folder.
+    strain
+        Nominal strain of the image that they were measured on [-].
+    out
+        Folder for the report.
+    edge_px
+        Material closer than this to a hole or to the outside counts as edge [px].
+    progress
+        Listener.
+
+    Returns
+    -------
+    Grading
+        Of the fields that can be graded; those that can't be read, are of another benchmark or in
+        another unit than declared are in its ``refused``, each with the reason.
+
+    Raises
+    ------
+    InputError
+        If no field can be graded, or two have one name.
+    """
+    every = fields if isinstance(fields, Mapping) else {Path(f): Declared() for f in fields}
+    _require_names(every)
+    known = BenchmarkTruth.read(truth)
+    require_writable(out)
+    grid = known.grid
+    labels = regions(known.mask, grid, known.specimen, edge_px)
+    true = partial(known.displacement, strain)
+    reach_px = REACH_CELLS * known.specimen.pitch / grid.pixel_size
+    scores: list[Score] = []
+    remarks: list[str] = []
+    refused: dict[str, str] = {}
+    for n, (path, declared) in enumerate(every.items()):
+        progress(n, len(every) + 1, f"score: {path.name}")
+        try:
+            field = read_measured(path, grid, known.id, declared)
+            graded = score(field, true(field.x, field.y), labels, grid, reach_px)
+            _, told = check_conventions(field, true, grid)
+        except InputError as error:
+            refused[str(path)] = str(error)
+            continue
+        scores.append(graded)
+        remarks += told
+    if not scores:
+        raise InputError("; ".join(refused.values()))
+    best_first = ranked(scores)
+    progress(len(every), len(every) + 1, "score: report")
+    spectra = {graded.source: error_spectrum(graded, grid) for graded in best_first}
+    done = Grading(
+        known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks), refused
+    )
+    write_grading(out, done)
+    progress(1, 1, "score")
+    return done
+
+
+def _require_names(fields: Mapping[Path, Declared]) -> None:
+    """Raise InputError if there is no field, or two of one name."""
+    if not fields:
+        raise InputError("expected fields to grade, got none")
+    names = [declared.name or path.stem for path, declared in fields.items()]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"expected fields of different names, got {', '.join(twice)} twice; give each a --name"
+        )
+
+
+def declarations(
+    paths: Sequence[Path],
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    y_axes: Sequence[str] | None = None,
+    first_pixels: Sequence[int] | None = None,
+    columns: Sequence[str] | None = None,
+) -> dict[Path, Declared]:
+    """What a command line declares of each file.
+
+    Parameters
+    ----------
+    paths
+        The files.
+    names
+        One for each, or none.
+    units, y_axes, first_pixels
+        One for all, or one for each; "file" where the columns' names say it.
+    columns
+        "u=NAME" or "u=7", for all files.
+
+    Raises
+    ------
+    InputError
+        If there are neither one nor as many as files.
+    """
+    if len(set(paths)) < len(paths):
+        raise InputError(f"expected different files to score, got {', '.join(map(str, paths))}")
+    if names and len(names) != len(paths):
+        raise InputError(f"expected a --name for each of {len(paths)} files, got {len(names)}")
+    named = _each(names, paths, "--name")
+    in_units = _each(units, paths, "--unit")
+    axes = _each(y_axes, paths, "--y-axis")
+    first = _each(first_pixels, paths, "--first-pixel")
+    if not set(first) <= {None, 0, 1}:
+        raise InputError(f"expected --first-pixel 0 or 1, got {', '.join(map(str, first))}")
+    roles = dict(map(_column, columns or ()))
+    return {
+        path: Declared(
+            name=named[k],
+            units=None if in_units[k] == "file" else in_units[k],
+            y_axis=None if axes[k] == "file" else axes[k],
+            first_pixel=first[k] or 0,
+            columns=roles,
+        )
+        for k, path in enumerate(paths)
+    }
+
+
+def _each(given: Sequence[T] | None, paths: Sequence[Path], option: str) -> Sequence[T | None]:
+    """One value for each file."""
+    if not given:
+        return [None] * len(paths)
+    if len(given) == 1:
+        return [given[0]] * len(paths)
+    if len(given) != len(paths):
+        raise InputError(
+            f"expected {option} once, or once for each of {len(paths)} files, got {len(given)}"
+        )
+    return list(given)
+
+
+def _column(text: str) -> tuple[str, str | int]:
+    role, sign, name = text.partition("=")
+    if not sign or not name:
+        raise InputError(f"expected --column ROLE=NAME, as u=disp_x or u=3, got {text!r}")
+    if role not in ALL_ROLES:
+        raise InputError(
+            f"expected --column for one of {', '.join(ALL_ROLES)}, got {role!r} in {text!r}"
+        )
+    return role, int(name) if name.isdigit() else name

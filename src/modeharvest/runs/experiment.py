@@ -1,0 +1,391 @@
+"""A virtual experiment from simulation to report, in stages that can be run apart and resumed.
+
+::
+
+    solution.h5 solution.vtu    fem        what the finite elements found
+    images/                     image      speckle images, masks, truth
+    correlation/                correlate  one result for each image
+    report.html summary.json    validate   how large the errors are, and why
+    stages.json timings.json               which stages are finished, and what they took
+
+A stage whose inputs, options and code have not changed, and whose files are what it wrote, is
+not run again. Two runs of a case leave the same bytes in every file but ``timings.json``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.field import Solution
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.result import Result
+from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
+from modeharvest.report.experiment import write_experiment_report
+from modeharvest.runs.case import Case, read_case, shipped_cases, shipped_solution
+from modeharvest.runs.precompile import precompiling
+from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.machine import on_first
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import Stages, exclusive, stage_key
+from modeharvest.validation.summary import (
+    MeasuredExperiment,
+    compare_snapshot,
+    displacement_spectrum,
+    experiment_summary,
+    snapshot_summary,
+)
+
+
+def validate(
+    measured: MeasuredExperiment,
+    case: Mapping[str, Any],
+    folder: Path,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Compare the results of an image set with its truth and write the summary and the report.
+
+    Parameters
+    ----------
+    measured
+        What is to be judged.
+    case
+        What was run, as plain values, for the record; its ``title`` heads the report.
+    folder
+        Where ``summary.json`` and ``report.html`` go.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    comparisons = []
+    for k, strain in enumerate(sorted(measured.results)):
+        progress(k, len(measured.results), "compare with the truth")
+        comparisons.append(compare_snapshot(measured, strain))
+    with ThreadPoolExecutor(os.cpu_count()) as threads:  # numpy's work, and it lets go of the GIL
+        spectra = list(
+            threads.map(lambda c: displacement_spectrum(c, measured.specimen), comparisons)
+        )
+        patterns = [pattern for _, pattern in spectra]
+        snapshots = list(
+            threads.map(
+                lambda c, pattern: snapshot_summary(c, pattern, measured), comparisons, patterns
+            )
+        )
+
+    summary = experiment_summary(measured, case, snapshots)
+    page = folder / "report.html"
+    solution, images = measured.solution, measured.images
+    write_experiment_report(
+        page, dict(case), solution, images, comparisons, spectra, summary, progress
+    )
+    write_json(folder / "summary.json", summary)
+    return summary
+
+
+_COMPLETE = "complete"
+_NO_DOLFINX = (
+    "the finite-element stage needs dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda "
+    "install -c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'; or take a solution "
+    "made elsewhere: --solution FILE"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A case, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    case
+        What to do.
+    folder
+        Where; made if it does not exist.
+    progress
+        Listener.
+    solution
+        A solution file to use instead of simulating.
+    """
+
+    case: Case
+    folder: Path
+    progress: Progress = silent
+    solution: Path | None = None
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    def fem(self) -> Solution:
+        """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
+
+        Without dolfinx, a shipped case's own solution is taken instead.
+
+        Raises
+        ------
+        MissingDependencyError
+            If dolfinx is not there and no solution of this case is shipped.
+        """
+        path = self.folder / "solution.h5"
+        vtu = path.with_suffix(".vtu")
+
+        def write(solution: Solution) -> None:
+            solution.write(path)
+            solution.write_vtu(vtu)
+
+        def work() -> tuple[Path, ...]:
+            solution = self._simulate()
+            on_first(lambda: write(solution))
+            return path, vtu
+
+        key = stage_key(self.case.plain()["experiment"], "fem")
+        self.stages.do("fem", key, work, collective=True)
+        return Solution.read(path)
+
+    def solved(self) -> Solution:
+        """The solution that was given, or else a simulated one.
+
+        Raises
+        ------
+        InputError
+            If the one given is of another experiment, or lacks one of its strains.
+        """
+        return self.fem() if self.solution is None else self._solution()
+
+    def image(self) -> ImageSet:
+        """Make images and truth of the solution's snapshots in ``images/``.
+
+        Raises
+        ------
+        InputError
+            If the solution is of another experiment, or lacks one of its strains although its
+            simulation did not end early.
+        """
+        solution, folder = self._solution(), self.folder / "images"
+        strains, spec = self._strains(solution), self.case.imaging
+        key = image_key(solution, strains, spec)
+        self.stages.do(
+            "image", key, lambda: make_images(solution, strains, spec, folder, self.progress).files
+        )
+        return ImageSet.read(folder)
+
+    def correlate(self) -> dict[float, Result]:
+        """Correlate every deformed image with the reference; leaves ``correlation/``.
+
+        Raises
+        ------
+        InputError
+            If the images were made of another experiment or with other options than this case's.
+        """
+        images = self._images()
+        paths = {strain: self._result_path(strain) for strain in images.strains}
+
+        def work() -> list[Path]:
+            for strain, path in paths.items():
+                self._correlate_one(images, strain).write(path)
+            return list(paths.values())
+
+        self.stages.do("correlate", self._correlate_key(images), work)
+        return {strain: Result.read(path) for strain, path in paths.items()}
+
+    def validate(self) -> dict[str, Any]:
+        """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If the results are not of these images and this case.
+        """
+        images = self._images()
+        correlated = self._correlate_key(images)
+        if not self.stages.is_finished("correlate", correlated):
+            raise InputError(
+                f"expected results of this case in {self.folder / 'correlation'}, found none that "
+                "are finished and whole; make them with 'modeharvest correlate'"
+            )
+        path, page = self.folder / "summary.json", self.folder / "report.html"
+
+        def work() -> tuple[Path, Path]:
+            results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
+            case = self.case
+            measured = MeasuredExperiment(
+                case.experiment, case.correlation, self._solution(), images, results
+            )
+            validate(measured, case.plain(), self.folder, self.progress)
+            return path, page
+
+        self.stages.do("validate", stage_key([correlated, self.case.title]), work)
+        summary: dict[str, Any] = read_json(path)
+        return summary
+
+    def all(self) -> dict[str, Any]:
+        """Run every stage that is not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            At once, if another process works in the folder. At the end, if the simulation did
+            not reach all strains asked for: what it did reach is reported.
+        """
+        with exclusive(self.folder):
+            ahead = [stage for stage in ("image", "correlate") if stage not in self.stages.timings]
+            with precompiling(ahead) as kernels:
+                solution = self.solved()
+                kernels.wait("image", self.progress)
+                self.image()
+                kernels.wait("correlate", self.progress)
+                self.correlate()
+            summary = self.validate()
+        outcome = _outcome(solution.info)
+        if outcome != _COMPLETE:
+            raise InputError(f"simulation {outcome}; what was reached is in {self.folder}")
+        return summary
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _images(self) -> ImageSet:
+        advice = "make it again with 'modeharvest image'"
+        self.stages.require_whole(self.folder / "images" / SIDECAR, advice)
+        images = ImageSet.read(self.folder / "images")
+        hint = f"in {images.folder}; make them again with 'modeharvest image'"
+        if images.spec != self.case.imaging:
+            raise InputError(f"expected images made with this case's options, got others {hint}")
+        info = images.info["solution"]
+        require_same_experiment(info, self.case.experiment, f"images {hint}")
+        self._reached(info, images.strains, f"images {hint}")
+        return images
+
+    def _correlate_key(self, images: ImageSet) -> str:
+        how = self.case.plain()["correlation"]
+        return stage_key([images.info["key"], how], "fem", "imaging", "idic")
+
+    def _simulate(self) -> Solution:
+        try:
+            from modeharvest.fem.simulate import simulate
+        except ImportError as error:
+            shipped = self._shipped()
+            if shipped is None:
+                raise MissingDependencyError(_NO_DOLFINX) from error
+            return shipped
+        return simulate(self.case.experiment, self.progress)
+
+    def _shipped(self) -> Solution | None:
+        """The solution that comes with the package, if it is of this very experiment."""
+        for name in shipped_cases():
+            path = shipped_solution(name)
+            if path is not None and read_case(name).experiment == self.case.experiment:
+                return Solution.read(path)
+        return None
+
+    def _solution(self) -> Solution:
+        """The solution that was given, or the folder's own; InputError if it isn't this case's."""
+        if self.solution is None:
+            advice = "make it again with 'modeharvest fem', or give it by --solution"
+            self.stages.require_whole(self._solution_path, advice)
+        solution = Solution.read(self._solution_path)
+        require_same_experiment(solution.info, self.case.experiment, self._solution_path)
+        self._strains(solution)
+        return solution
+
+    @property
+    def _solution_path(self) -> Path:
+        return self.solution or self.folder / "solution.h5"
+
+    def _strains(self, solution: Solution) -> list[float]:
+        """The strains asked for that the solution has."""
+        have = sorted({s.nominal_strain for s in solution.snapshots})
+        reached = self._reached(solution.info, have, self._solution_path)
+        for strain in reached:
+            branch, wanted = solution.at(strain).branch, self.case.experiment.branches
+            if branch not in ("primary", *wanted):
+                raise InputError(
+                    f"expected branch {' or '.join(wanted)} at strain {strain:g}, got {branch} in "
+                    f"{self._solution_path}"
+                )
+        return reached
+
+    def _reached(
+        self, info: Mapping[str, Any], have: Sequence[float], where: object
+    ) -> list[float]:
+        """The strains asked for that there are; of one's own simulation that ended early, some."""
+        wanted = self.case.experiment.strains
+        found = [e for e in wanted if any(abs(e - other) < 1e-9 for other in have)]
+        is_early = self.solution is None and _outcome(info) != _COMPLETE
+        if len(found) == len(wanted) or (found and is_early):
+            return found
+        said = f" (simulation {_outcome(info)})" if _outcome(info) != _COMPLETE else ""
+        raise InputError(
+            f"expected snapshots at strains {', '.join(f'{e:g}' for e in wanted)}, got "
+            f"{', '.join(f'{e:g}' for e in have) or 'none'}{said} in {where}"
+        )
+
+    def _result_path(self, strain: float) -> Path:
+        return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
+
+    def _correlate_one(self, images: ImageSet, strain: float) -> Result:
+        how, specimen = self.case.correlation, self.case.experiment.specimen
+        ansatz = how.ansatz(specimen)
+        return correlate(
+            images.reference(camera=how.camera),
+            images.deformed(strain, camera=how.camera),
+            images.grid,
+            ansatz,
+            how.start(ansatz, strain),
+            images.mask(),
+            images.deformed_mask(strain),
+            how.options(),
+            self.progress,
+        )
+
+
+def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, where: object) -> None:
+    """Raise InputError if a solution's ``info`` says that it is of another experiment.
+
+    That of another solver, read from its mesh, says nothing of it and is believed.
+    """
+    usual = Experiment().described()
+    for table, values in experiment.described().items():
+        for name, value in values.items() if table in info else ():
+            # What an older solution does not say was not to be chosen when it was made.
+            got = info[table].get(name, usual[table].get(name))
+            if got != value:
+                raise InputError(
+                    f"expected this case's {table}, {name} = {value}, got {got} in {where}"
+                )
+
+
+def _outcome(info: Mapping[str, Any]) -> str:
+    """How far a simulation went, in words."""
+    return str(info.get("outcome", _COMPLETE))
+
+
+def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
+    """Run a case from simulation to report; what ``modeharvest run`` does.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a Case.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    case = case if isinstance(case, Case) else read_case(case)
+    return Run(case, Path(folder), progress).all()

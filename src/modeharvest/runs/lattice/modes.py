@@ -1,0 +1,379 @@
+"""What a lattice buckles into: its critical point, its modes and branches, their mode families.
+
+``critical.json`` holds ``point``, the fields of
+:class:`modeharvest.runs.lattice.results.CriticalPoint`, and ``history``: for each load looked at
+the least stable wave (see ``fem.zone.LeastStable``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.bloch.modes import Branch, ModeSet
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import Material
+from modeharvest.idic.spectra.lattice_spectrum import lattice_spectrum
+from modeharvest.idic.spectra.mode_family import (
+    mode_family,
+    read_family,
+    read_spectrum,
+    write_family,
+)
+from modeharvest.runs.lattice.case import LatticeCase
+from modeharvest.runs.lattice.options import ModesPlan, Search
+from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, combination_name
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.files import read_json, reading, write_json
+from modeharvest.util.progress import Progress, named, silent
+
+if TYPE_CHECKING:
+    from modeharvest.fem.bloch.critical import LatticeCritical
+    from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+    from modeharvest.fem.lattice.cells import UnitCell
+
+
+def find_critical(path: CellPath, search: Search, progress: Progress = silent) -> LatticeCritical:
+    """Look for the first critical point over all wave vectors.
+
+    Raises
+    ------
+    InputError
+        If the lattice is a mechanism.
+    """
+    from modeharvest.fem.bloch.critical import first_critical
+    from modeharvest.fem.lattice.options import CriticalSearch
+
+    how = CriticalSearch(**asdict(search))
+    return first_critical(path, how, named(progress, "first critical load"))
+
+
+def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
+    """Write ``critical.json``."""
+    point = _in_order(CriticalPoint.of(loading, found))
+    history = [asdict(least) for least in found.history]
+    write_json(path, {"point": asdict(point), "history": history})
+
+
+def read_critical(path: Path) -> CriticalPoint:
+    """Read the point in ``critical.json``; InputError if it is damaged."""
+    with reading(path, "a critical point", "remove it"):
+        content = read_json(path)["point"]
+        waves = {name: tuple(map(tuple, content[name])) for name in ("waves", "earlier")}
+        signs = {name: tuple(content[name]) for name in ("below", "above")}
+        return CriticalPoint(**{**content, **waves, **signs})
+
+
+def _in_order(point: CriticalPoint) -> CriticalPoint:
+    """The same with its waves by phases, the largest first: rounding must not number the modes."""
+    every = zip(point.waves, point.below, point.above, strict=True)
+    ordered = sorted(every, key=lambda one: [-round(phase, 3) for phase in one[0]])
+    waves, below, above = zip(*ordered, strict=True) if ordered else ((), (), ())
+    return replace(point, waves=waves, below=below, above=above)
+
+
+BEYOND = (1.02, 1.1, 1.25, 1.5)
+"""Loads at which states of branches are kept, relative to the critical one."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicField:
+    """A periodic field in which a mode family is looked for.
+
+    Parameters
+    ----------
+    file
+        Name of the family's file, such as "family_mode_1.json".
+    name
+        What it is, such as "φ₁ at 8.8 %".
+    mesh, lattice
+        One period [mm], with its (2, 2) lattice vectors as rows [mm].
+    displacement, gradient
+        (n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2).
+    info
+        Load and whatever else must be known of it, as plain JSON values.
+    stable
+        Whether it is a stable equilibrium; None for modes.
+    energy
+        Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches.
+    """
+
+    file: str
+    name: str
+    mesh: Mesh
+    lattice: FloatArray
+    displacement: FloatArray
+    gradient: FloatArray
+    info: Mapping[str, Any]
+    stable: bool | None = None
+    energy: float = 0.0
+
+    @property
+    def values(self) -> FloatArray:
+        """(n, 2) without the affine part."""
+        affine = self.mesh.nodes @ (self.gradient - np.eye(2)).T
+        return np.asarray(self.displacement - affine)
+
+
+def why_no_modes(critical: CriticalPoint, plan: ModesPlan) -> str:
+    """Why there is no wave whose modes could be computed; empty if there is one."""
+    if plan.waves or critical.waves:
+        return ""
+    what = "long waves are modes of no finite cell" if critical.found else "nothing is critical"
+    return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
+
+
+def find_modes(
+    path: CellPath,
+    material: Material,
+    critical: CriticalPoint,
+    plan: ModesPlan,
+    step: float,
+    info: Mapping[str, Any],
+    progress: Progress = silent,
+) -> tuple[ModeSet, tuple[Branch, ...]]:
+    """The modes of a plan as real fields, and the branches that start with critical ones.
+
+    Parameters
+    ----------
+    path
+        The primary path of the primitive cell.
+    material
+        What that is made of.
+    critical
+        Its first critical point.
+    plan
+        Which modes and branches.
+    step
+        Largest step of the load along primary paths [-].
+    info
+        Plain JSON values to keep with the modes.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If a wave doesn't repeat within a dozen cells, the load can't be reached, or combinations
+        don't have one coefficient for each mode.
+    """
+    from modeharvest.fem.bloch.real_modes import real_modes
+
+    state = _state(path, plan.load or critical.load)
+    progress(0, 1, "modes")
+    modes = real_modes(path.cell, state, plan.phases or critical.waves, info)
+    progress(1, 1, "modes")
+    if not critical.found or state.load != critical.load:
+        return modes, ()
+    return modes, tuple(_branches(path, material, modes, plan, step, progress))
+
+
+def _branches(
+    path: CellPath,
+    material: Material,
+    modes: ModeSet,
+    plan: ModesPlan,
+    step: float,
+    progress: Progress,
+) -> list[Branch]:
+    """A branch for each combination of modes, on their commensurate cell."""
+    from modeharvest.fem.bloch.postbuckling import follow
+    from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+
+    combinations = plan.combinations or default_combinations(len(modes.waves))
+    loads = plan.branch_loads or tuple(factor * modes.load for factor in BEYOND)
+    cell = PeriodicCell(path.cell.cell.enlarged(*modes.info["copies"]), material)
+    found = []
+    for k, combination in enumerate(combinations, start=1):
+        listener = named(progress, f"branch {k} of {len(combinations)}")
+        enlarged = follow_to(CellPath(cell, path.loading), 0.98 * modes.load, step)
+        found.append(follow(enlarged, modes, combination, loads, progress=listener))
+    return found
+
+
+def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
+    """Each of some modes alone, and the sum of all where there are more."""
+    alone = [tuple(float(i == k) for i in range(count)) for k in range(count)]
+    return (*alone, (1.0,) * count) if count > 1 else tuple(alone)
+
+
+def periodic_fields(
+    path: CellPath,
+    load: float,
+    modes: ModeSet | None,
+    branches: Sequence[Branch],
+    info: Mapping[str, Any],
+) -> list[PeriodicField]:
+    """All fields in which families are looked for: modes, ends of branches, the primary path.
+
+    Parameters
+    ----------
+    path
+        The primary path of the primitive cell.
+    load
+        At which its fluctuation is taken [-].
+    modes, branches
+        What was found.
+    info
+        Plain JSON values to keep with each of them.
+    """
+    found = []
+    if modes is not None:
+        found += [_of_mode(modes, k, info) for k in range(len(modes.waves))]
+        ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
+        found += [_of_branch(modes, k, branch, info) for k, branch in ends]
+    return [*found, _of_primary(path, load, modes, info)]
+
+
+def _of_mode(modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
+    name = combination_name([float(j == k) for j in range(len(modes.waves))])
+    known = {**info, "load": modes.load, "wave": list(modes.waves[k])}
+    place = (modes.mesh, modes.lattice, modes.shapes[k], np.eye(2))
+    return PeriodicField(f"family_mode_{k + 1}.json", f"mode {name}", *place, known)
+
+
+def _of_branch(modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any]) -> PeriodicField:
+    """The last state of a branch."""
+    last = branch.states[-1]
+    name = f"{combination_name(branch.combination)} at {100 * last.load:.4g} %"
+    known = {**info, "load": last.load, "combination": list(branch.combination)}
+    place = (modes.mesh, modes.lattice, last.displacement, last.gradient)
+    energy = last.energy - last.primary_energy
+    stable = last.negative_eigenvalues == 0
+    return PeriodicField(f"family_branch_{k}.json", name, *place, known, stable, energy)
+
+
+def _of_primary(
+    path: CellPath, load: float, modes: ModeSet | None, info: Mapping[str, Any]
+) -> PeriodicField:
+    """The unbuckled lattice, on the modes' cell where there is one."""
+    state, unit = _state(path, load), path.cell.cell
+    mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
+    w = path.cell.displacement(state) - unit.mesh.nodes @ (state.gradient - np.eye(2)).T
+    known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
+    same = cKDTree(known, boxsize=1.0).query(wanted)[1]
+    u = w[same] + mesh.nodes @ (state.gradient - np.eye(2)).T
+    name = f"primary path at {100 * load:.4g} %"
+    return PeriodicField(
+        "family_primary.json", name, mesh, lattice, u, state.gradient, {**info, "load": load}, True
+    )
+
+
+def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
+    """(n, 2) fractional coordinates in [0, 1)."""
+    fractional = np.mod(nodes @ np.linalg.inv(lattice), 1.0)
+    return np.asarray(np.mod(fractional, 1.0))  # -1e-17 has become 1
+
+
+def find_family(pattern: PeriodicField, pitch: float, folder: Path) -> None:
+    """Find the family of a pattern and write it, with its Fourier coefficients, as JSON."""
+    place = (pattern.mesh, pattern.lattice, pattern.values, pitch)
+    found = mode_family(*place, info={**pattern.info, "of": pattern.name})
+    write_family(folder / pattern.file, found, spectrum=lattice_spectrum(*place))
+
+
+def found_pattern(pattern: PeriodicField, folder: Path) -> FoundPattern:
+    """A pattern with the family and spectrum that :func:`find_family` left.
+
+    Raises
+    ------
+    InputError
+        If the file lacks the Fourier coefficients.
+    """
+    path = folder / pattern.file
+    family, spectrum = read_family(path), read_spectrum(path)
+    if spectrum is None:
+        raise InputError(f"expected Fourier coefficients in {path}, found none; make it again")
+    place = (pattern.displacement, pattern.gradient, spectrum, family)
+    return FoundPattern(pattern.name, *place, pattern.stable)
+
+
+def to_be_shown(
+    every: Sequence[PeriodicField], modes: ModeSet, pitch: float, folder: Path
+) -> list[FoundPattern]:
+    """Those for the report: branches from the lowest energy up, or modes; and the primary path."""
+    branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
+    found = [found_pattern(pattern, folder) for pattern in branches]
+    if not found:
+        found = [FoundPattern.of_mode(modes, k, pitch) for k in range(len(modes.waves))]
+    return [*found, found_pattern(every[-1], folder)]
+
+
+def follow_to(path: CellPath, load: float, step: float) -> CellPath:
+    """The same path with its states up to a load, in steps so small that none is jumped over."""
+    for k in range(int(load / step) + 1):
+        if path.at(k * step) is None:
+            break
+    return path
+
+
+def _state(path: CellPath, load: float) -> CellState:
+    """The state at a load; a millionth below where that is critical with the cell's own period."""
+    state = path.at(load) or path.at((1.0 - 1e-6) * load)
+    if state is None:
+        raise InputError(f"modes: expected a load that the lattice's path reaches, got {load:.6g}")
+    return state
+
+
+_NO_DOLFINX = (
+    "infinite lattices need dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda install "
+    "-c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
+    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'"
+)
+
+
+class LatticeModel:
+    """Cell and path of a case, made when they are asked for.
+
+    Parameters
+    ----------
+    case
+        The case.
+    """
+
+    def __init__(self, case: LatticeCase) -> None:
+        self.case = case
+
+    @cached_property
+    def unit(self) -> UnitCell:
+        """The primitive cell's mesh and lattice vectors.
+
+        Raises
+        ------
+        InputError
+            If there is no such lattice, or its cell isn't periodic.
+        MissingDependencyError
+            If dolfinx or gmsh is not there.
+        """
+        try:
+            return self.case.lattice.cell()
+        except ImportError as error:
+            raise MissingDependencyError(_NO_DOLFINX) from error
+
+    @cached_property
+    def cell(self) -> PeriodicCell:
+        """The primitive cell with its material; raises as ``unit``."""
+        unit = self.unit
+        try:
+            from modeharvest.fem.lattice.cell import PeriodicCell
+        except ImportError as error:
+            raise MissingDependencyError(_NO_DOLFINX) from error
+        return PeriodicCell(unit, self.case.material)
+
+    def path(self, load: float = 0.0) -> CellPath:
+        """A new primary path, followed up to a load [-]; raises as ``unit``.
+
+        From the beginning, so that no stage depends on another's steps.
+        """
+        cell = self.cell  # first: without dolfinx it says what is missing
+        from modeharvest.fem.lattice.cell import CellPath
+
+        path = CellPath(cell, self.case.loading.macro())
+        return follow_to(path, load, self.case.search.largest_step)

@@ -1,0 +1,375 @@
+"""The tables of a lattice's case: which lattice, how it is loaded, what is looked for.
+
+Frozen dataclasses, checked where they are built; no lattice needs gmsh before its cell is meshed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+from modeharvest.fem.bloch.dispersion import ZONES, Wave, in_plane
+from modeharvest.fem.experiment import SMALLEST_STEP
+from modeharvest.fem.lattice.options import (
+    MacroLoading,
+    Rates,
+    equibiaxial,
+    simple_shear,
+    uniaxial,
+    uniaxial_strain,
+)
+from modeharvest.util.errors import InputError
+
+if TYPE_CHECKING:
+    from modeharvest.fem.lattice.cells import UnitCell
+
+
+@runtime_checkable
+class LatticeSpec(Protocol):
+    """A lattice of which one primitive cell can be meshed."""
+
+    @property
+    def pitch(self) -> float:
+        """Unit cell size l [mm], the unit of wave lengths in spectra."""
+
+    @property
+    def symmetry(self) -> str:
+        """Without load: "square", "hexagonal" (60 degrees from a1 to a2) or "oblique"."""
+
+    def cell(self) -> UnitCell:
+        """The primitive cell, meshed; an InputError if there is no such lattice."""
+
+
+@dataclass(frozen=True)
+class SquareLattice:
+    """Circular holes in square stacking: ``fem.lattices.square``.
+
+    Parameters
+    ----------
+    pitch, diameter
+        l and d [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    """
+
+    pitch: float = 1.9
+    diameter: float = 1.5
+    mesh_size: float = 0.15
+    symmetry = "square"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell."""
+        from modeharvest.fem.lattice.cells import square
+
+        return square(self.pitch, self.diameter, self.mesh_size)
+
+
+@dataclass(frozen=True)
+class HexagonalLattice:
+    """Circular holes in hexagonal stacking: ``fem.lattices.hexagonal``.
+
+    Parameters
+    ----------
+    pitch, diameter
+        Distance of the holes' centres and their diameter [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    """
+
+    pitch: float = 1.386
+    diameter: float = 1.28
+    mesh_size: float = 0.1
+    symmetry = "hexagonal"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell: one hole."""
+        from modeharvest.fem.lattice.cells import hexagonal
+
+        return hexagonal(self.pitch, self.diameter, self.mesh_size)
+
+
+@dataclass(frozen=True)
+class ChiralLattice:
+    """Rings joined by ligaments that touch them tangentially: ``fem.chiral.chiral``.
+
+    Parameters
+    ----------
+    pitch
+        Distance of neighbouring rings' centres [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    ring_radius, ring_thickness, ligament_thickness
+        [mm]; shares of the pitch that ``fem.chiral`` states unless given.
+    handedness
+        "clockwise" or "counterclockwise".
+    """
+
+    pitch: float = 1.9
+    mesh_size: float = 0.1
+    ring_radius: float | None = None
+    ring_thickness: float | None = None
+    ligament_thickness: float | None = None
+    handedness: str = "clockwise"
+    ligaments = 4
+    symmetry = "square"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell: one ring."""
+        from modeharvest.fem.lattice.cells import chiral
+
+        walls = (self.ring_radius, self.ring_thickness, self.ligament_thickness)
+        return chiral(self.pitch, self.mesh_size, self.ligaments, *walls, self.handedness)
+
+
+@dataclass(frozen=True)
+class TetrachiralLattice(ChiralLattice):
+    """Four ligaments at each ring, rings on a square lattice."""
+
+
+@dataclass(frozen=True)
+class HexachiralLattice(ChiralLattice):
+    """Six ligaments at each ring, rings on a hexagonal lattice."""
+
+    ligaments = 6
+    symmetry = "hexagonal"
+
+
+@dataclass(frozen=True)
+class FileLattice:
+    """A cell of one's own, a mesh or a geometry: ``fem.cell_files.read_cell``.
+
+    Parameters
+    ----------
+    path
+        The file [mm]; in a case file, relative to that file's folder.
+    pitch
+        Unit cell size l [mm], the unit of wave lengths in spectra.
+    vectors
+        a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material.
+    mesh_size
+        Largest edge length [mm] where a geometry is meshed; None for a mesh.
+    """
+
+    path: str
+    pitch: float
+    vectors: tuple[tuple[float, float], tuple[float, float]] | None = None
+    mesh_size: float | None = None
+    symmetry = "oblique"
+
+    def cell(self) -> UnitCell:
+        """The cell as the file has it."""
+        from modeharvest.fem.lattice.files import read_cell
+
+        return read_cell(self.path, self.vectors, self.mesh_size)
+
+
+LATTICES: dict[str, type[Any]] = {
+    "square": SquareLattice,
+    "hexagonal": HexagonalLattice,
+    "tetrachiral": TetrachiralLattice,
+    "hexachiral": HexachiralLattice,
+    "file": FileLattice,
+}
+
+
+Component = float | Literal["free"]
+_ZERO = ((0.0, 0.0), (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How the lattice is loaded; the load e multiplies all rates.
+
+    Parameters
+    ----------
+    kind
+        Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
+        lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or
+        "prescribed": the rates below.
+    axis
+        "x" or "y", of the first two kinds.
+    gradient
+        dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only.
+    stress
+        dP̄/de [MPa] where the gradient is free; of "prescribed" only.
+    """
+
+    kind: Literal["uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"] = "uniaxial"
+    axis: Literal["x", "y"] = "x"
+    gradient: tuple[tuple[Component, Component], tuple[Component, Component]] | None = None
+    stress: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind == "prescribed" and self.gradient is None:
+            raise InputError(
+                'loading: expected the gradient of "prescribed", such as [[-1.0, 0.0], [0.0, '
+                '"free"]], got none'
+            )
+        if self.kind != "prescribed" and (self.gradient or self.stress):
+            raise InputError(
+                f'loading: expected gradient and stress with kind = "prescribed", got {self.kind!r}'
+            )
+        self.macro()
+
+    def macro(self) -> MacroLoading:
+        """What the equilibrium equations need."""
+        axis = "xy".index(self.axis)
+        if self.gradient is not None:
+            (a, b), (c, d) = self.gradient
+            rates: Rates = ((_rate(a), _rate(b)), (_rate(c), _rate(d)))
+            return MacroLoading(rates, self.stress or _ZERO)
+        return {
+            "uniaxial": uniaxial(axis),
+            "uniaxial-strain": uniaxial_strain(axis),
+            "equibiaxial": equibiaxial(),
+            "shear": simple_shear(),
+        }[self.kind]
+
+    @property
+    def name(self) -> str:
+        """In words, for tables and pictures."""
+        words = self.kind.replace("-", " ")
+        return f"{words} along {self.axis}" if self.kind.startswith("uniaxial") else words
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether the lattice keeps its rotational symmetry."""
+        (a, b), (c, d) = self.macro().gradient
+        return a is not None and a == d and b == 0 == c
+
+
+def _rate(component: Component) -> float | None:
+    return None if component == "free" else float(component)
+
+
+@dataclass(frozen=True)
+class Search:
+    """Up to which load, and how finely, the first critical point is looked for.
+
+    Parameters
+    ----------
+    largest
+        Load up to which to look [-].
+    divisions
+        Of each axis of the zone of wave vectors; an even number has M and X on the grid.
+    largest_step
+        Of the load [-].
+    """
+
+    largest: float = 0.3
+    divisions: int = 8
+    largest_step: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
+            raise InputError(
+                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
+                f"{self}"
+            )
+        if not 2 <= self.divisions <= 200:
+            raise InputError(f"search: expected 2 to 200 divisions, got {self.divisions}")
+
+
+@dataclass(frozen=True)
+class DispersionPlan:
+    """Where the lowest eigenvalues are computed.
+
+    Parameters
+    ----------
+    loads
+        [-]; none: 0, half the critical load and the critical one.
+    points
+        Wave vectors along the path.
+    bands
+        Eigenvalues at each of them.
+    map_divisions
+        Of each axis of the zone's map; even, 0 for no map.
+    corners
+        Names and phases [π rad] of the path, such as [["Γ", [0, 0]], ["M", [1, 1]]]; none: a tour
+        that suits the lattice and its load.
+    """
+
+    loads: tuple[float, ...] = ()
+    points: int = 60
+    bands: int = 3
+    map_divisions: int = 24
+    corners: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_loads("dispersion", self.loads)
+        tour = _phases(wave for _, wave in self.corners)
+        if self.corners and (len(tour) < 2 or self.points < len(tour)):
+            raise InputError(
+                "dispersion: expected two corners or more, and no fewer points, got "
+                f"{len(tour)} corners and {self.points} points"
+            )
+        if not (8 <= self.points <= 10_000 and 1 <= self.bands <= 100):
+            raise InputError(
+                "dispersion: expected 8 to 10000 points and 1 to 100 bands, got "
+                f"{self.points} and {self.bands}"
+            )
+        if not 0 <= self.map_divisions <= 1000 or self.map_divisions % 2:
+            raise InputError(
+                "dispersion: expected an even number of map divisions from 0 to 1000, got "
+                f"{self.map_divisions}"
+            )
+
+    def tour(self, lattice: LatticeSpec, loading: Loading) -> tuple[tuple[str, Wave], ...]:
+        """Names and phases [rad] of the path's corners."""
+        if self.corners:
+            waves = _phases(wave for _, wave in self.corners)
+            return tuple((name, w) for (name, _), w in zip(self.corners, waves, strict=True))
+        if loading.is_isotropic or lattice.symmetry == "oblique":
+            return ZONES[lattice.symmetry]
+        return ZONES["rhombic" if lattice.symmetry == "hexagonal" else "oblique"]
+
+
+@dataclass(frozen=True)
+class ModesPlan:
+    """Which modes are computed, and which buckled branches are followed.
+
+    Parameters
+    ----------
+    waves
+        Phases [π rad], such as [[1, 1]]; none: those that are critical first.
+    load
+        At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
+        another load than the critical one have no branches.
+    combinations
+        One row of coefficients for each branch to follow, as many as there are modes, in the order
+        of their waves (critical ones by phases, the largest first); none: each mode alone, and
+        the sum of all.
+    branch_loads
+        At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
+        critical load.
+    """
+
+    waves: tuple[tuple[float, ...], ...] = ()
+    load: float = 0.0
+    combinations: tuple[tuple[float, ...], ...] = ()
+    branch_loads: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        _phases(self.waves)
+        _check_loads("modes", (self.load, *self.branch_loads))
+        for row in self.combinations:
+            if not any(row) or not all(math.isfinite(c) for c in row):
+                raise InputError(f"modes: expected finite combinations, not all 0, got {row}")
+
+    @property
+    def phases(self) -> tuple[Wave, ...]:
+        """The waves in rad."""
+        return _phases(self.waves)
+
+
+def _phases(waves: Any) -> tuple[Wave, ...]:
+    """Units of π to rad, each wave checked to be in the plane."""
+    checked = (in_plane(wave) for wave in waves)
+    return tuple((math.pi * p, math.pi * q) for p, q in checked)
+
+
+def _check_loads(where: str, loads: Sequence[float]) -> None:
+    if not all(0 <= load < 1 for load in loads):
+        raise InputError(f"{where}: expected loads of 0 or more and below 1, got {tuple(loads)}")

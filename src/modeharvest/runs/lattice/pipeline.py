@@ -1,0 +1,335 @@
+"""The analysis of an infinite lattice in one folder, in stages that can be resumed.
+
+::
+
+    critical.json                   critical    the first critical load over all wave vectors
+    dispersion.h5 dispersion.csv    dispersion  lowest eigenvalues against the wave vector
+    modes.h5 modes.vtu modes.xdmf   modes       real modes and buckled branches
+    family_*.json families.json     families    their spectra and mode families
+    study.csv                       study       how the pattern depends on d/l and more
+    report.html summary.json        report      everything of it that is there
+    stages.json timings.json                    which stages are finished, what they took
+
+``modeharvest bloch`` is the first two, ``modeharvest modes`` all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from modeharvest import __version__
+from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap, dispersion, zone_map
+from modeharvest.fem.bloch.modes import (
+    Branch,
+    ModeSet,
+    read_modes,
+    write_modes,
+    write_vtu,
+    write_xdmf,
+)
+from modeharvest.report.lattice import write_lattice_report
+from modeharvest.runs.lattice.case import LatticeCase, read_lattice_case, stage_keys
+from modeharvest.runs.lattice.modes import (
+    LatticeModel,
+    PeriodicField,
+    find_critical,
+    find_family,
+    find_modes,
+    found_pattern,
+    periodic_fields,
+    read_critical,
+    to_be_shown,
+    why_no_modes,
+    write_critical,
+)
+from modeharvest.runs.lattice.results import (
+    CriticalPoint,
+    FoundPattern,
+    LatticeRun,
+    exports_in,
+    summary_of,
+)
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import Stages, exclusive, stage_key
+from modeharvest.validation.studies.lattice import LatticeModeStudy
+
+
+@dataclass(frozen=True)
+class LatticeAnalysis:
+    """A lattice's case, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    case
+        What to do.
+    folder
+        Where; made if it does not exist.
+    progress
+        Listener.
+    source
+        Name or file of the case, for the report.
+    """
+
+    case: LatticeCase
+    folder: Path
+    progress: Progress = silent
+    source: str = "CASE"
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    def critical(self) -> CriticalPoint:
+        """Find the first critical load over all wave vectors; leaves ``critical.json``.
+
+        Raises
+        ------
+        InputError
+            If the cell is not periodic, or the lattice is a mechanism.
+        MissingDependencyError
+            If dolfinx is not there.
+        """
+        path = self.folder / "critical.json"
+
+        def work() -> tuple[Path, ...]:
+            found = find_critical(self._model.path(), self.case.search, self.progress)
+            write_critical(path, self.case.loading.name, found)
+            return (path,)
+
+        self.stages.do("critical", self._keys["critical"], work)
+        return read_critical(path)
+
+    def dispersion(self) -> Dispersion:
+        """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
+        critical, plan = self.critical(), self.case.dispersion
+        path = self.folder / "dispersion.h5"
+        table = path.with_suffix(".csv")
+
+        def work() -> tuple[Path, ...]:
+            loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
+            cell_path, zone = self._model.path(max(loads)), list[ZoneMap]()
+            tour = plan.tour(self.case.lattice, self.case.loading)
+            found = dispersion(cell_path, tour, loads, plan.points, plan.bands, self.progress)
+            if plan.map_divisions:
+                divisions = plan.map_divisions
+                zone.append(zone_map(cell_path, critical.load, divisions, self.progress))
+            replace(found, zone=tuple(zone)).write(path)
+            found.write_csv(table)
+            return path, table
+
+        self.stages.do("dispersion", self._keys["dispersion"], work)
+        return Dispersion.read(path)
+
+    def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
+        """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
+
+        Raises
+        ------
+        InputError
+            If a wave asked for doesn't repeat within a dozen cells, or a load can't be reached.
+        """
+        critical, plan = self.critical(), self.case.modes
+        if why_no_modes(critical, plan):
+            return None, ()
+        path = self.folder / "modes.h5"
+        others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
+
+        def work() -> tuple[Path, ...]:
+            cell_path = self._model.path(max(plan.load, critical.load))
+            step = self.case.search.largest_step
+            how = (self.case.material, critical, plan, step, self._info(critical))
+            found = find_modes(cell_path, *how, self.progress)
+            write_modes(path, *found)
+            for write, other in others.items():
+                write(other, *found)
+            return path, *others.values()
+
+        self.stages.do("modes", self._keys["modes"], work)
+        return read_modes(path)
+
+    def families(self) -> None:
+        """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
+        self.modes()
+        index = self.folder / "families.json"
+
+        def work() -> list[Path]:
+            for k, pattern in enumerate(self._patterns):
+                self.progress(k, len(self._patterns), "mode families")
+                find_family(pattern, self.case.lattice.pitch, self.folder)
+            self.progress(1, 1, "mode families")
+            write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
+            return [index, *(self.folder / pattern.file for pattern in self._patterns)]
+
+        self.stages.do("families", self._keys["families"], work)
+
+    def study(self) -> None:
+        """Do the study, if the case has one; leaves ``study.csv``."""
+        if self.case.study is None:
+            return
+        path, key = self.folder / "study.csv", self._keys["study"]
+        rows = self.folder / f"study-{key[:8]}.csv"  # of this very study, to go on from
+
+        def work() -> tuple[Path, ...]:
+            self.case.run_study(rows, self.progress)
+            rows.replace(path)
+            for other in self.folder.glob("study-*.csv"):  # of studies given up
+                other.unlink()
+            return (path,)
+
+        self.stages.do("study", key, work)
+
+    def report(self) -> dict[str, Any]:
+        """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
+
+        Whatever was computed in this folder for this very case is in it.
+        """
+        path, page = self.folder / "summary.json", self.folder / "report.html"
+        done = self._finished()
+
+        def work() -> tuple[Path, ...]:
+            run = self._run(done)
+            write_lattice_report(page, run, self.progress)
+            found = self._found_patterns() if "families" in done else []
+            write_json(path, summary_of(run, self.case, found))
+            return path, page
+
+        self.stages.do("report", stage_key([done, self.case.title, self.source]), work)
+        content: dict[str, Any] = read_json(path)
+        return content
+
+    def bloch(self) -> dict[str, Any]:
+        """Stability against all waves, and dispersion; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If another process works in the folder.
+        """
+        with exclusive(self.folder):
+            self.dispersion()
+            return self.report()
+
+    def all(self) -> dict[str, Any]:
+        """All stages that are not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If another process works in the folder, or modes can't be had; what there is is
+            reported before.
+        """
+        with exclusive(self.folder):
+            self.dispersion()
+            try:
+                self.families()
+                self.study()
+            except InputError:
+                self.report()
+                raise
+            return self.report()
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _info(self, critical: CriticalPoint) -> dict[str, Any]:
+        """What a mode's user must know of where it comes from."""
+        content = self.case.plain()
+        tables = {name: content[name] for name in ("title", "lattice", "material", "loading")}
+        return {**tables, "critical": asdict(critical)}
+
+    @cached_property
+    def _model(self) -> LatticeModel:
+        return LatticeModel(self.case)
+
+    @cached_property
+    def _patterns(self) -> list[PeriodicField]:
+        """All fields in which families are looked for."""
+        critical = self.critical()
+        load = self.case.modes.load or critical.load
+        return periodic_fields(self._model.path(load), load, *self.modes(), self._info(critical))
+
+    def _found_patterns(self) -> list[FoundPattern]:
+        return [found_pattern(pattern, self.folder) for pattern in self._patterns]
+
+    def _run(self, done: Collection[str]) -> LatticeRun:
+        """All there is, for the report."""
+        from modeharvest.fem import dolfinx_api
+
+        unit, critical = self._model.unit, self.critical()
+        modes, branches = self.modes() if "modes" in done else (None, ())
+        command = "modes" if "families" in done else "bloch"
+        return LatticeRun(
+            title=self.case.title or "An infinite lattice",
+            case=self.case.plain(),
+            command=f"modeharvest {command} {self.source} --out {self.folder}",
+            mesh=unit.mesh,
+            lattice=unit.lattice,
+            pitch=self.case.lattice.pitch,
+            critical=(critical,),
+            dispersion=self.dispersion() if "dispersion" in done else None,
+            modes=modes,
+            branches=branches,
+            patterns=self._shown(modes) if modes and "families" in done else (),
+            study=self._study() if "study" in done else None,
+            notes=[note for note in (why_no_modes(critical, self.case.modes),) if note],
+            exports=exports_in(self.folder),
+            versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
+        )
+
+    def _shown(self, modes: ModeSet) -> list[FoundPattern]:
+        return to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
+
+    def _study(self) -> LatticeModeStudy | None:
+        """The study of which the rows are all there."""
+        return self.case.run_study(self.folder / "study.csv", self.progress)
+
+    @cached_property
+    def _keys(self) -> dict[str, str]:
+        return stage_keys(self.case)
+
+    def _finished(self) -> dict[str, str]:
+        """The keys of the stages that are finished for this very case."""
+        return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
+
+
+def bloch(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
+) -> dict[str, Any]:
+    """Analyse a lattice's stability against all waves; what ``modeharvest bloch`` does.
+
+    Parameters
+    ----------
+    case
+        A shipped case's name, the path of a TOML file, or a LatticeCase.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    return _analysis(case, folder, progress).bloch()
+
+
+def modes(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
+) -> dict[str, Any]:
+    """Do all of a lattice's analysis; what ``modeharvest modes`` does. Parameters as ``bloch``."""
+    return _analysis(case, folder, progress).all()
+
+
+def _analysis(
+    case: str | Path | LatticeCase, folder: Path | str, progress: Progress
+) -> LatticeAnalysis:
+    if isinstance(case, LatticeCase):
+        return LatticeAnalysis(case, Path(folder), progress)
+    return LatticeAnalysis(read_lattice_case(case), Path(folder), progress, str(case))

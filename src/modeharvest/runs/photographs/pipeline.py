@@ -1,0 +1,291 @@
+"""A harvest of photographs in one folder, in stages that can be interrupted and resumed.
+
+::
+
+    distortion.json  calibration.json   optics      S, if it is calibrated, and how
+    prepared/                           prepare     photographs without distortion, masks
+    results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
+    results/NAME_start.json                         where it started from, in words
+    report.html  summary.json           report      everything that was found
+    stages.json timings.json                        which stages are finished, what they took
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from modeharvest.idic.local.field import LocalField, read_field, write_field
+from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.photograph.geometry import Geometry, find_geometry
+from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, pulled_back
+from modeharvest.idic.result import Result
+from modeharvest.imaging.distortion.files import read_distortion
+from modeharvest.report.photographs import write_harvest_report
+from modeharvest.runs.photographs.case import PhotographCase, read_photograph_case
+from modeharvest.runs.photographs.prepare import (
+    Optics,
+    all_files,
+    calibrate_lens,
+    calibrated_lens,
+    local_field,
+    named_files,
+    of_each_photograph,
+    prepare,
+    require_inputs,
+)
+from modeharvest.runs.photographs.results import Harvest, HarvestTruth, gather_harvest
+from modeharvest.runs.photographs.summary import harvest_summary
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import Stages, digest, exclusive, stage_key, versions
+from modeharvest.util.typed import plain
+
+_LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
+"""What the numbers depend on."""
+_CODE = ("fem", "imaging", "idic", "harvest")
+"""Folders of the package that they depend on; how they are shown is in others."""
+
+
+@dataclass(frozen=True)
+class HarvestRun:
+    """An experiment, the folder it leaves its files in, and who listens to its progress.
+
+    Parameters
+    ----------
+    experiment
+        Of which there are photographs.
+    base
+        Folder that its files' names are relative to.
+    folder
+        Where to leave what is found.
+    progress
+        Listener.
+    source
+        The experiment's file, for the report.
+    """
+
+    experiment: PhotographCase
+    base: Path
+    folder: Path
+    progress: Progress = silent
+    source: str = "EXPERIMENT.toml"
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    @cached_property
+    def optics(self) -> Optics:
+        """The lens; a calibration leaves ``distortion.json`` and ``calibration.json``."""
+        table = self.experiment.distortion
+        if table.file:
+            return Optics(read_distortion(self.base / table.file))
+        if not table.calibration:
+            return Optics()
+        files = named_files(self.base, table.calibration, unique=False)
+
+        def work() -> tuple[Path, ...]:
+            calibrate_lens(table, self.base, self.folder, self.progress)
+            return self.folder / "distortion.json", self.folder / "calibration.json"
+
+        key = stage_key([plain(table), [sha256_of(path) for path in files]], *_CODE)
+        self.stages.do("optics", key, work)
+        return calibrated_lens(self.folder)
+
+    def prepared(self) -> PreparedPhotographs:
+        """Make the photographs ready; leaves ``prepared/``."""
+        folder = self.folder / "prepared"
+
+        def work() -> tuple[Path, ...]:
+            distortion = self.optics.distortion
+            return prepare(self.experiment, self.base, folder, distortion, self.progress).files
+
+        self.stages.do("prepare", self._prepared_key(), work)
+        return PreparedPhotographs.read(folder)
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """Holes, lattice and cellular part, from the reference."""
+        return find_geometry(self.prepared(), self.experiment.specimen, self.base)
+
+    def results(self) -> dict[str, MeasuredPhotograph]:
+        """Correlate every photograph, each after the one before; leaves ``results/``.
+
+        One that can't be measured is left out (see :meth:`failures`), and the next goes on from
+        the last that could.
+
+        Raises
+        ------
+        InputError
+            If none can be measured.
+        """
+        prepared = self.prepared()
+        _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
+        found: dict[str, MeasuredPhotograph] = {}
+        key = digest([self._prepared_key(), self._how()])
+        for name in prepared.names:
+            key = digest([key, name, self._local_digest(name)])
+            self._measure_one(prepared, name, found, key)
+            if not self._told(name)["failed"]:
+                found[name] = self._read(name)
+        if not found:
+            name = prepared.names[0]
+            raise InputError(f"{name}: {self._told(name)['failed']}")
+        return found
+
+    def failures(self) -> tuple[tuple[str, str], ...]:
+        """Names of the photographs that were read but could not be measured, and why."""
+        told = {name: self._told(name)["failed"] for name in self.prepared().names}
+        return tuple((name, reason) for name, reason in told.items() if reason)
+
+    def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
+        """All that is known of the test, for the report."""
+        return gather_harvest(
+            self.experiment,
+            self.prepared(),
+            self.geometry,
+            self.optics,
+            self.results(),
+            skipped=(*self.prepared().skipped, *self.failures()),
+            truth=truth,
+            source=self.source,
+            folder=self.folder,
+            versions=versions(*_LIBRARIES),
+            progress=self.progress,
+        )
+
+    def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
+        """Do everything that is not finished; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If another process works in the folder, it can't be written to, or no photograph can
+            be measured.
+        """
+        with exclusive(self.folder):
+            require_writable(self.folder)
+            self.results()
+            harvest = self.harvest(truth)
+            summary = harvest_summary(harvest)
+            write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
+            write_json(self.folder / "summary.json", summary)
+        return summary
+
+    # -- parts --------------------------------------------------------------------------
+
+    def _measure_one(
+        self,
+        prepared: PreparedPhotographs,
+        name: str,
+        found: dict[str, MeasuredPhotograph],
+        key: str,
+    ) -> None:
+        """Measure a photograph, from the last of those before it that were measured."""
+        result, field, start = self._paths(name)
+        before = next(reversed(found), None)
+
+        def work() -> tuple[Path, ...]:
+            try:
+                measured = measure(
+                    self._pair(prepared, name, before, found),
+                    self.geometry,
+                    self.experiment.specimen.cell_size,
+                    self.experiment.correlation,
+                    self._local(prepared, name),
+                    None if before is None else found[before],
+                    self.progress,
+                )
+            except InputError as error:
+                write_json(start, {"failed": str(error)})
+                return (start,)
+            write_field(field, measured.local)
+            measured.result.write(result)
+            told = {"held": measured.held, "blur_px": measured.blur_px, "said": measured.sentences}
+            write_json(start, {"failed": "", **told})
+            return result, field, start
+
+        self.stages.do(f"correlate {name}", key, work)
+
+    def _local(self, prepared: PreparedPhotographs, name: str) -> LocalField | None:
+        return local_field(self.experiment, self.base, prepared, name, self.optics.distortion)
+
+    def _pair(
+        self,
+        prepared: PreparedPhotographs,
+        name: str,
+        before: str | None,
+        found: dict[str, MeasuredPhotograph],
+    ) -> ImagePair:
+        """The photograph and what it is correlated with."""
+        reference, mask = prepared.image(), prepared.mask()
+        if self.experiment.correlation.formulation == "updated" and before is not None:
+            result = found[before].result
+            reference, seen = pulled_back(prepared.image(before), result, result.order)
+            mask = mask & seen
+        return ImagePair(reference, prepared.image(name), mask, prepared.mask(name))
+
+    def _read(self, name: str) -> MeasuredPhotograph:
+        result, field, _ = self._paths(name)
+        told = self._told(name)
+        return MeasuredPhotograph(
+            Result.read(result),
+            read_field(field),
+            bool(told["held"]),
+            float(told["blur_px"]),
+            tuple(told["said"]),
+        )
+
+    def _told(self, name: str) -> dict[str, Any]:
+        return dict(read_json(self._paths(name)[2]))
+
+    def _paths(self, name: str) -> tuple[Path, Path, Path]:
+        folder = self.folder / "results"
+        return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
+
+    def _prepared_key(self) -> str:
+        tables, files = self.experiment.plain(), all_files(self.experiment, self.base)
+        wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
+        return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *_CODE)
+
+    def _how(self) -> list[Any]:
+        tables = self.experiment.plain()
+        return [tables["correlation"], tables["local"]]
+
+    def _local_digest(self, name: str) -> str:
+        files = self.experiment.local.files
+        path = of_each_photograph(self.experiment, self.base, files, "local.files").get(name)
+        return "" if path is None else sha256_of(path)
+
+
+def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
+    """Harvest an experiment's photographs; what ``modeharvest harvest`` does.
+
+    Parameters
+    ----------
+    path
+        Its TOML file.
+    folder
+        Where to leave the files.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        If the experiment can't be used; before anything is computed, if a file is missing.
+    """
+    path = Path(path)
+    experiment = read_photograph_case(path)
+    require_inputs(experiment, path.parent)
+    return HarvestRun(experiment, path.parent, Path(folder), progress, str(path)).all()

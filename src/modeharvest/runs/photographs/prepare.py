@@ -1,0 +1,358 @@
+"""Photographs made ready for correlation: files found, lens, ideal images, masks, local fields.
+
+::
+
+    distortion.json  calibration.json            S, if it is calibrated, and how
+    prepared/reference.tif  reference_mask.tif
+    prepared/NAME.tif       NAME_mask.tif        of each deformed image
+    prepared/prepared.json                       what was done and what was skipped; written last
+
+The images are grey levels as the camera counts them, float32, on the ideal pixel grid; the masks
+are white on material. A local DIC's field is another code's file, or pyvale's subsets.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeharvest.idic.local.field import LocalField, read_field, without_distortion
+from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
+from modeharvest.idic.pair import PREPARED_FILE, PreparedPhotographs
+from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
+from modeharvest.idic.uncertainty.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
+from modeharvest.imaging.distortion.calibration.calibrate import calibrate
+from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.files import read_distortion, write_distortion
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
+from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
+from modeharvest.imaging.photographs.photograph import Photograph, read_photograph
+from modeharvest.imaging.photographs.series import read_frame, read_reference
+from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, reading, write_json
+from modeharvest.util.progress import Progress, silent
+
+
+def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
+    """The files that names, or patterns with wildcards, stand for.
+
+    ``unique``: no two may have the same stem, because results are named by it.
+
+    Raises
+    ------
+    InputError
+        If a pattern matches no file, or two files would leave results of the same name.
+    """
+    paths: list[Path] = []
+    for name in names:
+        if any(sign in name for sign in "*?["):
+            found = sorted(p for p in map(Path, glob.glob(str(base / name))) if p.is_file())
+            if not found:
+                raise InputError(f"expected files that match {base / name}, found none")
+            paths += found
+        else:
+            paths.append(base / name)
+    stems = [path.stem for path in paths]
+    twice = next((stem for stem in stems if stems.count(stem) > 1 or stem == "reference"), None)
+    if unique and twice is not None and len(paths) > 1:
+        raise InputError(
+            f"expected images whose names differ, and none called 'reference', got {twice!r} "
+            "again; rename it, or narrow the pattern"
+        )
+    return tuple(paths)
+
+
+def of_each_photograph(
+    experiment: PhotographCase, base: Path, names: Sequence[str], what: str
+) -> dict[str, Path]:
+    """The file that goes with each deformed photograph, by the photograph's name.
+
+    Parameters
+    ----------
+    experiment, base
+        What there is, and the folder its names are relative to.
+    names
+        Of the files, or patterns; none at all is all right.
+    what
+        They are, for the message.
+
+    Raises
+    ------
+    InputError
+        If there aren't as many as photographs.
+    """
+    files = named_files(base, names, unique=False)
+    photographs = named_files(base, experiment.images.deformed)
+    if files and len(files) != len(photographs):
+        raise InputError(
+            f"{what}: expected one file for each of {len(photographs)} deformed images, got "
+            f"{len(files)}"
+        )
+    return {path.stem: file for path, file in zip(photographs, files, strict=False)}
+
+
+def all_files(experiment: PhotographCase, base: Path) -> tuple[Path, ...]:
+    """Every file that an experiment names, but fields of a local DIC."""
+    images, table, lens = experiment.images, experiment.specimen, experiment.distortion
+    names = [images.reference, *images.deformed, *images.repeats]
+    names += [table.material, table.cells, *table.deformed_material]
+    names += [lens.file, *lens.calibration]
+    return named_files(base, [name for name in names if name], unique=False)
+
+
+def require_inputs(experiment: PhotographCase, base: Path) -> None:
+    """Raise in one line unless all that an experiment names is there.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, or there aren't as many masks or fields as photographs.
+    MissingDependencyError
+        If pyvale is asked for and not installed.
+    """
+    local = experiment.local
+    files = (*all_files(experiment, base), *named_files(base, local.files, unique=False))
+    missing = [path for path in files if not path.is_file()]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"expected the files that the experiment names, found no file {missing[0]}{more}"
+        )
+    masks = experiment.specimen.deformed_material
+    of_each_photograph(experiment, base, masks, "specimen.deformed_material")
+    of_each_photograph(experiment, base, local.files, "local.files")
+    if local.code == "pyvale":
+        pyvale_python()
+
+
+_ARRAYS = ("shifts", "shifts_sd", "angles", "angles_sd", "matches", "covariance")
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """What is known of the lens.
+
+    Parameters
+    ----------
+    distortion
+        S of the paper's Eq. (r2); None for none.
+    calibration
+        How it was found, if it was not given.
+    """
+
+    distortion: Distortion | None = None
+    calibration: Calibration | None = None
+
+
+def calibrate_lens(
+    table: DistortionTable, base: Path, folder: Path, progress: Progress = silent
+) -> None:
+    """Calibrate from the images of a target; leaves ``distortion.json``, ``calibration.json``.
+
+    Raises
+    ------
+    InputError
+        If a file can't be used, or the images don't determine the distortion.
+    """
+    images = [read_photograph(file).image for file in named_files(base, table.calibration)]
+    shifts = [(row, col) for col, row in table.shifts] or None
+    found = calibrate(images, shifts, progress=progress)
+    write_distortion(folder / "distortion.json", found.distortion)
+    content: dict[str, Any] = {name: getattr(found, name).tolist() for name in _ARRAYS}
+    content["trials"] = [asdict(trial) for trial in found.trials]
+    content |= {"noise_sd": found.noise_sd, "fixed": found.fixed, "sentences": found.sentences}
+    write_json(folder / "calibration.json", content)
+
+
+def calibrated_lens(folder: Path) -> Optics:
+    """What :func:`calibrate_lens` left."""
+    path = folder / "calibration.json"
+    with reading(path, "a calibration", "remove it, and harvest again"):
+        distortion, content = read_distortion(folder / "distortion.json"), read_json(path)
+        if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
+            raise InputError("expected a polynomial in distortion.json beside it, got another kind")
+        calibration = Calibration(
+            distortion=distortion,
+            trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
+            noise_sd=float(content["noise_sd"]),
+            fixed=int(content["fixed"]),
+            sentences=tuple(map(str, content["sentences"])),
+            **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
+        )
+        return Optics(distortion, calibration)
+
+
+def prepare(
+    experiment: PhotographCase,
+    base: Path,
+    folder: Path,
+    distortion: Distortion | None = None,
+    progress: Progress = silent,
+) -> PreparedPhotographs:
+    """Make an experiment's photographs ready; leaves them in ``folder``.
+
+    Parameters
+    ----------
+    experiment
+        Of which there are photographs.
+    base
+        Folder that its files' names are relative to.
+    folder
+        Where to leave them.
+    distortion
+        Of the optics.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If the reference can't be used, or none of the deformed images.
+    """
+    images, table = experiment.images, experiment.specimen
+    reference = read_reference(base / images.reference)
+    cell_px = table.cell_size / experiment.scale.mm_per_px
+    ready = _Maker(folder, distortion, material_options(cell_px))
+    mask = ready.save("reference", reference, _given(base, table.material))
+    deformed = named_files(base, images.deformed)
+    masks = of_each_photograph(
+        experiment, base, table.deformed_material, "specimen.deformed_material"
+    )
+    names, skipped, notes = [], [], list(reference.notes) + ready.sentences
+    for k, path in enumerate(deformed):
+        progress(k, len(deformed), "prepare photographs")
+        try:
+            frame = read_frame(path, reference)
+            ready.save(path.stem, frame, masks.get(path.stem))
+        except InputError as error:
+            skipped.append((path.name, str(error)))
+            continue
+        names.append(path.stem)
+        notes += [note for note in frame.notes if note not in notes]
+    if not names:
+        raise InputError(
+            f"expected a deformed image that can be used, got none of {len(deformed)}: "
+            f"{skipped[0][1]}"
+        )
+    rows, cols = reference.shape
+    grid = PixelGrid.centred(rows, cols, experiment.scale.mm_per_px)
+    info = {
+        "names": names,
+        "skipped": skipped,
+        "noise": vars(_noise(experiment, base, reference, mask)),
+        "grid": vars(grid),
+        "full_scale": reference.full_scale,
+        "notes": notes,
+    }
+    write_json(folder / PREPARED_FILE, info)
+    return PreparedPhotographs(folder, info)
+
+
+"""Window in which the speckle's contrast is looked at, as a share of the cell."""
+
+
+class _Maker:
+    """Frees photographs from distortion and finds their material."""
+
+    def __init__(
+        self, folder: Path, distortion: Distortion | None, options: MaterialOptions
+    ) -> None:
+        self._folder, self._distortion, self._options = folder, distortion, options
+        self.sentences: list[str] = []
+
+    def save(self, name: str, photograph: Photograph, given: Path | None) -> BoolArray:
+        """Write image and mask under a name; returns the photograph's own mask."""
+        if given is not None:
+            mask = read_mask(given)
+            require_same_shape(photograph.image, mask, str(photograph.path), str(given))
+        else:
+            material = find_material(photograph.image, self._options)
+            mask = material.mask
+            self.sentences += [s for s in material.sentences if s not in self.sentences]
+        image, shown = photograph.image, mask
+        if self._distortion is not None:
+            image, shown = (
+                undistorted(image, self._distortion),
+                undistorted_mask(mask, self._distortion),
+            )
+        write_image(self._folder / f"{name}.tif", image)
+        write_image(self._folder / f"{name}_mask.tif", shown)
+        return mask
+
+
+def _given(base: Path, name: str) -> Path | None:
+    return base / name if name else None
+
+
+def _noise(
+    experiment: PhotographCase, base: Path, reference: Photograph, mask: BoolArray
+) -> CameraNoise:
+    """Given, measured or estimated, in this order; before any interpolation smooths it."""
+    if experiment.noise.sd is not None:
+        return CameraNoise(experiment.noise.sd, GIVEN)
+    repeats = experiment.images.repeats
+    if not repeats:
+        return estimated_noise(reference.image, mask)
+    others = [read_frame(path, reference).image for path in named_files(base, repeats, False)]
+    return measured_noise([reference.image, *others], mask)
+
+
+def local_field(
+    experiment: PhotographCase,
+    base: Path,
+    prepared: PreparedPhotographs,
+    name: str,
+    distortion: Distortion | None,
+) -> LocalField | None:
+    """The displacement field of one deformed photograph by a local DIC; None if there is none.
+
+    Files are of the photographs as they are; what the lens did to them is taken out here.
+
+    Parameters
+    ----------
+    experiment, base
+        What there is, and the folder its names are relative to.
+    prepared
+        The photographs, made ready.
+    name
+        Of the deformed photograph.
+    distortion
+        Of the lens.
+
+    Raises
+    ------
+    InputError
+        If there aren't as many files as photographs, or this one's can't be used.
+    """
+    table, grid = experiment.local, prepared.grid
+    if table.code == "none":
+        return None
+    if table.code == "pyvale":
+        options = SubsetOptions(subset_px=table.subset, step_px=table.step)
+        return subset_field(
+            prepared.image(), prepared.image(name), grid, prepared.mask(), prepared.mask(name),
+            options,
+        )  # fmt: skip
+    path = of_each_photograph(experiment, base, table.files, "local.files")[name]
+    field = read_field(
+        path,
+        grid,
+        units=_told(table.unit),
+        y_axis=_told(table.y_axis),
+        first_pixel=table.first_pixel,
+        columns=table.columns,
+    )
+    return field if distortion is None else without_distortion(field, grid, distortion)
+
+
+def _told(value: str) -> str | None:
+    return None if value == "auto" else value

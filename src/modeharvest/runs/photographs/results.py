@@ -1,0 +1,444 @@
+"""What was found in photographs of a test: result types, and how the stages' outcomes fill them.
+
+Every result with its error bars, by noise and by model error; spectra; the onset of the pattern.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.pair import PreparedPhotographs
+from modeharvest.idic.photograph.geometry import Geometry
+from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.idic.photograph.measure import (
+    MeasuredPhotograph,
+    covariances,
+    noise_of,
+    prepared_pair,
+    residual_test,
+)
+from modeharvest.idic.result import Result
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
+from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
+from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors
+from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
+from modeharvest.idic.uncertainty.residual_test import ResidualTest
+from modeharvest.imaging.distortion.calibration.result import Calibration
+from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.prepare import Optics
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.onset import Buckling, Moment, find_buckling, mean_strain
+
+
+@dataclass(frozen=True, eq=False)
+class PartSpectrum:
+    """What a part of the specimen shows that has modes of its own.
+
+    Parameters
+    ----------
+    name
+        Of the part.
+    spectrum, pattern
+        Of the displacement there without its affine part, and what is read off it.
+    """
+
+    name: str
+    spectrum: Spectrum
+    pattern: WavePattern
+
+
+@dataclass(frozen=True, eq=False)
+class HarvestedFrame:
+    """What was found in one deformed photograph.
+
+    Parameters
+    ----------
+    name
+        Of the photograph; differs from all others'.
+    strain_x, strain_y
+        Mean nominal compression of the cellular part [-].
+    image
+        (rows, cols) the photograph, free from distortion [grey levels]; may be memory-mapped.
+    mask
+        (rows, cols) True on its material; None if not known.
+    result, identifiability, agreement
+        Of its correlation.
+    error_x, error_y
+        (p,) and (q,) axes [mm] of the error bars.
+    by_noise, by_leftover
+        Error bars on these axes, arrays (q, p, ...), by the images' noise and by what the ansatz
+        leaves over; the latter None if they can't be had.
+    noise_covariance, leftover_covariance
+        (n, n) of the unknowns by the images' noise and by what the ansatz leaves over: those
+        that the error bars are made of.
+    spectrum, pattern
+        Of the displacement without its affine part, and what is read off it.
+    parts
+        The same of every part that has modes of its own, in one order for all photographs.
+    local
+        Of a local DIC.
+    start_sentences, warnings
+        Where the correlation started from, and what a user should know.
+    """
+
+    name: str
+    strain_x: float
+    strain_y: float
+    image: FloatImage
+    mask: BoolArray | None
+    result: Result
+    identifiability: Identifiability
+    agreement: ResidualTest
+    error_x: FloatArray
+    error_y: FloatArray
+    by_noise: FieldErrors
+    noise_covariance: FloatArray
+    by_leftover: FieldErrors | None = None
+    leftover_covariance: FloatArray | None = None
+    spectrum: Spectrum | None = None
+    pattern: WavePattern | None = None
+    parts: tuple[PartSpectrum, ...] = ()
+    local: LocalField | None = None
+    start_sentences: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        expected = (len(self.error_y), len(self.error_x), 2)
+        for errors in (self.by_noise, self.by_leftover):
+            if errors is not None and errors.v0.shape != expected:
+                raise InputError(
+                    f"harvest {self.name}: expected error bars of shape {expected} like their "
+                    f"axes, got {errors.v0.shape}"
+                )
+
+    @property
+    def modes(self) -> range:
+        """Numbers of the modes, from 0."""
+        return range(len(self.result.ansatz.modes))
+
+
+@dataclass(frozen=True)
+class TruthRow:
+    """One line of the table that sets what was found against the truth.
+
+    Parameters
+    ----------
+    quantity
+        In words.
+    obtained, expected
+        Numbers, or words.
+    ok
+        Whether the first is as good as the second asks for.
+    unit
+        Of both; "" for none.
+    """
+
+    quantity: str
+    obtained: float | str
+    expected: float | str
+    ok: bool
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """The truth of one frame, in the reference frame.
+
+    Parameters
+    ----------
+    displacement
+        (rows, cols, 2) [mm]; NaN off the material. May be memory-mapped.
+    best
+        The best fit of the frame's ansatz to it.
+    """
+
+    displacement: NDArray[Any]
+    best: Result
+
+
+@dataclass(frozen=True, eq=False)
+class HarvestTruth:
+    """The truth of photographs that were made by a simulation.
+
+    Parameters
+    ----------
+    frames
+        By the frames' names; some may be missing.
+    distortion
+        The optics' true distortion.
+    rows
+        What was found against what is true.
+    """
+
+    frames: Mapping[str, FrameTruth]
+    distortion: Distortion | None = None
+    rows: tuple[TruthRow, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Harvest:
+    """All that the report of a harvest shows; what is None or empty is left out.
+
+    Parameters
+    ----------
+    title
+        Of the page.
+    experiment
+        The experiment, as plain values.
+    grid
+        The pixels of the ideal images.
+    reference, mask
+        (rows, cols) the photograph of the undeformed state, free from distortion [grey levels],
+        and where it shows material.
+    lattice
+        The holes that were found and the lattice fitted to them.
+    cellular, domain
+        The part that has holes, and the box of the material [mm].
+    frames
+        In the order of the test.
+    skipped
+        Names of photographs that were not used, and why.
+    timeline
+        In the order of the test.
+    buckling
+        When the pattern appeared.
+    calibration, distortion
+        Of the optics; the distortion alone if it was given.
+    noise_sd, noise_source
+        Of each photograph [grey levels], and where that is known from.
+    full_scale
+        Largest grey level of the camera; None if not known.
+    sentences
+        What was done to the photographs and found in them, in words.
+    truth
+        Of photographs made by a simulation.
+    command, toml
+        That make this page again; the experiment's values are shown if ``toml`` is empty.
+    versions
+        Of software.
+    """
+
+    title: str
+    experiment: Mapping[str, Any]
+    grid: PixelGrid
+    reference: FloatImage
+    mask: BoolArray
+    cellular: Box
+    domain: Box
+    frames: tuple[HarvestedFrame, ...]
+    noise_sd: float
+    noise_source: str
+    lattice: HoleLattice | None = None
+    skipped: tuple[tuple[str, str], ...] = ()
+    timeline: Sequence[Moment] = ()
+    buckling: Buckling | None = None
+    calibration: Calibration | None = None
+    distortion: Distortion | None = None
+    full_scale: float | None = None
+    sentences: tuple[str, ...] = ()
+    truth: HarvestTruth | None = None
+    command: str = "modeharvest harvest EXPERIMENT.toml"
+    toml: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = self.grid.shape
+        images = {"reference": self.reference, "mask": self.mask}
+        images |= {frame.name: frame.image for frame in self.frames}
+        for name, image in images.items():
+            if image.shape != shape:
+                raise InputError(
+                    f"harvest: expected images of {shape} px like the grid, got {image.shape} for "
+                    f"{name}"
+                )
+        if not self.frames:
+            raise InputError("harvest: expected at least one deformed photograph, got none")
+        names = [frame.name for frame in self.frames]
+        if len(set(names)) < len(names):
+            raise InputError(f"harvest: expected names that differ, got {', '.join(names)}")
+        if not self.pitch > 0:
+            raise InputError("harvest: expected specimen.cell_size above 0 mm in the experiment")
+
+    @property
+    def pitch(self) -> float:
+        """Unit cell size l [mm]."""
+        return float(self.experiment.get("specimen", {}).get("cell_size", 0.0))
+
+    @property
+    def edge_px(self) -> int:
+        """Width of the rim of the material that was not compared [px]."""
+        return int(self.experiment.get("correlation", {}).get("edge_px", 0))
+
+    @property
+    def lens(self) -> Distortion | None:
+        """The optics' distortion, given or calibrated."""
+        if self.distortion is None and self.calibration is not None:
+            return self.calibration.distortion
+        return self.distortion
+
+
+_ALONG = 120
+"""Points of the error bars along the longer side: they are as smooth as the ansatz."""
+
+
+def gather_harvest(
+    experiment: PhotographCase,
+    prepared: PreparedPhotographs,
+    geometry: Geometry,
+    optics: Optics,
+    results: Mapping[str, MeasuredPhotograph],
+    *,
+    skipped: tuple[tuple[str, str], ...] = (),
+    truth: HarvestTruth | None = None,
+    source: str,
+    folder: Path,
+    versions: Mapping[str, str],
+    progress: Progress = silent,
+) -> Harvest:
+    """Gather what a harvest found.
+
+    Parameters
+    ----------
+    experiment, prepared, geometry, optics, results
+        The stages' outcomes.
+    skipped
+        Names of photographs that were not used, and why.
+    truth
+        Of photographs made by a simulation.
+    source, folder
+        The experiment's file and the folder of the harvest, for the command to make it again.
+    versions
+        For the record.
+    progress
+        Listener.
+    """
+    frames, moments = [], []
+    for k, (name, measured) in enumerate(results.items()):
+        progress(k, len(results), "error bars")
+        frame = _frame(experiment, prepared, geometry, name, measured)
+        frames.append(frame)
+        moments.append(_moment(frame, geometry.region.cellular))
+    noise, path = prepared.noise, Path(source)
+    return Harvest(
+        title=experiment.title or "Photographs of a test",
+        experiment=experiment.plain(),
+        grid=prepared.grid,
+        reference=prepared.image(),
+        mask=prepared.mask(),
+        cellular=geometry.region.cellular,
+        domain=geometry.region.domain,
+        frames=tuple(frames),
+        noise_sd=noise.sd,
+        noise_source=noise.source,
+        lattice=geometry.lattice,
+        skipped=skipped,
+        timeline=tuple(moments),
+        buckling=find_buckling(moments),
+        calibration=optics.calibration,
+        distortion=optics.distortion,
+        full_scale=float(prepared.info["full_scale"]),
+        sentences=(*prepared.info["notes"], *geometry.region.sentences),
+        truth=truth,
+        command=f"modeharvest harvest {source} --out {folder}",
+        toml=path.read_text("utf-8") if path.is_file() else "",
+        versions=versions,
+    )
+
+
+def _frame(
+    experiment: PhotographCase,
+    prepared: PreparedPhotographs,
+    geometry: Geometry,
+    name: str,
+    measured: MeasuredPhotograph,
+) -> HarvestedFrame:
+    result, image = measured.result, prepared.image(name)
+    box = geometry.region.cellular
+    cell = experiment.specimen.cell_size
+    x, y = _axes(geometry.region.domain)
+    noise = noise_of(prepared, name)
+    by_noise, by_leftover, warnings = covariances(
+        measured, prepared_pair(prepared, name), noise, cell
+    )
+    seen = identifiability(result, prepared.mask())
+    along, across = mean_strain(result, box)
+    spectrum = measured_spectrum(measured.local, cell, box)
+    pattern = read_pattern(spectrum)
+    return HarvestedFrame(
+        name=name,
+        strain_x=along,
+        strain_y=across,
+        image=image,
+        mask=prepared.mask(name),
+        result=result,
+        identifiability=seen,
+        agreement=residual_test(measured, prepared.image(), image, prepared, noise),
+        error_x=x,
+        error_y=y,
+        by_noise=field_errors(result, x, y, by_noise),
+        by_leftover=None if by_leftover is None else field_errors(result, x, y, by_leftover),
+        noise_covariance=by_noise,
+        leftover_covariance=by_leftover,
+        spectrum=spectrum,
+        pattern=pattern,
+        parts=_parts(measured, geometry, cell),
+        local=measured.local if experiment.local.code != "none" else None,
+        start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
+        warnings=warnings,
+    )
+
+
+def _parts(
+    measured: MeasuredPhotograph, geometry: Geometry, cell: float
+) -> tuple[PartSpectrum, ...]:
+    """Spectra of the parts, where there are several."""
+    if len(geometry.parts) == 1:
+        return ()
+    spectra = {p.name: measured_spectrum(measured.local, cell, p.box) for p in geometry.parts}
+    return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
+
+
+"""Pixels so near to a hole have no say in error bars [px]."""
+
+"""Examples of noise: with 100 cells a standard deviation is good to 4 %."""
+
+
+def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
+    seen, px = frame.identifiability, frame.result.grid.pixel_size
+    return Moment(
+        name=frame.name,
+        strain=frame.strain_x,
+        amplitude_px=float(np.linalg.norm(seen.amplitude_px)),
+        leftover_px=seen.leftover_px,
+        noise_px=_inside(frame.by_noise, frame.error_x, frame.error_y, cellular) / px,
+    )
+
+
+def _inside(errors: FieldErrors, x: FloatArray, y: FloatArray, box: Box) -> float:
+    """Rms per component of the pattern's standard deviation over a box [mm]; 0 without a mode."""
+    if not len(errors.fluctuation):
+        return 0.0
+    cols, rows = (box.x_min <= x) & (x <= box.x_max), (box.y_min <= y) & (y <= box.y_max)
+    variance = (errors.fluctuation**2).sum(axis=0)[np.ix_(rows, cols)]
+    return float(np.sqrt(np.mean(variance)))
+
+
+def _axes(domain: Box) -> tuple[FloatArray, FloatArray]:
+    """Positions over the specimen, about as dense both ways [mm]."""
+    across, up = (max(2, round(_ALONG * half / max(domain.half)) + 1) for half in domain.half)
+    return (
+        np.linspace(domain.x_min, domain.x_max, across, dtype=np.float64),
+        np.linspace(domain.y_min, domain.y_max, up, dtype=np.float64),
+    )

@@ -1,0 +1,327 @@
+"""``summary.json`` of measured photographs: every number of the report, for programs to read.
+
+A number that is not known, or infinite, is null. Standard deviations come in pairs: by the
+photographs' noise, and by what the ansatz leaves over (noise included); lengths that follow the
+images are in px, positions and fields in mm. rms is per component.
+
+``title``, ``experiment``
+    What was harvested, the experiment's every value.
+``pixel_size_mm``, ``cell_size_mm``, ``cellular_mm``, ``domain_mm``
+    Scale; the boxes [x_min, x_max, y_min, y_max] of the part with holes and of the material.
+``noise``
+    ``sd`` [grey levels], ``of_full_scale`` [-], ``source``.
+``frames``
+    In the order of the test: ``name``, ``strain_x``, ``strain_y``, ``strain`` (that of the time
+    line) [-, compression positive], ``has_pattern``, ``outcome``, ``outcome_why``,
+    ``iterations`` (on the full image), ``iterations_all_levels``, ``pixels``,
+    ``residual_rms`` [grey levels], ``residual_of_full_scale``, ``residual_correlation``,
+    ``chi_square``, ``agreement`` and ``weighting`` (sentences), ``leftover_px`` (of what the
+    ansatz can't describe, estimated from the images), ``condition_number``, ``undetermined``,
+    ``errors_px`` (``noise`` and ``leftover``: rms standard deviation of ``v0``, ``fluctuation``
+    and ``displacement`` over the part with holes), ``local`` (``source``, ``points``, ``lost``,
+    ``w_rms_px``, ``sd_px``, ``w_beyond_noise_px``), ``modes``, ``pattern_reading`` and
+    ``start`` (sentences), ``warnings``.
+``frames[].modes``
+    One for each mode: ``family``, ``held``, ``observable``, ``amplitude_px`` (rms of v phi),
+    ``largest_px`` (its largest length), ``v_max_mm`` with ``v_max_sd_noise_mm`` and
+    ``v_max_sd_leftover_mm`` (largest |v| over the part with holes), ``overlap`` (with v0, the
+    largest cosine), ``parameters`` (``name``, ``unit``, ``value``, ``sd_noise``,
+    ``sd_leftover``), ``waves`` (``xi``, the wave vector [1/l], with ``sd_noise`` and
+    ``sd_leftover``; null where the mode was held).
+``timeline``
+    For each frame ``name``, ``strain``, ``amplitude_px``, ``leftover_px``, ``noise_px``,
+    ``has_pattern``.
+``buckling``
+    ``before``, ``after``, ``estimate`` [-], ``sentence``.
+``lattice``
+    ``kind``, ``holes``, ``missing``, ``extra``, ``misfit_px``, ``pitch_px``, ``diameter_px``,
+    ``vectors_px`` and ``origin_px`` (row, col), ``rotation_deg``, ``sentences``; null without.
+``optics``
+    ``max_px`` and ``rms_px`` of the distortion; where it was calibrated ``sd_rms_px``,
+    ``degree``, ``trials`` (``degree``, ``unknowns``, ``residual_rms``, ``bic``, ``change_px``,
+    ``sd_px``), ``shifts_px`` (row, col) and ``angles_rad`` of the target with ``shifts_sd_px``
+    and ``angles_sd_rad``, ``noise_sd``, ``matches``, ``sentences``; null without.
+``skipped``, ``sentences``
+    Photographs not used (``name``, ``reason``); what was done and found, in words.
+``truth``
+    Rows ``quantity``, ``obtained``, ``expected``, ``unit``, ``ok``, where the truth is known.
+``versions``
+    With which software; what it took is in ``timings.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, astuple, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from modeharvest.idic.modes import PER_WAVE
+from modeharvest.idic.uncertainty.covariance import FieldErrors
+from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
+from modeharvest.util.arrays import FloatArray
+
+_CELLS = 360
+"""Along the images' longer side, at which fields are evaluated for their largest values."""
+
+
+def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
+    """Describe mode i (from 0) of a frame; keys as in ``summary.json``."""
+    result, seen = frame.result, frame.identifiability
+    family, part = result.ansatz.modes[i].family, result.ansatz.phi_slice(i)
+    noise = frame.noise_covariance[part, part]
+    left = None if frame.leftover_covariance is None else frame.leftover_covariance[part, part]
+    sd_noise, sd_left = _sd(np.eye(family.size), noise), _sd(np.eye(family.size), left)
+    return {
+        "family": family.name,
+        "held": family.size == 0,
+        "observable": i not in seen.unobservable,
+        "amplitude_px": seen.amplitude_px[i],
+        **_largest_values(harvest, frame, i),
+        "overlap": seen.overlap[i],
+        "parameters": [
+            {"name": name, "unit": unit, "value": value, "sd_noise": _item(sd_noise, k),
+             "sd_leftover": _item(sd_left, k)}
+            for k, (name, unit, value) in enumerate(
+                zip(family.names, family.units, result.mode_parameters(i), strict=True))
+        ],
+        "waves": _wave_vectors(harvest, frame, i, noise, left),
+    }  # fmt: skip
+
+
+def _wave_vectors(
+    harvest: Harvest, frame: HarvestedFrame, i: int, noise: FloatArray, left: FloatArray | None
+) -> list[dict[str, Any]]:
+    """Wave vectors [1/l]: k is in units of half a wavelength's inverse, like the mode's length."""
+    mode = frame.result.ansatz.modes[i]
+    to_xi = harvest.pitch / (2.0 * mode.half_wavelength)
+    waves = mode.family.waves(frame.result.mode_parameters(i))
+    found = []
+    for w, wave in enumerate(waves):
+        rows = to_xi * mode.family.matrix[PER_WAVE * w + 2 : PER_WAVE * w + 4]
+        held = not rows.any()
+        found.append({
+            "xi": to_xi * wave[2:4],
+            "sd_noise": None if held else _sd(rows, noise),
+            "sd_leftover": None if held else _sd(rows, left),
+        })  # fmt: skip
+    return found
+
+
+def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
+    """The largest |v| and the largest length of v phi on the material of the mode's own part."""
+    grid, box = harvest.grid, frame.result.ansatz.modes[i].taper.cellular
+    step = max(1, round(max(grid.shape) / _CELLS))
+    x, y, mask = grid.x[::step], grid.y[::step], harvest.mask[::step, ::step]
+    inside = mask & ((box.y_min <= y) & (y <= box.y_max))[:, None]
+    inside &= ((box.x_min <= x) & (x <= box.x_max))[None, :]
+    ansatz, a = frame.result.ansatz, frame.result.unknowns
+    v = np.where(inside, np.abs(ansatz.v(i, a, x, y)), 0.0)
+    length = np.linalg.norm(ansatz.fluctuation(i, a, x, y), axis=-1)
+    row, col = np.unravel_index(int(v.argmax()), v.shape)
+    at = (
+        int(np.abs(frame.error_y - y[row]).argmin()),
+        int(np.abs(frame.error_x - x[col]).argmin()),
+    )
+    by_leftover = frame.by_leftover
+    return {
+        "largest_px": float(length.max(initial=0.0, where=inside)) / grid.pixel_size,
+        "v_max_mm": v[row, col],
+        "v_max_sd_noise_mm": frame.by_noise.v[i][at],
+        "v_max_sd_leftover_mm": None if by_leftover is None else by_leftover.v[i][at],
+    }
+
+
+def _sd(rows: FloatArray, covariance: FloatArray | None) -> FloatArray | None:
+    """(k,) standard deviations of rows (k, m) times unknowns; infinite where one of them is."""
+    if covariance is None:
+        return None
+    lost = np.isinf(np.diag(covariance))
+    known = np.where(lost[:, None] | lost[None, :], 0.0, covariance)
+    variance = np.einsum("km,mn,kn->k", rows, known, rows)
+    touched = (rows[:, lost] != 0.0).any(axis=1)
+    return np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _item(values: FloatArray | None, k: int) -> float | None:
+    return None if values is None else float(values[k])
+
+
+def harvest_summary(harvest: Harvest) -> dict[str, Any]:
+    """Make the content of ``summary.json``, plain JSON values; keys as documented above."""
+    truth, buckling = harvest.truth, harvest.buckling
+    summary = {
+        "title": harvest.title,
+        "experiment": harvest.experiment,
+        "pixel_size_mm": harvest.grid.pixel_size,
+        "cell_size_mm": harvest.pitch,
+        "cellular_mm": astuple(harvest.cellular),
+        "domain_mm": astuple(harvest.domain),
+        "noise": {
+            "sd": harvest.noise_sd,
+            "of_full_scale": _share(harvest.noise_sd, harvest.full_scale),
+            "source": harvest.noise_source,
+        },
+        "frames": [_frame(harvest, frame) for frame in harvest.frames],
+        "timeline": [
+            {k: getattr(m, k) for k in ("name", "strain", "amplitude_px", "leftover_px",
+                                        "noise_px", "has_pattern")}
+            for m in harvest.timeline
+        ],
+        "buckling": None if buckling is None else {
+            k: getattr(buckling, k) for k in ("before", "after", "estimate", "sentence")},
+        "lattice": _lattice(harvest),
+        "optics": _optics(harvest),
+        "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
+        "sentences": harvest.sentences,
+        "truth": [] if truth is None else [asdict(row) for row in truth.rows],
+        "versions": harvest.versions,
+    }  # fmt: skip
+    plain: dict[str, Any] = plain_values(summary)
+    return plain
+
+
+def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
+    result, seen = frame.result, frame.identifiability
+    moment = next((m for m in harvest.timeline if m.name == frame.name), None)
+    return {
+        "name": frame.name,
+        "strain_x": frame.strain_x,
+        "strain_y": frame.strain_y,
+        "strain": max(frame.strain_x, frame.strain_y, key=abs) if moment is None
+        else moment.strain,
+        "has_pattern": None if moment is None else moment.has_pattern,
+        "outcome": result.outcome.name.lower(),
+        "outcome_why": result.outcome.explanation,
+        "iterations": result.iterations,
+        "iterations_all_levels": len(result.history),
+        "pixels": result.pixels,
+        "residual_rms": result.residual_rms,
+        "residual_of_full_scale": _share(result.residual_rms, harvest.full_scale),
+        "residual_correlation": frame.agreement.correlation,
+        "chi_square": frame.agreement.chi_square,
+        "agreement": frame.agreement.sentence,
+        "weighting": result.weighting.sentence,
+        "leftover_px": seen.leftover_px,
+        "condition_number": seen.condition_number,
+        "undetermined": seen.undetermined,
+        "errors_px": {
+            "noise": _rms_errors(harvest, frame, frame.by_noise),
+            "leftover": _rms_errors(harvest, frame, frame.by_leftover),
+        },
+        "local": _local(harvest, frame),
+        "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
+        "pattern_reading": () if frame.pattern is None else frame.pattern.sentences,
+        "start": frame.start_sentences,
+        "warnings": (*_frame_warnings(frame), *frame.warnings),
+    }  # fmt: skip
+
+
+def _frame_warnings(frame: HarvestedFrame) -> list[str]:
+    """What identifiability warns of, but for modes that are held, as it advises."""
+    seen, modes = frame.identifiability, frame.result.ansatz.modes
+    said = dict(zip(seen.unobservable, seen.warnings, strict=False))  # those come first
+    return [w for w in seen.warnings
+            if not any(w == said[i] and not modes[i].family.size for i in said)]  # fmt: skip
+
+
+def _rms_errors(
+    harvest: Harvest, frame: HarvestedFrame, errors: FieldErrors | None
+) -> dict[str, float] | None:
+    """Rms standard deviations per component among the holes [px]."""
+    if errors is None:
+        return None
+    box = harvest.cellular
+    rows = (box.y_min <= frame.error_y) & (frame.error_y <= box.y_max)
+    cols = (box.x_min <= frame.error_x) & (frame.error_x <= box.x_max)
+    if not (rows.any() and cols.any()):
+        return None
+    fields = {"v0": errors.v0, "displacement": errors.displacement}
+    if frame.modes:
+        fields["fluctuation"] = np.sqrt((errors.fluctuation**2).sum(axis=0))
+    px = harvest.grid.pixel_size
+    return {
+        name: float(np.sqrt(np.mean(field[np.ix_(rows, cols)] ** 2))) / px
+        for name, field in fields.items()
+    }
+
+
+def _local(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
+    local, result, px = frame.local, frame.result, harvest.grid.pixel_size
+    if local is None:
+        return None
+    w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
+    return {
+        "source": local.source,
+        "points": local.x.size,
+        "lost": local.lost,
+        "w_rms_px": w.rms / px,
+        "sd_px": w.sd_rms / px,
+        "w_beyond_noise_px": w.rms_beyond_noise / px,
+    }
+
+
+def _lattice(harvest: Harvest) -> dict[str, Any] | None:
+    lattice = harvest.lattice
+    if lattice is None:
+        return None
+    return {
+        "kind": lattice.kind,
+        "holes": len(lattice),
+        "missing": len(lattice.missing),
+        "extra": len(lattice.extra),
+        "misfit_px": lattice.misfit_px,
+        "pitch_px": lattice.pitch_px,
+        "diameter_px": lattice.diameters.mean(),
+        "vectors_px": lattice.vectors,
+        "origin_px": lattice.origin,
+        "rotation_deg": lattice.rotation_deg,
+        "sentences": lattice.sentences,
+    }
+
+
+def _optics(harvest: Harvest) -> dict[str, Any] | None:
+    found = harvest.calibration
+    distortion = harvest.lens
+    if distortion is None:
+        return None
+    rows, cols = (np.linspace(0.0, size - 1.0, 25) for size in harvest.grid.shape)
+    at = rows[:, None], cols[None, :]
+    length = np.hypot(*distortion.shift(*at))
+    summary = {"max_px": length.max(), "rms_px": np.sqrt(np.mean(length**2) / 2.0)}
+    if found is not None:
+        summary |= {
+            "sd_rms_px": np.sqrt(np.mean(np.square(found.sd(*at)))),
+            "degree": found.distortion.degree,
+            "trials": found.trials,
+            "shifts_px": found.shifts,
+            "shifts_sd_px": found.shifts_sd,
+            "angles_rad": found.angles,
+            "angles_sd_rad": found.angles_sd,
+            "noise_sd": found.noise_sd,
+            "matches": found.matches,
+            "sentences": found.sentences,
+        }
+    return summary
+
+
+def _share(level: float, full_scale: float | None) -> float | None:
+    return level / full_scale if full_scale else None
+
+
+def plain_values(value: Any) -> Any:
+    """Dictionaries, lists, strings, numbers; null for what is not a finite number."""
+    if isinstance(value, Mapping):
+        return {str(k): plain_values(v) for k, v in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_values(asdict(value))
+    if isinstance(value, np.ndarray):
+        return plain_values(value.tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain_values(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

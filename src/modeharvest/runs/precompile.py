@@ -1,0 +1,132 @@
+"""Kernels compiled ahead of time: by children, while the finite elements leave a core idle.
+
+numba holds the interpreter while it compiles, so threads are no help. Each child does a small case
+of what comes later in the run and leaves its kernels on disk, where the run finds them. It is a
+courtesy: what a child does not get done is compiled where it is needed.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from modeharvest.fem.field import Solution
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.solver.passes import accumulate
+from modeharvest.imaging.compiled import kept_in, sources
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.mapping.rasterise import rasterise
+from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.util.machine import is_alone
+from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.truth import best_fit
+
+_CASE = "paper-virtual"
+
+
+def _images() -> None:
+    """What the stage ``image`` compiles."""
+    case, solution = read_case(_CASE), shipped_solution(_CASE)
+    assert solution is not None
+    spec = replace(case.imaging, pixel_size=0.1)
+    with tempfile.TemporaryDirectory() as folder:
+        make_images(Solution.read(solution), case.experiment.strains[-1:], spec, folder)
+
+
+def _correlation() -> None:
+    """What the stages ``correlate`` and ``validate`` compile."""
+    case, rng = read_case(_CASE), np.random.default_rng(0)
+    grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
+    ansatz = case.correlation.ansatz(case.experiment.specimen)
+    start = case.correlation.start(ansatz, strain)
+    f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
+    options = replace(
+        case.correlation.options(),
+        gauss_newton=replace(case.correlation.options().gauss_newton, max_iterations=1),
+    )
+    found = correlate(f, f[::-1].copy(), grid, ansatz, start, mask, mask, options)
+    best_fit(found.displacement(), grid, ansatz, (start,), mask)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A child's work, and a kernel beside which it notes that it is done."""
+
+    work: Callable[[], None]
+    beside: Callable[..., object]
+
+    @property
+    def stamp(self) -> Path | None:
+        """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
+        folder = kept_in(self.beside)
+        return None if folder is None else folder / f"precompiled-{sources()}.nbi"
+
+
+_PARTS = {"image": _Part(_images, rasterise), "correlate": _Part(_correlation, accumulate)}
+
+
+@dataclass(frozen=True)
+class Precompilation:
+    """Children at work.
+
+    Parameters
+    ----------
+    children
+        By the stage that needs what they compile.
+    """
+
+    children: dict[str, subprocess.Popen[bytes]]
+
+    def wait(self, stage: str, progress: Progress = silent) -> None:
+        """Wait for the kernels of a stage: two who compile the same are no faster than one."""
+        child = self.children.get(stage)
+        if child is not None and child.poll() is None:
+            progress(0, 1, "compile kernels, once")
+            child.wait()
+
+
+@contextmanager
+def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
+    """Start a child for each stage whose kernels are not there yet; none is left in the end."""
+    children = {}
+    if is_alone() and (os.cpu_count() or 1) > 1:
+        for stage in stages:
+            stamp = _PARTS[stage].stamp
+            if stamp is not None and not stamp.exists():
+                children[stage] = subprocess.Popen(
+                    [sys.executable, "-m", "modeharvest.runs.precompile", stage],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+    try:
+        yield Precompilation(children)
+    finally:
+        for child in children.values():
+            if child.poll() is None:
+                child.kill()
+            child.wait()
+
+
+def _main(stage: str) -> None:
+    if hasattr(os, "nice"):
+        os.nice(10)  # the finite elements go first
+    part = _PARTS[stage]
+    part.work()
+    if part.stamp is not None:
+        for old in part.stamp.parent.glob("precompiled-*.nbi"):
+            old.unlink(missing_ok=True)
+        part.stamp.touch()
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

@@ -1,0 +1,392 @@
+"""A study from its case to its report, in one folder in which an interrupted run is continued.
+
+::
+
+    study.json               which kind of study has this folder
+    solution.h5              the exact displacements
+    subjects/ images/        pairs of images, and how they are correlated
+    cases/KEY.json           one file for each case, written when it is done
+    table.csv                one row for each case
+    timings.json             what it took; all else is the same after every run
+    *.csv                    the report's tables
+    summary.json report.html what was found
+
+Its TOML file has the tables of a virtual experiment and ``[study]``, with a kind ("robustness",
+"noise", "systematic", "modes" or "resolution") and that kind's options. In Python::
+
+    case = StudyCase(study=Robustness(starts=20, radius=0.2))
+"""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import pandas as pd
+from pydantic import field_validator, model_validator
+
+from modeharvest import __version__
+from modeharvest.fem.field import Solution
+from modeharvest.report.model import Findings, StudyRun, slug, write_study_report
+from modeharvest.report.study_modes import report_modes
+from modeharvest.report.study_noise import report_noise
+from modeharvest.report.study_resolution import report_resolution
+from modeharvest.report.study_robustness import report_robustness
+from modeharvest.report.study_systematic import report_systematic
+from modeharvest.runs.case import Case, checked, kind_of, of_kind, read_tables
+from modeharvest.runs.experiment import Run
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic, read_json, require_writable, write_json
+from modeharvest.util.progress import Progress, named, silent
+from modeharvest.util.stages import Stages, exclusive
+from modeharvest.util.typed import nearest
+from modeharvest.validation.campaign import Campaign
+from modeharvest.validation.studies.modes import MeasuredModesStudy
+from modeharvest.validation.studies.noise import NoiseStudy
+from modeharvest.validation.studies.resolution import ResolutionStudy
+from modeharvest.validation.studies.robustness import RobustnessStudy
+from modeharvest.validation.studies.study import ImagePairSpec, Study
+from modeharvest.validation.studies.systematic import SystematicStudy
+from modeharvest.validation.workers import Workers
+
+
+def study_with_options(
+    name: str,
+    out: Path,
+    workers: int | None,
+    memory: str,
+    scheduler: str | None,
+    quick: bool,
+    solution: Path | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Run a study as the command line says; returns the content of ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        If options contradict each other, or the study can't be read or run.
+    """
+    if scheduler is not None and workers is not None:
+        raise InputError(
+            "expected --workers or --scheduler, got both: a scheduler has workers of its own"
+        )
+    case = read_study(name)
+    crew = Workers(2 if workers is None else workers, memory, scheduler)
+    words = ["modeharvest study", name, "--out DIR"]
+    words += ["--quick"] if quick else []
+    words += ["--solution FILE"] if solution else []
+    return StudyAnalysis(
+        case.quick() if quick else case, out, crew, progress, solution, " ".join(words)
+    ).all()
+
+
+KINDS: dict[str, type[Any]] = {
+    "robustness": RobustnessStudy,
+    "noise": NoiseStudy,
+    "systematic": SystematicStudy,
+    "resolution": ResolutionStudy,
+    "modes": MeasuredModesStudy,
+}
+_SHIPPED = resources.files("modeharvest") / "studies"
+_QUICK = 2.0
+"""A quick study's pixels are that much larger."""
+
+
+class StudyCase(Case):
+    """A question, and the virtual experiment that it is asked of."""
+
+    study: Any = RobustnessStudy()
+
+    @field_validator("study", mode="before")
+    @classmethod
+    def _of_kind(cls, table: Any) -> Any:
+        return of_kind(table, KINDS, "study") if isinstance(table, Mapping) else table
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        study: Study = self.study
+        study.require(self.correlation)
+        strains = self.experiment.strains
+        if not any(abs(study.strain - e) < 1e-9 for e in strains):
+            raise InputError(
+                f"study: expected a strain among experiment.strains = {list(strains)}, got "
+                f"{study.strain}"
+            )
+        if self.imaging.distortion is not None:
+            raise InputError(
+                "study: expected a perfect lens, got imaging.distortion; studies measure ideal "
+                "images"
+            )
+        return self
+
+    @property
+    def kind(self) -> str:
+        """The name of the question."""
+        return next(name for name, kind in KINDS.items() if isinstance(self.study, kind))
+
+    def quick(self) -> StudyCase:
+        """A first look: fewer cases, on images of a quarter of the pixels."""
+        imaging = replace(self.imaging, pixel_size=_QUICK * self.imaging.pixel_size)
+        changed = {"study": self.study.quick(), "imaging": imaging}
+        return StudyCase(**{n: getattr(self, n) for n in type(self).model_fields} | changed)
+
+    def plain(self) -> dict[str, Any]:
+        """The case as plain JSON values, the study and materials by their kinds."""
+        return {**super().plain(), "study": kind_of(self.study, KINDS)}
+
+
+def shipped_studies() -> dict[str, str]:
+    """Names and titles of the studies that come with the package."""
+    paths = sorted(Path(str(p)) for p in _SHIPPED.iterdir() if p.name.endswith(".toml"))
+    return {p.stem: str(tomllib.loads(p.read_text("utf-8"))["title"]) for p in paths}
+
+
+def read_study(name: str | Path) -> StudyCase:
+    """Read a study by the name of a shipped one or by the path of a TOML file.
+
+    Raises
+    ------
+    InputError
+        If there is no such study, it is not TOML, a key is unknown (the nearest known one is
+        suggested), a value is out of its range, or options contradict each other.
+    """
+    path = Path(name)
+    if path.suffix != ".toml" and not path.is_file():
+        known = list(shipped_studies())
+        if str(name) not in known:
+            raise InputError(f"unknown study {str(name)!r}{nearest(str(name), known)}")
+        path = Path(str(_SHIPPED / f"{name}.toml"))
+    tables = read_tables(path)
+    if "study" not in tables:
+        raise InputError(
+            f"{name}: expected a table [study] with a kind among {list(KINDS)}, got none; a "
+            f"virtual experiment by itself is run with 'modeharvest run {name} --out DIR'"
+        )
+    return checked(StudyCase, tables, name)
+
+
+FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
+    RobustnessStudy: report_robustness,
+    NoiseStudy: report_noise,
+    SystematicStudy: report_systematic,
+    ResolutionStudy: report_resolution,
+    MeasuredModesStudy: report_modes,
+}
+"""For each kind of study what reads its table: failed cases have an ``error``, and no result."""
+
+
+@dataclass(frozen=True)
+class StudyAnalysis:
+    """A study, the folder it leaves its files in, who works and who listens.
+
+    Parameters
+    ----------
+    case
+        What to ask of which specimen.
+    folder
+        Where; made if it does not exist.
+    workers
+        Who runs the cases.
+    progress
+        Listener.
+    solution
+        A solution file to use instead of simulating.
+    command
+        What makes it again, for the report.
+    """
+
+    case: StudyCase
+    folder: Path
+    workers: Workers = field(default_factory=Workers)
+    progress: Progress = silent
+    solution: Path | None = None
+    command: str = "modeharvest study STUDY --out DIR"
+
+    def subject(self) -> ImagePairSpec:
+        """What is measured."""
+        case = self.case
+        return ImagePairSpec(case.experiment, case.imaging, case.correlation, self._solution)
+
+    def _solution(self) -> Solution:
+        """The exact displacements, simulated or read from a file; leaves ``solution.h5``."""
+        solution = Run(self.case, self.folder, self.progress, self.solution).solved()
+        if self.solution is not None:
+            solution.write(self.folder / "solution.h5")
+        return solution
+
+    def all(self) -> dict[str, Any]:
+        """Run what is missing of the study; returns the content of ``summary.json``.
+
+        Raises
+        ------
+        InputError
+            If no case succeeded, the folder can't be written to, holds anything else or is
+            another process's, a scheduler is not there, or its workers can't do the work.
+        """
+        folder, study = self.folder.resolve(), self.case.study
+        with exclusive(folder):
+            require_writable(folder)
+            _claim(folder, self.case.kind)
+            self.workers.require_ready(study.function, folder)
+            with self._timed("solution and images"):
+                cases = study.prepare(self.subject(), folder, self.progress)
+            campaign = Campaign(study.function, cases, folder)
+            with self._timed("cases"):
+                listener = named(self.progress, f"study: {len(cases)} cases")
+                table = campaign.run(self.workers, listener)
+            if (table["error"] != "").all():
+                first = table["error"].iloc[0]
+                raise InputError(f"all {len(table)} cases failed; the first: {first}")
+            with self._timed("findings"):
+                findings = FINDINGS[type(study)](study, table, folder)
+            return self._tell(campaign, table, findings)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        """Take down what a stage takes."""
+        begin = time.perf_counter()
+        yield
+        Stages(self.folder).took(stage, time.perf_counter() - begin)
+
+    def _tell(self, campaign: Campaign, table: pd.DataFrame, findings: Findings) -> dict[str, Any]:
+        """Leave tables, ``summary.json`` and ``report.html``."""
+        files = {"table.csv": "every case: its values, error, result"}
+        for title, part in {**findings.tables, **findings.attachments}.items():
+            name = f"{slug(title)}.csv"
+            files[name] = title
+            with atomic(self.folder / name) as temporary:
+                part.to_csv(temporary, index=False)
+        files["summary.json"] = "the findings' numbers and sentences, and the failures"
+        files["timings.json"] = "what the stages took [s]"
+        summary = self._summary(campaign, table, findings)
+        write_json(self.folder / "summary.json", summary)
+        study: Study = self.case.study
+        run = StudyRun(
+            title=summary["title"],
+            question=study.question,
+            findings=findings,
+            command=self.command,
+            seeds=study.seeds,
+            case=summary["case"],
+            notes=_notes(summary),
+            files=files,
+            versions=summary["versions"],
+        )
+        write_study_report(self.folder / "report.html", run)
+        return summary
+
+    def _summary(
+        self, campaign: Campaign, table: pd.DataFrame, findings: Findings
+    ) -> dict[str, Any]:
+        """The content of ``summary.json``; docs/studies.md tells its keys."""
+        failed = table[table["error"] != ""]
+        return {
+            "title": self.case.title or self.case.kind.capitalize(),
+            "kind": self.case.kind,
+            "command": self.command,
+            "seeds": self.case.study.seeds,
+            "sentences": list(findings.sentences),
+            "numbers": _plain(dict(findings.numbers)),
+            "cases": len(table),
+            "failed": [
+                {"file": campaign.path(campaign.cases[k]).name, "error": failed["error"][k]}
+                for k in failed.index
+            ],
+            "other_results_by_version": campaign.of_other_versions(),
+            "versions": _versions(),
+            "case": self.case.plain(),
+        }
+
+
+def study(
+    name: str | Path | StudyCase,
+    folder: Path | str,
+    workers: Workers | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Run a study; what ``modeharvest study`` does.
+
+    Parameters
+    ----------
+    name
+        A shipped study's name, the path of a TOML file, or a StudyCase.
+    folder
+        Where to leave the files.
+    workers
+        Who runs the cases; two processes of this machine by default.
+    progress
+        Listener.
+
+    Returns
+    -------
+    dict
+        The content of ``summary.json``.
+    """
+    case = name if isinstance(name, StudyCase) else read_study(name)
+    return StudyAnalysis(case, Path(folder), workers or Workers(), progress).all()
+
+
+def _claim(folder: Path, kind: str) -> None:
+    """Take a folder for a kind of study; InputError if it holds anything else."""
+    path, holds = folder / "study.json", f"a {kind} study"
+    if path.is_file():
+        holds = f"a {_kind_in(path, kind)} study"
+    elif (folder / "summary.json").exists():
+        holds = "something that is no study (it has a summary.json, but no study.json)"
+    if holds != f"a {kind} study":
+        raise InputError(
+            f"expected an empty folder or one with a {kind} study, got {folder}, which holds "
+            f"{holds}; take another with --out"
+        )
+    write_json(path, {"kind": kind})
+
+
+def _kind_in(path: Path, kind: str) -> str:
+    """The kind that a folder's ``study.json`` says; the one asked for if that is damaged."""
+    try:
+        return str(read_json(path)["kind"])
+    except (InputError, KeyError, TypeError):
+        return kind
+
+
+def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
+    """What to keep in mind of how the study went."""
+    said = []
+    if summary["failed"]:
+        first = summary["failed"][0]
+        said.append(
+            f"{len(summary['failed'])} of {summary['cases']} cases failed; their tracebacks are "
+            f"in cases/. The first, {first['file']}: {first['error']}"
+        )
+    for other, count in summary["other_results_by_version"].items():
+        of = "other options" if other == __version__ else f"modeharvest {other}"
+        said.append(f"Stored results of {of}, {count} in number, were left alone and not mixed in.")
+    said.append(
+        "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
+        "not plane) is not in it."
+    )
+    return tuple(said)
+
+
+def _plain(value: Any) -> Any:
+    """Values as JSON knows them: NaN as null, numpy's numbers as numbers."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and value != value else value
+
+
+def _versions() -> dict[str, str]:
+    libraries = ("numpy", "scipy", "numba", "distributed")
+    return {"modeharvest": __version__} | {name: version(name) for name in libraries}

@@ -1,1 +1,0 @@
-"""Studies as cases: a TOML file says what to ask of which specimen; ``modeharvest study`` asks."""

@@ -1,0 +1,96 @@
+"""Parsers that can crash, run in a process apart: ``python child.py KIND FILE TARGET``.
+
+scipy reads MAT files, and meshio meshes, as they tell it to: a damaged one makes scipy read where
+there is no memory of its own, which ends the process, and meshio fill the memory. What is read goes
+to TARGET, an NPZ of numbers and texts, with their names as ``names``. Imports nothing of
+modeharvest, to start fast.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from typing import Any
+
+import numpy as np
+
+BASE_BYTES, BYTES_PER_BYTE = 1e9, 2000.0
+"""Memory that reading a file may take beside what is taken already: no format packs closer."""
+
+Arrays = dict[str, np.ndarray[Any, Any]]
+
+
+def read_mat(path: str) -> Arrays:
+    """Numbers and texts of a MAT file before version 7.3, by their path in structures."""
+    from scipy.io import loadmat
+
+    return dict(_flattened(loadmat(path, simplify_cells=True)))
+
+
+def _flattened(content: dict[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in content.items():
+        if name.startswith("__"):
+            continue
+        if isinstance(value, dict):
+            yield from _flattened(value, f"{above}{name}/")
+        else:
+            yield above + name, np.asarray(value)
+
+
+def read_mesh(path: str) -> Arrays:
+    """``points``, ``cells/N/TYPE`` and ``point_data/NAME`` of a mesh."""
+    import meshio
+
+    mesh = meshio.read(path)
+    cells = {f"cells/{k}/{block.type}": block.data for k, block in enumerate(mesh.cells)}
+    fields = {f"point_data/{name}": values for name, values in mesh.point_data.items()}
+    return {"points": mesh.points, **cells, **fields}
+
+
+KINDS = {"mat": read_mat, "mesh": read_mesh}
+
+
+def convert(kind: str, path: str, target: str) -> str:
+    """Read ``path`` and write ``target``; returns why that failed, or an empty text."""
+    said = StringIO()
+    try:
+        with warnings.catch_warnings(), redirect_stdout(said), redirect_stderr(said):
+            warnings.simplefilter("ignore")  # what is doubtful is left out below
+            found = {name: np.asarray(values) for name, values in KINDS[kind](path).items()}
+        kept = {name: array for name, array in found.items() if array.dtype.kind in "fiubU"}
+        np.savez(target, *kept.values(), names=np.array(list(kept), dtype=np.str_))
+    except (Exception, SystemExit) as error:  # they raise anything, print why, and may exit
+        if isinstance(error, MemoryError):
+            return "it declares more numbers than a file of its size can hold"
+        return " ".join((said.getvalue() or str(error)).split()) or type(error).__name__
+    return ""
+
+
+def limit_memory(path: str) -> None:
+    """Where the system can, let wild allocations fail instead of filling the memory."""
+    try:
+        import resource
+
+        with open("/proc/self/statm", encoding="ascii") as file:
+            taken = int(file.read().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError):  # not Linux
+        return
+    most = int(taken + BASE_BYTES + BYTES_PER_BYTE * os.path.getsize(path))
+    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do what the module says; the exit code, after a line on stderr if it isn't 0."""
+    kind, path, target = arguments
+    limit_memory(path)
+    said = convert(kind, path, target)
+    print(said, file=sys.stderr)
+    return int(bool(said))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,336 @@
+"""Reading and writing files: every fault of a file in one line, every new file whole or absent.
+
+The libraries that read formats raise anything for a damaged file. What a reader does with them
+stands in a ``with reading(...)`` block, which turns all of it into InputError. HDF5 is opened by
+:func:`open_hdf5`, which refuses files that would read others or fill the memory; what can't be
+trusted even so is read by :func:`read_in_child`. New files are written under a temporary name and
+then renamed: :func:`atomic`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.util import child
+from modeharvest.util.errors import InputError
+from modeharvest.util.machine import require_memory
+
+_CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
+"""After which a file is taken for one that makes its parser run for ever."""
+
+
+@contextmanager
+def reading(path: Path | str, what: str, remedy: str = "make it again") -> Iterator[Path]:
+    """Turn whatever ends the block into InputError; nothing but reading the file belongs in it.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        Is expected there: "a solution (HDF5)".
+    remedy
+        What to do.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is a folder, or the block raises. What the block itself says
+        is kept, behind the file's name.
+    """
+    path = Path(path)
+    require_file(path, what, remedy)
+    try:
+        yield path
+    except InputError as error:
+        line = " ".join(str(error).split())
+        raise InputError(line if str(path) in line else f"{path}: {line}") from error
+    except Exception as error:  # every format and library has exceptions of its own
+        raise InputError(f"expected {what} at {path}, got: {reason(error)}; {remedy}") from error
+
+
+def require_file(path: Path, what: str, remedy: str) -> None:
+    """Raise InputError unless there is a file."""
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"expected {what} at {path}, found {found}; {remedy}")
+    if path.stat().st_size == 0:
+        raise InputError(
+            f"expected {what} at {path}, got: an empty file, cut short at 0 bytes; {remedy}"
+        )
+
+
+def reason(error: BaseException) -> str:
+    """Why a library gave up, in one line."""
+    if isinstance(error, KeyError) and len(error.args) == 1 and " " not in str(error.args[0]):
+        return f"no {error.args[0]!r}"
+    if isinstance(error, MemoryError):
+        return "more numbers than there is memory for"
+    text = " ".join(str(error).split())
+    return text if len(text) > 3 else f"{type(error).__name__} {text}".strip()
+
+
+@contextmanager
+def open_hdf5(
+    path: Path | str, what: str, remedy: str = "make it again", form: str | None = None
+) -> Iterator[h5py.File]:
+    """An HDF5 file to read from; see :func:`reading` for what happens to errors.
+
+    Parameters
+    ----------
+    path, what, remedy
+        As there.
+    form
+        What its attribute ``format`` has to say; None for any.
+
+    Raises
+    ------
+    InputError
+        Also if the file is of another format, reaches into other files (external storage, external
+        links, virtual data), or holds more than there is memory for: a file of a few hundred bytes
+        can hand out any other one, and declare any size.
+    """
+    with reading(path, what, remedy) as path, h5py.File(path, "r") as file:
+        if form is not None and (got := file.attrs.get("format")) != form:
+            raise InputError(f"expected a {form} file at {path}, got format {got!r}; {remedy}")
+        _require_self_contained(file, path)
+        yield file
+
+
+def require_plausible(path: Path, declared: float) -> None:
+    """Refuse a file that declares more than it can hold, or more than there is memory for.
+
+    Parameters
+    ----------
+    path
+        The file.
+    declared
+        What it says that it holds [bytes].
+
+    Raises
+    ------
+    InputError
+        A header of a few bytes can declare any size.
+    """
+    size = path.stat().st_size
+    if not declared <= child.BASE_BYTES / 10.0 + child.BYTES_PER_BYTE * size:
+        raise InputError(
+            f"expected a whole file at {path}, got {size} bytes that declare {declared:.3g}"
+        )
+    require_memory(declared, f"the file {path}", "take a part of it")
+
+
+def read_in_child(kind: str, path: Path | str, what: str, remedy: str) -> dict[str, NDArray[Any]]:
+    """Numbers and texts of a file, by their names, read by :mod:`modeharvest.util.child`.
+
+    Parameters
+    ----------
+    kind
+        "mat" or "mesh".
+    path, what, remedy
+        As for :func:`reading`.
+
+    Raises
+    ------
+    InputError
+        If the parser gives up, crashes, or doesn't end.
+    """
+    with reading(path, what, remedy) as path, tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "read.npz"
+        command = [sys.executable, "-P", child.__file__, kind, str(path.resolve()), str(target)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False,
+            timeout=_CHILD_SECONDS + path.stat().st_size * _CHILD_SECONDS_PER_BYTE,
+        )  # fmt: skip
+        if done.returncode < 0:
+            raise ValueError(f"a file that makes its parser crash (signal {-done.returncode})")
+        if done.returncode:
+            raise ValueError((done.stderr.strip().splitlines() or ["nothing"])[-1])
+        with np.load(target, allow_pickle=False) as file:
+            return {str(name): file[f"arr_{k}"] for k, name in enumerate(file["names"])}
+
+
+def _require_self_contained(file: h5py.File, path: Path) -> None:
+    total = 0.0
+
+    # What these return that isn't None ends the visit; what they raise would get lost in HDF5.
+    def outside(name: str, link: Any) -> str | None:
+        is_external = isinstance(link, h5py.ExternalLink)
+        return f"{name!r}, which is in another file, {link.filename!r}" if is_external else None
+
+    def stored_outside(name: str, thing: Any) -> str | None:
+        nonlocal total
+        if not isinstance(thing, h5py.Dataset):
+            return None
+        total += thing.nbytes
+        is_external = thing.external or thing.is_virtual
+        return f"{name!r}, whose numbers are in another file" if is_external else None
+
+    found = file.visititems_links(outside) or file.visititems(stored_outside)
+    if found:
+        raise InputError(
+            f"expected all data in the file itself, got {found}; copy them in (h5repack)"
+        )
+    require_plausible(path, total)
+
+
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.part(\.[^.]*)?")
+"""Names that :func:`atomic` gives, with the process in them."""
+
+
+@contextmanager
+def atomic(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds.
+
+    Whatever ends the block early (an exception, a full disk, Ctrl-C) removes the temporary
+    file, so a reader never sees half a file; what a killed process left is removed by the next
+    that writes in the same folder. File and folder reach the disk before the block ends, so that a
+    power cut leaves no empty file under a finished name. The suffix is kept, because libraries
+    choose formats by it.
+
+    Raises
+    ------
+    InputError
+        If the operating system refuses the write (disk full, no permission).
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_orphans(path.parent)
+        yield temporary
+        _flush(temporary, os.O_RDWR)
+        os.replace(temporary, path)
+        if os.name == "posix":  # elsewhere a folder can't be opened
+            _flush(path.parent, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(f"could not write {path}: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):  # it may never have been there, nor its folder
+            temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path, mode: int) -> None:
+    """Have the disk itself store a file or a folder's names."""
+    descriptor = os.open(path, mode)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def remove_orphans(folder: Path | str) -> None:
+    """Remove temporary files in a folder whose process is no more."""
+    for name in os.listdir(folder):
+        orphan = _TEMPORARY.fullmatch(name)
+        if orphan and not may_be_alive(int(orphan[1])):
+            Path(folder, name).unlink(missing_ok=True)
+
+
+def may_be_alive(process: int) -> bool:
+    """Whether this machine may have a process of that id; where it can't tell, it says yes."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)  # sends nothing
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's; no id at all
+        return True
+    return True
+
+
+def require_writable(folder: Path | str) -> None:
+    """Make ``folder`` and check that files can be written there, before long work begins.
+
+    Raises
+    ------
+    InputError
+        If not.
+    """
+    with atomic(Path(folder) / "writable") as temporary:
+        temporary.touch()
+    (Path(folder) / "writable").unlink()
+
+
+@contextmanager
+def atomic_hdf5(path: Path | str) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file that appears at ``path`` when the block has succeeded.
+
+    It is made in memory first: on a full disk HDF5 can't close a file of its own and complains
+    about it until the program ends.
+    """
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as file:
+        yield file
+    with atomic(path) as temporary:
+        # Not its buffer: memory that is lent to a failed write can't be freed.
+        temporary.write_bytes(memory.getvalue())
+
+
+def copy_whole(source: Path | str, path: Path | str) -> None:
+    """Copy a file, atomically."""
+    with atomic(path) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+def write_json(path: Path | str, content: Any) -> None:
+    """Write ``content`` as indented JSON, atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def read_json(path: Path | str) -> Any:
+    """Read JSON; raises InputError if the file is missing, cut short or nested too deeply."""
+    with reading(path, "a JSON file"):
+        return json.loads(Path(path).read_text("utf-8-sig"))
+
+
+def read_record(path: Path | str, form: str, what: str, remedy: str) -> dict[str, Any]:
+    """Read a JSON object whose ``format`` is ``form``.
+
+    Parameters
+    ----------
+    path
+        The file.
+    form
+        What its key ``format`` has to say.
+    what, remedy
+        For the message: what is expected there, and what to do.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, or of another format.
+    """
+    with reading(path, what, remedy):
+        content = read_json(path)
+        got = content.get("format") if isinstance(content, dict) else type(content).__name__
+        if got != form:
+            raise InputError(f"expected {form} in {path}, got {got!r}; {remedy}")
+        return dict(content)
+
+
+def sha256_of(path: Path | str) -> str:
+    """SHA-256 of a file's content, hexadecimal; empty if it can't be read."""
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""

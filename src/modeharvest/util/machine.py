@@ -1,0 +1,139 @@
+"""The machine that the program runs on: free memory, and the ranks that mpirun started.
+
+MPI is asked only where a launcher has left its marks, so that nothing else has to load it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import psutil
+
+from modeharvest.util.errors import InputError
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_OWN_CGROUP = Path("/proc/self/cgroup")
+_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
+
+
+def available_bytes() -> float:
+    """Memory that this process may still take [bytes]: the machine's, or its container's."""
+    return min(float(psutil.virtual_memory().available), *map(_left_in, _own_cgroups()))
+
+
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Refuse work before it begins to allocate.
+
+    Parameters
+    ----------
+    needed
+        A rough estimate [bytes]; infinite or NaN is too much.
+    what
+        Needs it: "an image of 9000 x 9000 px".
+    remedy
+        What to change.
+
+    Raises
+    ------
+    InputError
+        If there is less.
+    """
+    there = available_bytes()
+    if not needed <= there:
+        raise InputError(
+            f"expected {what} to fit into the memory that is free, {_readable(there)}, got one "
+            f"that needs about {_readable(needed)}; {remedy}"
+        )
+
+
+def _own_cgroups() -> list[Path]:
+    """The folders of the control groups that this process is in; Linux only.
+
+    A limit counts wherever it is set between the process's own group and the root.
+    """
+    folders = [_CGROUPS, _CGROUPS / "memory"]
+    with suppress(OSError):
+        for line in _OWN_CGROUP.read_text("utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers in ("", "memory"):
+                own = _CGROUPS / controllers / path.lstrip("/")
+                folders += [own, *(p for p in own.parents if _CGROUPS in p.parents)]
+    return folders
+
+
+def _left_in(folder: Path) -> float:
+    """What a control group may still take [bytes]; files it has cached don't count as taken."""
+    for limit, usage in (
+        ("memory.max", "memory.current"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ):
+        with suppress(OSError, ValueError):
+            left = float((folder / limit).read_text()) - float((folder / usage).read_text())
+            return left + _cached_in(folder)
+    return float("inf")
+
+
+def _cached_in(folder: Path) -> float:
+    with suppress(OSError, ValueError):
+        entries = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        return float(next((value for name, value in entries if name == "inactive_file"), 0))
+    return 0.0
+
+
+def _readable(count: float) -> str:
+    """1.2e10 as "12 GB"."""
+    for unit in _UNITS:
+        if count < 1000.0 or unit == _UNITS[-1]:
+            return f"{count:.3g} {unit}"
+        count /= 1000.0
+    return f"{count:g}"
+
+
+_MARKS = ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_SIZE", "PMI_RANK")
+
+T = TypeVar("T")
+
+
+@cache
+def _world() -> Any:
+    if not any(mark in os.environ for mark in _MARKS):
+        return None
+    try:
+        from mpi4py import MPI
+    except ImportError:
+        return None
+    return MPI.COMM_WORLD
+
+
+def is_alone() -> bool:
+    """Whether no launcher of MPI started this process."""
+    return _world() is None
+
+
+def is_first() -> bool:
+    """Whether this is rank 0, the one that writes and talks."""
+    world = _world()
+    return world is None or world.rank == 0
+
+
+def on_first(work: Callable[[], T]) -> T:
+    """Do work on rank 0 alone; every rank waits for it, and returns or raises what it did."""
+    world = _world()
+    if world is None:
+        return work()
+    done: tuple[Any, Exception | None] = (None, None)
+    if world.rank == 0:
+        try:
+            done = work(), None
+        except Exception as error:  # of any kind: the others would wait for ever
+            done = None, error
+    value, failure = world.bcast(done)
+    if failure is not None:
+        raise failure
+    found: T = value
+    return found

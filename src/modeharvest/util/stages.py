@@ -1,0 +1,351 @@
+"""Work in stages that a folder remembers, so that what is finished is not done again.
+
+::
+
+    stages.json     of each finished stage its key, the digest of all that its outcome depends
+                    on, and the size and the SHA-256 of every file that it left
+    timings.json    what the stages took [s]; the one file that differs from run to run
+    .lock           who works in the folder, while somebody does
+
+Part of every key is the digest of the package's own code: a version's number lags behind it.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import platform
+import shlex
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from importlib import resources
+from importlib.metadata import version
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from modeharvest import __version__
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import may_be_alive, read_json, remove_orphans, sha256_of, write_json
+from modeharvest.util.machine import on_first
+
+_SOURCES = (".py", ".html", ".css")
+
+
+def versions(*libraries: str) -> dict[str, str]:
+    """Versions of modeharvest, of Python, and of installed libraries, by their names."""
+    own = {"modeharvest": __version__, "python": platform.python_version()}
+    return own | {name: version(name) for name in libraries}
+
+
+@cache
+def source_digest(*folders: str) -> str:
+    """SHA-256 of the package's own code, hexadecimal: a version's number lags behind it.
+
+    Parameters
+    ----------
+    folders
+        Folders of the package that count, such as "fem" and "imaging", besides the modules at
+        its root, which always do; all of them if none is named. Since imports go one way, those
+        up to the one that does the work are all that it can depend on.
+    """
+    found = hashlib.sha256()
+    root = resources.files("modeharvest")
+    for name, file in sorted(_sources(root, "", folders), key=lambda source: source[0]):
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        found.update(f"{name} {content}\n".encode())
+    return found.hexdigest()
+
+
+def _sources(
+    folder: Traversable, name: str, only: tuple[str, ...]
+) -> Iterator[tuple[str, Traversable]]:
+    """Code and templates in a folder of the package and below, by their names."""
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            if entry.name != "__pycache__" and (not only or entry.name in only):
+                yield from _sources(entry, f"{name}{entry.name}/", ())
+        elif entry.name.endswith(_SOURCES):
+            yield f"{name}{entry.name}", entry
+
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+RECORD, TIMINGS, LOCK = "stages.json", "timings.json", ".lock"
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The stages of one folder.
+
+    Parameters
+    ----------
+    folder
+        Where; made if it does not exist.
+    """
+
+    folder: Path
+
+    def is_finished(self, name: str, key: str) -> bool:
+        """Whether a stage was finished with this key, and its files are what it wrote."""
+        stage = self._record().get(name)
+        if not isinstance(stage, dict) or stage.get("key") != key:
+            return False
+        files = stage.get("files")
+        return isinstance(files, dict) and all(
+            _is_whole(self.folder / path, entry) for path, entry in files.items()
+        )
+
+    def do(
+        self,
+        name: str,
+        key: str,
+        work: Callable[[], Iterable[Path]],
+        *,
+        collective: bool = False,
+    ) -> None:
+        """Do the work unless it was finished with the same key and its files are whole.
+
+        Parameters
+        ----------
+        name
+            Of the stage.
+        key
+            See :func:`stage_key`.
+        work
+            Leaves files in the folder and returns their paths.
+        collective
+            Under mpirun, all ranks work; otherwise rank 0 does, and the others wait.
+
+        Raises
+        ------
+        InputError
+            If the disk refuses or another process works in the folder, and what the work raises.
+        """
+        if on_first(lambda: self.is_finished(name, key)):
+            return
+        with exclusive(self.folder):
+            begin = time.perf_counter()
+            on_first(lambda: self._forget(name))
+            files = list(work() if collective else on_first(lambda: list(work())))
+            on_first(lambda: self._remember(name, key, files))
+            on_first(lambda: self.took(name, time.perf_counter() - begin))
+
+    def require_whole(self, path: Path, advice: str) -> None:
+        """Raise InputError if a file is not what the stage that left it wrote.
+
+        One that no stage left is believed.
+        """
+        name = path.relative_to(self.folder).as_posix()
+        for stage in self._record().values():
+            files = stage.get("files") if isinstance(stage, dict) else None
+            if isinstance(files, dict) and name in files and not _is_whole(path, files[name]):
+                raise InputError(
+                    f"expected {path} as {RECORD} has its SHA-256, got another file or none; "
+                    f"{advice}"
+                )
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """What stages took [s]; empty if nobody knows."""
+        return dict(_table(self.folder / TIMINGS))
+
+    def took(self, name: str, seconds: float) -> None:
+        """Take down what a stage took [s]."""
+        write_json(self.folder / TIMINGS, {**self.timings, name: seconds})
+
+    def _record(self) -> dict[str, Any]:
+        return _table(self.folder / RECORD)
+
+    def _forget(self, name: str) -> None:
+        """Remove a stage's files, which are of other inputs; its record first."""
+        record = self._record()
+        stage = record.pop(name, {})
+        write_json(self.folder / RECORD, record)
+        files = stage.get("files") if isinstance(stage, dict) else {}
+        for path in map(Path, files or {}):
+            if not path.is_absolute() and ".." not in path.parts:  # whatever the record says
+                (self.folder / path).unlink(missing_ok=True)
+
+    def _remember(self, name: str, key: str, files: Iterable[Path]) -> None:
+        """Take down that a stage is finished."""
+        entries = {path.relative_to(self.folder).as_posix(): _entry(path) for path in files}
+        stage = {"key": key, "files": entries}
+        record = {**self._record(), name: stage}
+        write_json(self.folder / RECORD, dict(sorted(record.items())))
+
+
+def stage_key(content: object, *folders: str) -> str:
+    """The digest of all that a stage's outcome depends on.
+
+    Parameters
+    ----------
+    content
+        Plain values: options, digests of files, keys of other stages.
+    folders
+        Folders of the package whose code counts, see
+        :func:`modeharvest.util.stages.source_digest`; all if none is named.
+    """
+    return digest([source_digest(*folders), content])
+
+
+def digest(content: object) -> str:
+    """A short text that differs for different plain content."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """A JSON object of a file; empty if it is missing or damaged."""
+    try:
+        content = read_json(path)
+    except InputError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _entry(path: Path) -> dict[str, Any]:
+    return {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+
+
+def _is_whole(path: Path, entry: object) -> bool:
+    """Whether a file is what was written; its size, which costs nothing, is looked at first."""
+    if not isinstance(entry, dict) or not path.is_file():
+        return False
+    return path.stat().st_size == entry.get("bytes") and sha256_of(path) == entry.get("sha256")
+
+
+# -- one folder, one process -------------------------------------------------------------
+
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
+_READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
+_of_this_thread = threading.local()
+
+
+@contextmanager
+def exclusive(folder: Path | str) -> Iterator[None]:
+    """Have a folder for this process alone; within, the same thread may ask for it again.
+
+    The operating system gives the folder back when its holder ends, however it ends. Where the
+    file system has no locks (that of some networks, or Windows) the file ``.lock`` alone decides,
+    and is believed unless it is of a process that this machine had and has no more. Where nothing
+    can be written nothing is locked. Under mpirun rank 0 holds the folder for all.
+
+    Raises
+    ------
+    InputError
+        If another process has it: which, where and since when. If the disk refuses.
+    """
+    folder = Path(folder).resolve()
+    held: set[Path] = _of_this_thread.__dict__.setdefault("folders", set())
+    if folder in held:
+        yield
+        return
+    lock = _Lock(folder / LOCK)
+    on_first(lock.acquire)
+    held.add(folder)
+    try:
+        yield
+    finally:
+        held.discard(folder)
+        lock.release()
+
+
+class _Lock:
+    """A file that is locked while somebody works beside it, and says who."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: int | None = None
+
+    def acquire(self) -> None:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            while self._file is None:
+                self._file = self._locked()
+            remove_orphans(self._path.parent)
+        except OSError as error:
+            if error.errno not in _READ_ONLY:
+                reason = error.strerror or error
+                raise InputError(f"could not write {self._path}: {reason}") from error
+
+    def release(self) -> None:
+        if self._file is None:
+            return
+        if os.name != "posix":  # where an open file can't be removed
+            os.close(self._file)
+        with suppress(OSError):  # it may have been removed by hand
+            self._path.unlink()
+        if os.name == "posix":  # last: who opens the name from now on makes a new file
+            os.close(self._file)
+        self._file = None
+
+    def _locked(self) -> int | None:
+        """The file, opened and locked; None if its holder has just removed it."""
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            self._require_free(file)
+            if not os.path.samestat(os.fstat(file), self._path.stat()):
+                raise FileNotFoundError
+        except BaseException as error:
+            os.close(file)
+            if isinstance(error, FileNotFoundError):
+                return None
+            raise
+        with suppress(OSError):  # a full disk: it is locked all the same
+            os.truncate(file, 0)
+            os.write(file, json.dumps(_this_process()).encode())
+        return file
+
+    def _require_free(self, file: int) -> None:
+        """Lock the file; InputError if another process has."""
+        holder = _table(self._path)
+        try:
+            if fcntl is None:
+                raise OSError(errno.ENOSYS, "no locks")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(self._occupied(holder)) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            if holder and not _is_gone(holder):
+                reason = f"{self._occupied(holder)}; if it is gone, remove {self._path}"
+                raise InputError(reason) from None
+
+    def _occupied(self, holder: dict[str, Any]) -> str:
+        by = "another process"
+        if holder:
+            about = {name: holder.get(name, "?") for name in _this_process()}
+            by = "process {process} on {host}, since {since}: {command}".format_map(about)
+        return (
+            f"expected {self._path.parent} for this process alone, but it is used by {by}; wait "
+            "until that ends, or take another folder"
+        )
+
+
+def _this_process() -> dict[str, Any]:
+    """Who holds a lock."""
+    return {
+        "process": os.getpid(),
+        "host": socket.gethostname(),
+        "since": datetime.now().isoformat(" ", "seconds"),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+
+
+def _is_gone(holder: dict[str, Any]) -> bool:
+    """Whether a holder was a process of this machine that is no more."""
+    process, is_here = holder.get("process"), holder.get("host") == socket.gethostname()
+    return is_here and isinstance(process, int) and not may_be_alive(process)

@@ -1,0 +1,116 @@
+"""Plain values, as files hold them, turned into the dataclasses they describe.
+
+pydantic does the work; what it finds is told in one line. Numbers have to be finite, and a boolean
+or a text is no number, though pydantic would take ``true`` for 1 and ``"3"`` for 3.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from modeharvest.util.errors import InputError
+
+CHECKS = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
+"""No unknown keys, no infinite numbers; nested dataclasses have the same rules."""
+
+_LARGEST = 1e15
+"""Whatever its unit, no length, stress or count that is meant is larger; squares don't overflow."""
+T = TypeVar("T")
+
+
+def made(kind: type[T], values: object) -> T:
+    """The dataclass that plain values describe.
+
+    Raises
+    ------
+    InputError
+        If a key is unknown (the nearest known one is suggested) or missing, or a value is of
+        another type or out of its range; the place is named as ``table.key``.
+    """
+    try:
+        (thing,) = TypeAdapter(tuple[kind], config=CHECKS).validate_python((values,))  # type: ignore[valid-type]
+    except ValidationError as error:
+        raise InputError(sentence(error, kind, 1)) from error
+    require_types(values, thing)
+    found: T = thing
+    return found
+
+
+def require_types(given: object, found: object, where: str = "") -> None:
+    """Compare values with what was made of them, leaf by leaf.
+
+    Raises
+    ------
+    InputError
+        If a boolean or a text became a number, a number a boolean, or a number is beyond all use.
+    """
+    if isinstance(given, Mapping):
+        for key, value in given.items():
+            inner = found.get(key) if isinstance(found, Mapping) else getattr(found, key, None)
+            require_types(value, inner, f"{where}.{key}".lstrip("."))
+    elif isinstance(given, (list, tuple)) and isinstance(found, (list, tuple)):
+        for k, (value, inner) in enumerate(zip(given, found, strict=False)):
+            require_types(value, inner, f"{where}.{k}")
+    elif _kind(given) and _kind(found) and _kind(given) != _kind(found):
+        raise InputError(f"{where}: expected {_kind(found)}, got {given!r}")
+    elif _kind(given) == "a number" and abs(given) > _LARGEST:  # type: ignore[arg-type]
+        raise InputError(f"{where}: expected a number below {_LARGEST:g}, got {given}")
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, bool):
+        return "true or false"
+    if isinstance(value, (int, float)):
+        return "a number"
+    return "a text" if isinstance(value, str) else ""
+
+
+def plain(value: Any) -> Any:
+    """A dataclass as plain JSON values; anything else as it is."""
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+def sentence(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
+    """The first fault, in one line: where, what came, what was expected.
+
+    ``skipped``: how many steps of the fault's place are not the user's.
+    """
+    first = error.errors()[0]
+    place = first["loc"][skipped:]
+    where = ".".join(str(part) for part in place)
+    if isinstance(first.get("ctx", {}).get("error"), InputError):
+        return f"[{where}] {first['ctx']['error']}" if where else str(first["ctx"]["error"])
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _known_keys(model, place[:-1])
+        return f"unknown key {where}{nearest(str(place[-1]), known)}"
+    if first["type"] == "missing":
+        return f"expected {where}, got none"
+    return f"{where}: {first['msg']}, got {first['input']!r:.80}"
+
+
+def _known_keys(model: type[Any] | None, table: tuple[int | str, ...]) -> list[str]:
+    """The keys that the table at this place of a case may have."""
+    place = model
+    for part in table:
+        if not isinstance(part, int):  # a place in a list of tables
+            place = _table_type(place, part)
+    if place is None:
+        return []
+    return [f.name for f in fields(place)] if is_dataclass(place) else list(place.model_fields)
+
+
+def _table_type(place: type[Any] | None, name: str) -> type[Any] | None:
+    """The dataclass of a table within another; None if it has none of its own."""
+    hint = None if place is None else get_type_hints(place).get(name)
+    return next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)  # type: ignore[return-value]
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """A hint at what was probably meant, or at all there is."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; known are: {', '.join(known)}"

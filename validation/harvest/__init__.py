@@ -1,1 +1,0 @@
-"""The report of a harvest: what photographs of a test have shown."""

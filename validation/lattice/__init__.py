@@ -1,1 +1,0 @@
-"""The report of an infinite lattice, and how its modes depend on it."""

@@ -1,0 +1,133 @@
+"""Onset of buckling in a series of images: pattern amplitude over strain, pitchfork estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeharvest.idic.result import Result
+from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
+
+_FIT = 3
+"""Images with a pattern that a pitchfork is fitted to, at least."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One image of a test.
+
+    Parameters
+    ----------
+    name
+        Of the image.
+    strain
+        Mean nominal compression of the cellular part, from v0 [-].
+    amplitude_px
+        Rms of v1 phi1 per component [px]; of several modes the root of their squares' sum.
+    leftover_px
+        What the ansatz leaves over, rms per component [px].
+    noise_px
+        Standard deviation of v1 phi1 by the images' noise, rms per component [px]; of several
+        modes as above.
+    """
+
+    name: str
+    strain: float
+    amplitude_px: float
+    leftover_px: float
+    noise_px: float
+
+    @property
+    def has_pattern(self) -> bool:
+        """Whether the pattern stands out of noise and of what the ansatz leaves over."""
+        return self.amplitude_px > OBSERVABLE * max(self.leftover_px, self.noise_px)
+
+
+@dataclass(frozen=True)
+class Buckling:
+    """When the pattern appears.
+
+    Parameters
+    ----------
+    before, after
+        Strains of the last image without a pattern and of the first with one [-]; NaN if
+        there is none.
+    estimate
+        Strain at which the pattern begins if its amplitude grows with the square root of the
+        strain beyond, as after a pitchfork bifurcation [-]; NaN with fewer than three images
+        that have a pattern.
+    sentence
+        That in words.
+    """
+
+    before: float
+    after: float
+    estimate: float
+    sentence: str
+
+
+def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
+    """Mean nominal compression along x and y of a part of the specimen [-].
+
+    The shortening between its opposite edges by v0, averaged along them, over their distance.
+
+    Parameters
+    ----------
+    result
+        Of a correlation.
+    cellular
+        The part [mm].
+    """
+    along = np.linspace(0.02, 0.98, 33)
+    x = cellular.x_min + along * (cellular.x_max - cellular.x_min)
+    y = cellular.y_min + along * (cellular.y_max - cellular.y_min)
+    ansatz, a = result.ansatz, result.unknowns
+    sides = np.array([cellular.x_min, cellular.x_max]), np.array([cellular.y_min, cellular.y_max])
+    across_x = ansatz.v0(a, sides[0], y)[..., 0].mean(axis=0)
+    across_y = ansatz.v0(a, x, sides[1])[..., 1].mean(axis=1)
+    return (
+        float((across_x[0] - across_x[1]) / (sides[0][1] - sides[0][0])),
+        float((across_y[0] - across_y[1]) / (sides[1][1] - sides[1][0])),
+    )
+
+
+def find_buckling(moments: Sequence[Moment]) -> Buckling:
+    """Tell from a sequence of images when the pattern appeared.
+
+    Parameters
+    ----------
+    moments
+        In the order of the test; a sequence that unloads again is read up to its largest strain.
+    """
+    nan = float("nan")
+    last = int(np.argmax([m.strain for m in moments])) if moments else -1
+    loading = list(moments[: last + 1])
+    shown = [m for m in loading if m.has_pattern]
+    if not shown:
+        return Buckling(nan, nan, nan, "No image shows a pattern that stands out of its noise.")
+    first = shown[0]
+    plain = [m for m in loading if not m.has_pattern and m.strain < first.strain]
+    if not plain:
+        words = f"Every image shows the pattern, from a strain of {100 * first.strain:.2f} % on."
+        return Buckling(nan, first.strain, _pitchfork(shown), words)
+    before = plain[-1].strain
+    estimate = _pitchfork(shown)
+    words = (
+        f"The pattern appears between strains of {100 * before:.2f} % ({plain[-1].name}) and "
+        f"{100 * first.strain:.2f} % ({first.name})."
+    )
+    if np.isfinite(estimate):
+        words += f" Its growth points back to {100 * estimate:.2f} %."
+    return Buckling(before, first.strain, estimate, words)
+
+
+def _pitchfork(shown: Sequence[Moment]) -> float:
+    """Where the squared amplitude, taken for linear in the strain, begins."""
+    if len(shown) < _FIT:
+        return float("nan")
+    few = shown[:_FIT]
+    slope, at_zero = np.polyfit([m.strain for m in few], [m.amplitude_px**2 for m in few], 1)
+    return float(-at_zero / slope) if slope > 0 else float("nan")

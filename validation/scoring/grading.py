@@ -1,0 +1,145 @@
+"""Scores of several fields of one image: their comparison, ``scores.json`` and ``scores.csv``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth
+from modeharvest.validation.scoring.score import (
+    ENOUGH_COVERED,
+    PERCENTILES,
+    ErrorSpectrum,
+    RegionScore,
+    Score,
+)
+
+SCORES_FORMAT = "modeharvest-scores-1"
+
+EVERYWHERE, COMMON = "everywhere", "where all measure"
+
+
+@dataclass(frozen=True, eq=False)
+class Grading:
+    """Graded fields of one deformed image.
+
+    Parameters
+    ----------
+    truth
+        What they are graded by.
+    strain
+        Of the image [-].
+    edge_px
+        Width of the region of edges [px].
+    labels
+        (rows, cols) of :func:`modeharvest.validation.scoring.score.regions`.
+    scores
+        The best first.
+    spectra
+        Of each field's error, by its name; None where it has none.
+    remarks
+        Sentences about probable mistakes in what was declared.
+    refused
+        By its file's name, why a field was not graded.
+    """
+
+    truth: BenchmarkTruth
+    strain: float
+    edge_px: int
+    labels: NDArray[np.int8]
+    scores: tuple[Score, ...]
+    spectra: Mapping[str, ErrorSpectrum | None]
+    remarks: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def common(self) -> dict[str, RegionScore]:
+        """By name, the error over the material that all fields cover."""
+        where = np.logical_and.reduce([graded.near for graded in self.scores])
+        return {graded.source: graded.over(where, self.truth.grid) for graded in self.scores}
+
+    @cached_property
+    def common_share(self) -> float:
+        """Share of the material that all fields cover [-]."""
+        where = np.logical_and.reduce([graded.near for graded in self.scores])
+        return float(where.sum() / (self.labels >= 0).sum())
+
+    def parts(self, graded: Score) -> dict[str, RegionScore]:
+        """A field's rows of the table: everywhere, where all measure, by region."""
+        common = {COMMON: self.common[graded.source]} if len(self.scores) > 1 else {}
+        return {EVERYWHERE: graded.everywhere, **common, **graded.by_region}
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know, in sentences."""
+        told = [f"not graded: {why}" for why in self.refused.values()]
+        told += self.remarks
+        for graded in self.scores:
+            if graded.covered < ENOUGH_COVERED:
+                told.append(
+                    f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less "
+                    f"than {100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
+                )
+        return told
+
+
+def grading_summary(grading: Grading) -> dict[str, Any]:
+    """The grades as plain values: for each field, the best first, all that is known of it."""
+    return {
+        "format": SCORES_FORMAT,
+        "benchmark": grading.truth.id,
+        "nominal_strain": grading.strain,
+        "edge_px": grading.edge_px,
+        "percentiles": list(PERCENTILES),
+        "covered_by_all": grading.common_share,
+        "fields": [_plain_field(grading, graded) for graded in grading.scores],
+        "refused": dict(grading.refused),
+        "remarks": grading.notes,
+    }
+
+
+def _plain_field(grading: Grading, graded: Score) -> dict[str, Any]:
+    spectrum = grading.spectra.get(graded.source)
+    return {
+        "name": graded.source,
+        "points_off_material": graded.off_material,
+        "spacing_px": graded.spacing_px,
+        "covered": graded.covered,
+        **{name: asdict(part) for name, part in grading.parts(graded).items()},
+        "spectrum": None
+        if spectrum is None
+        else {
+            "wavelength_px": spectrum.wavelength_px.tolist(),
+            "rms_px": spectrum.rms_px.tolist(),
+            "affine_px": spectrum.affine_px,
+        },
+    }
+
+
+def without_nan(value: Any) -> Any:
+    """The same without NaN, which JSON doesn't know."""
+    if isinstance(value, dict):
+        return {key: without_nan(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def csv_lines(grading: Grading) -> Iterator[str]:
+    """The table as CSV: a line for each field and region."""
+    percentiles = ",".join(f"p{p} [px]" for p in PERCENTILES)
+    yield ("field,region,points,returned [-],covered [-],bias x [px],bias y up [px],rms [px],"
+           f"{percentiles},max [px]")  # fmt: skip
+    for graded in grading.scores:
+        for name, part in grading.parts(graded).items():
+            covered = f"{graded.covered:.6g}" if name == EVERYWHERE else ""
+            values = [*part.bias_px, part.rms_px, *part.percentiles_px, part.max_px]
+            numbers = ",".join(f"{v:.6g}" for v in values)
+            yield f'"{graded.source}",{name},{part.points},{part.returned:.6g},{covered},{numbers}'

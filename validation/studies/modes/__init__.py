@@ -1,1 +1,0 @@
-"""Modes measured on specimens that differ, against those of infinite lattices."""

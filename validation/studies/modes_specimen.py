@@ -1,0 +1,356 @@
+"""Specimens of the study of measured modes: described, buckled, and the mode of their infinite lattice.
+
+A description is in ``specimens/NAME/specimen.json`` of the study's folder, NAME the digest of its
+content.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
+
+from modeharvest.fem.experiment import Experiment, PathOptions
+from modeharvest.fem.field import Mesh, Solution
+from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.modes import ModeFamily
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.spectra.lattice_spectrum import MeshQuadrature
+from modeharvest.idic.spectra.mode_family import overlap
+from modeharvest.imaging.imageset import image_key
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.stages import digest
+from modeharvest.validation.studies.lattice_pattern import PatternMode, StudiedLattice, pattern_mode
+from modeharvest.validation.studies.study import ImagePairSpec
+
+NO_DOLFINX = (
+    "simulating specimens needs dolfinx >= 0.9, which is not on PyPI; with conda-forge: 'conda "
+    "install fenics-dolfinx=0.11 petsc=*=real* python-gmsh', or use 'scripts/env' of the repository"
+)
+_QUADRATURE = 4
+"""Points per direction: the pattern's waves are long against the elements."""
+
+
+def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
+    """Compress a specimen until its pattern is as strong as wanted (needs dolfinx).
+
+    Parameters
+    ----------
+    experiment
+        Specimen, material, mesh, edges and path options; strains and branches are not used.
+    wanted
+        The pattern's amplitude to be reached, see :meth:`PatternCells.amplitude` [mm].
+    largest
+        Nominal strain up to which to look for the first critical point [-].
+
+    Returns
+    -------
+    Solution
+        Of :func:`modeharvest.fem.path.branching.simulate_pattern`.
+
+    Raises
+    ------
+    MissingDependencyError
+        If dolfinx is not there.
+    """
+    try:
+        from modeharvest.fem.meshing import mesh_specimen
+        from modeharvest.fem.path.branching import simulate_pattern
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(NO_DOLFINX) from error
+    mesh = mesh_specimen(experiment.specimen, experiment.mesh_size)
+    pattern = PatternCells(mesh, experiment.specimen)
+    return simulate_pattern(experiment, mesh, pattern, wanted, largest)
+
+
+class PatternCells:
+    """Projections of a displacement on the square pattern, unit cell by unit cell.
+
+    Parameters
+    ----------
+    mesh
+        Of the displacement.
+    specimen
+        Whose pattern, :meth:`modeharvest.fem.specimen.Specimen.pattern`.
+    """
+
+    def __init__(self, mesh: Mesh, specimen: Specimen) -> None:
+        self._rule = rule = MeshQuadrature(mesh, _QUADRATURE)
+        half = np.array(specimen.cellular_half_size)
+        self._shape = specimen.holes_x, specimen.holes_y
+        place = np.floor((rule.positions + half) / specimen.pitch).astype(np.int64)
+        self._inside = np.all((place >= 0) & (place < self._shape), axis=1)
+        self._cell = np.ravel_multi_index(tuple(place[self._inside].T), self._shape)
+        self._pattern = specimen.pattern(rule.positions)
+        self._own = self._products(self._pattern)
+
+    def _products(self, values: FloatArray) -> FloatArray:
+        """(holes_x, holes_y) integral of values (q, 2) times the pattern over each cell."""
+        density = self._rule.weights * (values * self._pattern).sum(axis=1)
+        cells = np.bincount(self._cell, density[self._inside])
+        return np.asarray(cells.reshape(self._shape), np.float64)
+
+    def share(self, displacement: FloatArray) -> float:
+        """How much of a nodal field (n, 2) is the pattern, whatever its amplitude in each cell.
+
+        The root of the share of ∫ |u|² that lies in the span of the pattern's restrictions to
+        single cells, between 0 and 1, with the sign of the overlap with the whole pattern.
+        """
+        u = self._rule.values(displacement)
+        mixed = self._products(u)
+        share = math.sqrt(np.sum(mixed**2 / self._own) / self._rule.product(u, u))
+        return math.copysign(share, mixed.sum())
+
+    def amplitude(self, displacement: FloatArray) -> float:
+        """The pattern's amplitude in a nodal displacement (n, 2), where it is largest [mm].
+
+        In each 2 x 2 cells the projection on the pattern: what has the lattice's own period, and
+        what is linear, has none there.
+        """
+        cells = self._products(self._rule.values(displacement)) / self._own
+        blocks = sliding_window_view(cells, tuple(min(2, n) for n in self._shape))
+        return float(np.abs(blocks.mean(axis=(2, 3))).max())
+
+
+_MATERIALS = {kind.__name__: kind for kind in (Ogden, TwoTermI1)}
+_SPEC = TypeAdapter(ImagingSpec)
+
+
+@dataclass(frozen=True)
+class SpecimenSpec:
+    """All that a specimen's measurement depends on.
+
+    Parameters
+    ----------
+    specimen, material, mesh_size, edges, path
+        As in :class:`~modeharvest.fem.experiment.Experiment`.
+    amplitude
+        The pattern's amplitude that it is compressed to [mm].
+    largest
+        Strain up to which to look for where it buckles [-].
+    divisions
+        Elements along l of the infinite lattice's cell.
+    imaging, correlation
+        How it is imaged and correlated.
+    given
+        The digest of a solution that is there already; "" to simulate.
+    """
+
+    specimen: Specimen
+    material: Material
+    mesh_size: float
+    edges: str
+    path: PathOptions
+    amplitude: float
+    largest: float
+    divisions: int
+    imaging: ImagingSpec
+    correlation: SquareLatticeOptions
+    given: str = ""
+
+    @classmethod
+    def of(
+        cls, subject: ImagePairSpec, strain: float, largest: float, divisions: int
+    ) -> SpecimenSpec:
+        """Of a simulated experiment, as strongly buckled as it is at a strain [-].
+
+        Raises
+        ------
+        InputError
+            If the experiment is not perfect, did not buckle, or has a material that can't be
+            written down.
+        """
+        e = subject.experiment
+        if not e.is_perfect or e.guided:
+            raise InputError(
+                "study: expected a perfect specimen that buckles at a strain of its own, got an "
+                "experiment with an imperfection, a tilt or guides; leave them out"
+            )
+        if type(e.material) not in _MATERIALS.values():
+            raise InputError(
+                f"study: expected a material among {list(_MATERIALS)}, got {e.material!r}"
+            )
+        critical = subject.solution.info.get("critical")
+        if not critical or critical["strain"] >= strain:
+            raise InputError(
+                f"study: expected an experiment that has buckled at {100 * strain:g} %, got one "
+                + (f"with {100 * critical['strain']:.4g} % as its" if critical else "with no")
+                + " critical strain"
+            )
+        there = subject.solution.at(strain).displacement
+        amplitude = PatternCells(subject.solution.mesh, e.specimen).amplitude(there)
+        return cls(
+            specimen=e.specimen,
+            material=e.material,
+            mesh_size=e.mesh_size,
+            edges=e.edges,
+            path=e.path,
+            amplitude=amplitude,
+            largest=largest,
+            divisions=divisions,
+            imaging=subject.imaging,
+            correlation=subject.correlation,
+            given=image_key(subject.solution, (strain,), subject.imaging)[:16],
+        )
+
+    @property
+    def experiment(self) -> Experiment:
+        """The compression test, its strains still to be found."""
+        return Experiment(
+            self.specimen,
+            self.material,
+            mesh_size=self.mesh_size,
+            edges=self.edges,
+            path=self.path,
+        )
+
+    def changed(self, material: Material | None = None, **specimen: Any) -> SpecimenSpec:
+        """With another material, or other values of the specimen; to be simulated."""
+        return replace(
+            self,
+            specimen=replace(self.specimen, **specimen),
+            material=material or self.material,
+            given="",
+        )
+
+    def scaled(self, pitch: float) -> SpecimenSpec:
+        """Everything in the same proportions to another l [mm], elements and pixels included."""
+        old, factor = self.specimen, pitch / self.specimen.pitch
+        lengths = {n: factor * getattr(old, n) for n in ("diameter", "bulk_x", "bulk_y")}
+        specimen = replace(old, pitch=pitch, **lengths)
+        pixel, start = self.imaging.pixel_size, self.correlation.start_amplitude
+        return replace(
+            self,
+            specimen=specimen,
+            mesh_size=factor * self.mesh_size,
+            amplitude=factor * self.amplitude,
+            imaging=replace(self.imaging, pixel_size=factor * pixel),
+            correlation=replace(self.correlation, start_amplitude=factor * start),
+            given="",
+        )
+
+    def solution_path(self, folder: Path) -> Path:
+        """Where the solution of a study's specimen is: that of all that simulating depends on."""
+        unseen = ("imaging", "correlation", "divisions")
+        simulated = {name: value for name, value in self.plain().items() if name not in unseen}
+        return folder / "solutions" / f"{digest(simulated)[:16]}.h5"
+
+    def plain(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        material = {"kind": type(self.material).__name__, **vars(self.material)}
+        imaging = _SPEC.dump_python(self.imaging, mode="json")
+        return {**asdict(self), "material": material, "imaging": imaging}
+
+    @classmethod
+    def read(cls, path: Path) -> SpecimenSpec:
+        """Read what :meth:`leave` wrote."""
+        values = dict(read_json(path))
+        material = dict(values["material"])
+        kind = _MATERIALS[material.pop("kind")]
+        made = {
+            "specimen": Specimen(**values["specimen"]),
+            "material": TypeAdapter(kind).validate_python(material),
+            "path": PathOptions(**values["path"]),
+            "imaging": _SPEC.validate_python(values["imaging"]),
+            "correlation": SquareLatticeOptions(**values["correlation"]),
+        }
+        return cls(**{**values, **made})
+
+    def leave(self, folder: Path) -> str:
+        """Write it into the study's folder; returns the specimen's name."""
+        name = digest(self.plain())[:16]
+        write_json(specimen_folder(folder, name) / "specimen.json", self.plain())
+        return name
+
+
+def specimen_folder(folder: Path, name: str) -> Path:
+    """Where a specimen of a study is."""
+    return folder / "specimens" / name
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeMode:
+    """The numerical (π, π) mode of an infinite lattice, and what a mode family makes of it.
+
+    Parameters
+    ----------
+    mode
+        On one cell about a hole, beside Eq. (mode) with its ideal parameters.
+    """
+
+    mode: PatternMode
+
+    @classmethod
+    def of(cls, specimen: Specimen, material: Material, divisions: int) -> LatticeMode:
+        """Of the lattice of a specimen's cells, in uniaxial compression.
+
+        In its first critical state, or where it stays stable in the last one looked at. Of a graded
+        specimen: the lattice of the cell at its centre.
+
+        Parameters
+        ----------
+        specimen, material
+            Whose.
+        divisions
+            Elements along l.
+
+        Raises
+        ------
+        MissingDependencyError
+            If dolfinx is not there.
+        """
+        ratio = specimen.diameter / specimen.pitch
+        lattice = StudiedLattice(
+            ratio, material=material, pitch=specimen.pitch, divisions=divisions
+        )
+        try:
+            return cls(pattern_mode(lattice))
+        except ModuleNotFoundError as error:
+            raise MissingDependencyError(NO_DOLFINX) from error
+
+    @property
+    def aspect(self) -> float:
+        """a₁ of Eq. (mode) that is nearest to the mode [-].
+
+        By symmetry and period the mode's wave vectors and phases are the ideal ones exactly; of the
+        seven parameters a₁ is left, the ratio of the two components' amplitudes.
+        """
+        rule = MeshQuadrature(self.mode.mesh)
+        mode, ideal = rule.values(self.mode.shape), rule.values(self.mode.analytic)
+        along, across = (
+            rule.weights @ (mode[:, c] * ideal[:, c]) / (rule.weights @ ideal[:, c] ** 2)
+            for c in (0, 1)
+        )
+        return float(along / across)
+
+    def over(self, specimen: Specimen) -> tuple[Mesh, FloatArray]:
+        """The mode on copies of its cell about all holes: mesh [mm] and (n, 2) nodal field [-].
+
+        Neighbours have opposite signs.
+        """
+        mesh, shape = self.mode.mesh, self.mode.shape
+        centres = specimen.hole_centres
+        steps = np.rint((centres - centres[0]) / specimen.pitch).astype(int).sum(axis=1)
+        nodes = (centres[:, None, :] + mesh.nodes).reshape(-1, 2)
+        first = len(mesh.nodes) * np.arange(len(centres))
+        cells = (first[:, None, None] + mesh.cells).reshape(-1, mesh.cells.shape[1])
+        field = ((-1.0) ** steps)[:, None, None] * shape
+        return Mesh(nodes, cells, mesh.element), field.reshape(-1, 2)
+
+    def overlap(self, specimen: Specimen, family: ModeFamily, parameters: ArrayLike) -> float:
+        """Normalised overlap with a family's mode over all unit cells of a specimen [-].
+
+        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude: 1 if they differ by a
+        factor only.
+        """
+        return overlap(*self.over(specimen), family, specimen.pitch, parameters)

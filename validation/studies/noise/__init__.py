@@ -1,1 +1,0 @@
-"""What noise does: bias, scatter, error bars."""

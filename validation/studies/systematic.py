@@ -1,0 +1,474 @@
+"""Systematic errors without noise: one option of the images or of the correlation at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+
+from modeharvest.idic.result import Result
+from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.studies.study import (
+    PAPERS_TAPER,
+    ImagePairSpec,
+    VirtualImagePair,
+    error_parts,
+    require_different,
+)
+from modeharvest.validation.workers import Case
+
+ERRORS = {
+    "lost_px": "IDIC − best fit [px]",
+    "best_px": "truth − best fit [px]",
+    "w_px": "w = truth − IDIC [px]",
+    "v1_percent": "v₁ off the best fit's [%]",
+}
+
+MOVED = "moved from the base [px]"
+
+
+def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) -> pd.DataFrame:
+    """A row for each factor and level, the base's among them: means over the speckles."""
+    done = table[table["error"] == ""]
+    done = _in_base_pixels(done).assign(moved=_moved(done) / px)
+    base = done[done["factor"] == "base"]
+    rows = []
+    for name, at_base in bases.items():
+        parts = dict(iter(done[done["factor"] == name].groupby("level")))
+        if at_base is not None:
+            parts[float(at_base)] = base
+        for level in sorted(parts):
+            part = parts[level]
+            if not len(part):
+                continue
+            factor = FACTORS[name]
+            row = {"factor": factor.label, "name": name, "number": level,
+                   "level": factor.told(level) if factor.names else level,
+                   "base": "yes" if level == at_base else ""}  # fmt: skip
+            for key, label in ERRORS.items():
+                row[label] = part[key].mean()
+            row[MOVED] = part["moved"].mean()
+            row["IDIC − best fit, sd over speckles [px]"] = part["lost_px"].std(ddof=0)
+            row["pixels per ligament"] = part["pixels_per_ligament"].mean()
+            row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
+    """Errors in pixels of one size: a ligament tells how large a level's own are."""
+    at_base = done.loc[done["factor"] == "base", "pixels_per_ligament"].mean()
+    factor = at_base / done["pixels_per_ligament"]
+    return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
+
+
+def _moved(done: pd.DataFrame) -> pd.Series:
+    """Rms per component of a measurement's difference from the base's on the same speckle [mm]."""
+    base = done[done["factor"] == "base"].set_index("seed")["at_junctions_mm"]
+
+    def moved(row: pd.Series) -> float:
+        if row["seed"] not in base.index:
+            return float("nan")
+        apart = np.subtract(row["at_junctions_mm"], base[row["seed"]])
+        return float(np.sqrt(np.mean(apart**2)))
+
+    return done.apply(moved, axis=1)
+
+
+def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
+    """A row for each factor: its smallest and its largest error, the most important first.
+
+    Levels at which not all converged have no part in it.
+    """
+    lost, best, moved = ERRORS["lost_px"], ERRORS["best_px"], f"largest, {MOVED}"
+    rows = []
+    settled = levels[~levels["converged"].map(not_all_converged)]
+    for name, part in settled.groupby("name", sort=False):
+        least, most = part.loc[part[lost].idxmin()], part.loc[part[lost].idxmax()]
+        rows.append({
+            "factor": FACTORS[str(name)].label, "name": name,
+            f"smallest {lost}": least[lost], "at": least["level"],
+            f"largest {lost}": most[lost], "at ": most["level"],
+            "ratio": most[lost] / least[lost],
+            f"{best}, from": part[best].min(), "to": part[best].max(),
+            moved: part[MOVED].max(),
+        })  # fmt: skip
+    return pd.DataFrame(rows).sort_values(moved, ascending=False, ignore_index=True)
+
+
+def not_all_converged(converged: str) -> bool:
+    good, _, count = converged.split()
+    return good != count
+
+
+@dataclass(frozen=True)
+class StudySetting:
+    """How a pair is imaged and correlated.
+
+    Parameters
+    ----------
+    imaging, correlation
+        As everywhere.
+    taper
+        Width over which the mode fades out [unit cells].
+
+    Raises
+    ------
+    InputError
+        If the taper has no width.
+    """
+
+    imaging: ImagingSpec
+    correlation: SquareLatticeOptions
+    taper: float = PAPERS_TAPER
+
+    def __post_init__(self) -> None:
+        if not self.taper > 0.0:
+            raise InputError(f"study: expected a taper wider than 0 unit cells, got {self.taper}")
+
+    def imaged(self, **options: Any) -> StudySetting:
+        """With other options of the imaging."""
+        return replace(self, imaging=replace(self.imaging, **options))
+
+    def speckled(self, **options: Any) -> StudySetting:
+        """With another speckle."""
+        return self.imaged(speckle=replace(self.imaging.speckle, **options))
+
+    def sensed(self, **options: Any) -> StudySetting:
+        """With another sensor."""
+        return self.imaged(sensor=replace(self.imaging.sensor, **options))
+
+    def correlated(self, **options: Any) -> StudySetting:
+        """With other options of the correlation."""
+        return replace(self, correlation=replace(self.correlation, **options))
+
+
+@dataclass(frozen=True)
+class VariedFactor:
+    """Something to change.
+
+    Parameters
+    ----------
+    label
+        What it is called, with its unit.
+    levels
+        What it is changed to unless a study says otherwise.
+    change
+        The setting with that level.
+    base
+        The level that a setting has; None where it has none (float images have no bits).
+    whole
+        Whether levels are whole numbers.
+    names
+        Of levels that are a choice and not a size: their numbers count these.
+    """
+
+    label: str
+    levels: tuple[float, ...]
+    change: Callable[[StudySetting, Any], StudySetting]
+    base: Callable[[StudySetting], float | None]
+    whole: bool = False
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
+        """One of several names of an option of the correlation."""
+        return cls(
+            label,
+            tuple(range(len(names))),
+            lambda s, v: s.correlated(**{option: names[v]}),
+            lambda s: _number(names, getattr(s.correlation, option)),
+            whole=True,
+            names=names,
+        )
+
+    def number(self, level: float | str) -> float:
+        """A level as a number; InputError if there is no such name."""
+        if isinstance(level, str):
+            if level not in self.names:
+                expected = f"one of {list(self.names)}" if self.names else "numbers"
+                raise InputError(f"study: expected {expected} for {self.label}, got {level!r}")
+            return self.names.index(level)
+        return level
+
+    def told(self, level: float) -> str:
+        """A level in words."""
+        return self.names[round(level)] if self.names else f"{level:g}"
+
+    def set(self, setting: StudySetting, level: float) -> StudySetting:
+        """Change a setting.
+
+        Raises
+        ------
+        InputError
+            If the level is out of the factor's range.
+        """
+        if self.names and level not in range(len(self.names)):
+            raise InputError(
+                f"study: expected one of {list(self.names)} for {self.label}, got {level:g}"
+            )
+        if self.whole and level != round(level):
+            raise InputError(f"study: expected whole numbers for {self.label}, got {level:g}")
+        return self.change(setting, round(level) if self.whole else level)
+
+
+def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
+    """Everything about the speckle that much larger, its blur included."""
+    if not factor > 0.0:
+        raise InputError(f"study: expected a speckle_size above 0 times the base's, got {factor}")
+    speckle = setting.imaging.speckle
+    return setting.speckled(
+        standard_deviation=speckle.standard_deviation / factor, blur_px=speckle.blur_px * factor
+    )
+
+
+def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
+    """Grey levels about the same middle, seen by a camera: float images know no contrast."""
+    speckle = setting.imaging.speckle
+    middle = 0.5 * (speckle.dark + speckle.bright)
+    middle = min(max(middle, 0.5 * contrast), 1.0 - 0.5 * contrast)
+    changed = setting.speckled(dark=middle - 0.5 * contrast, bright=middle + 0.5 * contrast)
+    return changed.correlated(camera=True)
+
+
+def _camera(setting: StudySetting, level: float) -> float | None:
+    """A level that only a camera's images have."""
+    return level if setting.correlation.camera else None
+
+
+def _number(names: tuple[str, ...], chosen: str | None) -> int | None:
+    """Of a name; None for a choice that is left to the images."""
+    return None if chosen is None else names.index(chosen)
+
+
+FACTORS: dict[str, VariedFactor] = {
+    "order": VariedFactor(
+        "order of the spline [-]", (3, 5, 11), lambda s, v: s.correlated(order=v),
+        lambda s: s.correlation.order, whole=True,
+    ),
+    "gradient": VariedFactor.choice(
+        "gradient that weighs the residual", "gradient", ("deformed", "reference")
+    ),
+    "speckle_size": VariedFactor(
+        "size of the speckle [times the base's]", (0.5, 0.7, 1.0, 1.4, 2.0), _speckle_size,
+        lambda s: 1.0,
+    ),
+    "contrast": VariedFactor(
+        "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
+        _contrast,
+        lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
+    ),
+    "blur": VariedFactor(
+        "blur of the speckle [px]", (1.5, 2.0, 3.0, 4.0, 6.0), lambda s, v: s.speckled(blur_px=v),
+        lambda s: s.imaging.speckle.blur_px,
+    ),
+    "bits": VariedFactor(
+        "bits of camera images [-]", (4, 6, 8, 10, 12),
+        lambda s, v: s.imaged(bits=v).correlated(camera=True),
+        lambda s: _camera(s, s.imaging.bits), whole=True,
+    ),
+    "fill_factor": VariedFactor(
+        "fill factor of the sensor [-]", (0.0, 0.25, 0.5, 0.75, 1.0),
+        lambda s, v: s.sensed(fill_factor=v), lambda s: s.imaging.sensor.fill_factor,
+    ),
+    "pixel_size": VariedFactor(
+        "pixel [mm]", (0.01, 0.014, 0.02, 0.028, 0.04), lambda s, v: s.imaged(pixel_size=v),
+        lambda s: s.imaging.pixel_size,
+    ),
+    "v0_degree": VariedFactor(
+        "degree of v0 [-]", (2, 3, 4, 5, 6, 7, 8), lambda s, v: s.correlated(v0_degree=v),
+        lambda s: s.correlation.v0_degree, whole=True,
+    ),
+    "v_degree": VariedFactor(
+        "degree of v1 [-]", (2, 3, 4, 5, 6, 7, 8), lambda s, v: s.correlated(v_degree=v),
+        lambda s: s.correlation.v_degree, whole=True,
+    ),
+    "taper": VariedFactor(
+        "width of the mode's taper [unit cells]", (0.125, 0.25, 0.5, 0.75, 1.0),
+        lambda s, v: replace(s, taper=v), lambda s: s.taper,
+    ),
+    "edge_px": VariedFactor(
+        "pixels left out at edges [px]", (0, 1, 2, 3, 5, 8), lambda s, v: s.correlated(edge_px=v),
+        lambda s: s.correlation.edge_px, whole=True,
+    ),
+}  # fmt: skip
+"""By the names that a study uses."""
+
+
+BASE = "base"
+_QUICK_LEVELS = 3
+
+
+@dataclass(frozen=True)
+class SystematicStudy:
+    """Correlate exact images with one option changed at a time.
+
+    Parameters
+    ----------
+    strain
+        Of the deformed image [-].
+    factors
+        What to change: names in :data:`modeharvest.validation.studies.systematic.FACTORS`.
+    levels
+        Other levels than a factor's own, by its name: numbers, or names where it has names.
+    seeds_of_speckle
+        Every level is measured on each of these speckles.
+
+    Raises
+    ------
+    InputError
+        If a factor is unknown, levels are given for one that is not asked for, or a value comes
+        twice.
+    """
+
+    strain: float = 0.128
+    factors: tuple[str, ...] = tuple(FACTORS)
+    levels: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
+    seeds_of_speckle: tuple[int, ...] = (0, 1)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in (*self.factors, *self.levels) if name not in FACTORS]
+        if unknown or not self.factors:
+            raise InputError(
+                f"study: expected factors among {list(FACTORS)}, got {unknown or 'none'}"
+            )
+        without = [name for name in self.levels if name not in self.factors]
+        if without:
+            raise InputError(
+                f"study: expected levels of the factors {list(self.factors)} only, got some of "
+                f"{without}"
+            )
+        if not self.seeds_of_speckle or min(self.seeds_of_speckle) < 0:
+            raise InputError(
+                "study: expected at least one seed of a speckle, of 0 or more, got "
+                f"{list(self.seeds_of_speckle)}"
+            )
+        require_different("factors", self.factors)
+        require_different("seeds_of_speckle", self.seeds_of_speckle)
+        for name, levels in self.levels.items():
+            if not levels:
+                raise InputError(f"study: expected at least one level of {name}, got none")
+            require_different(f"levels of {name}", self._levels(name))
+
+    @property
+    def question(self) -> str:
+        """What is asked, for the report."""
+        return (
+            "Without noise a measurement is still wrong. What makes it so? One option of the "
+            "images or of the correlation is changed at a time, and the error is split into what "
+            "the ansatz can’t describe and what the measurement adds."
+        )
+
+    @property
+    def function(self) -> str:
+        """The "package.module:name" of what runs one case."""
+        return f"{__name__}:one_level"
+
+    @property
+    def seeds(self) -> str:
+        """Of the speckles."""
+        plural = "s" if len(self.seeds_of_speckle) > 1 else ""
+        return f"seed{plural} {', '.join(map(str, self.seeds_of_speckle))} of the speckle"
+
+    def require(self, correlation: SquareLatticeOptions) -> None:
+        """Accept any correlation."""
+
+    def quick(self) -> Self:
+        """One speckle, and three levels of each factor: the first, the middle, the last."""
+        levels = {}
+        for name in self.factors:
+            own = self._levels(name)
+            some = {0, len(own) // 2, len(own) - 1}
+            levels[name] = tuple(own[k] for k in sorted(some))
+        return replace(self, levels=levels, seeds_of_speckle=self.seeds_of_speckle[:1])
+
+    def prepare(
+        self, subject: ImagePairSpec, folder: Path, progress: Progress = silent
+    ) -> tuple[Case, ...]:
+        """Make the base's images, which many cases share; the others are made case by case.
+
+        Raises
+        ------
+        InputError
+            If a level is out of its range.
+        """
+        cases = []
+        for seed in self.seeds_of_speckle:
+            base = StudySetting(subject.imaging, subject.correlation).speckled(seed=seed)
+            own = _described(subject, folder, self.strain, base)
+            images = VirtualImagePair.open(folder, own, progress).images.folder
+            cases.append({"factor": BASE, "level": 0.0, "seed": seed, "subject": own, "keep": True})
+            for name in self.factors:
+                for level in self._levels(name):
+                    setting = FACTORS[name].set(base, level)
+                    described = _described(subject, folder, self.strain, setting)
+                    if described != own:
+                        shared = VirtualImagePair.images_folder(folder, described) == images
+                        cases.append({"factor": name, "level": float(level), "seed": seed,
+                                      "subject": described, "keep": shared})  # fmt: skip
+        return tuple(cases)
+
+    def _levels(self, name: str) -> tuple[float, ...]:
+        factor = FACTORS[name]
+        return tuple(factor.number(level) for level in self.levels.get(name, factor.levels))
+
+
+def _described(subject: ImagePairSpec, folder: Path, strain: float, setting: StudySetting) -> str:
+    return subject.describe(folder, strain, setting.imaging, setting.correlation, setting.taper)
+
+
+def one_level(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Image, correlate and set against the truth.
+
+    Parameters
+    ----------
+    case
+        One of :meth:`Systematic.prepare`.
+    folder
+        Of the study. Images that no other case needs are removed again.
+
+    Returns
+    -------
+    dict
+        The errors of :func:`~modeharvest.validation.studies.study.error_parts`, how
+        the correlation ended, and the displacement at the junctions between holes.
+    """
+    scene = VirtualImagePair.open(folder, case["subject"])
+    try:
+        return _errors_of(scene)
+    finally:
+        if not case["keep"]:
+            scene.discard()
+
+
+def _errors_of(scene: VirtualImagePair) -> dict[str, Any]:
+    result = scene.correlate()
+    specimen = scene.specimen
+    ligament = specimen.pitch - specimen.diameter
+    return {
+        **error_parts(scene, result),
+        "outcome": result.outcome.value,
+        "iterations": result.iterations,
+        "residual": result.residual_rms,
+        "pixels": result.pixels,
+        "pixels_per_ligament": ligament / scene.images.grid.pixel_size,
+        "at_junctions_mm": _at_junctions(scene, result).ravel().tolist(),
+    }
+
+
+def _at_junctions(scene: VirtualImagePair, result: Result) -> FloatArray:
+    """(junctions, 2) displacement between four holes each, whatever the pixels [mm]."""
+    specimen = scene.specimen
+    x, y = (
+        specimen.pitch * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
+        for count in (specimen.holes_x, specimen.holes_y)
+    )
+    return scene.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)

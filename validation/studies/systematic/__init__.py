@@ -1,1 +1,0 @@
-"""What is wrong without any noise: one option at a time."""
