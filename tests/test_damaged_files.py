@@ -102,7 +102,7 @@ def _cases(folder: Path) -> dict[str, Subject]:
         "case": Subject(root / "cases" / "paper-virtual.toml", read_case),
         "twin": Subject(root / "cases" / "paper-real-twin.toml", read_case),
         "lattice": Subject(root / "cases" / "square-lattice.toml", read_lattice_case),
-        "study": Subject(root / "studies" / "noise.toml", read_study),
+        "study": Subject(root / "cases" / "studies" / "noise.toml", read_study),
         "experiment": Subject(harvest, read_photograph_case),
     }
 
@@ -399,7 +399,7 @@ def _read_at_once(monkeypatch: pytest.MonkeyPatch, kind: str, files: list[Path])
     """Let one child read all the variants, a second one what it leaves if it crashes, and so on."""
     script = (
         "import sys\n"
-        "from modeharvest import child\n"
+        "from modeharvest.util import child\n"
         "kind, *paths = sys.argv[1:]\n"
         "child.limit_memory(paths[0])\n"
         "for path in paths:\n"

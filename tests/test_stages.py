@@ -168,7 +168,7 @@ def test_a_key_holds_the_content_and_the_code(monkeypatch: pytest.MonkeyPatch) -
 
 HOLDS = """
 import sys
-from modeharvest.stages import exclusive
+from modeharvest.util.stages import exclusive
 sys.argv = ["modeharvest", "run", "a case"]
 with exclusive(sys.stdin.readline().strip()):
     print("held", flush=True)

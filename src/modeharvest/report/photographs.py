@@ -321,7 +321,7 @@ def write_harvest_report(
     atlas = PhotographReportData(harvest)
     by_name = {frame["name"]: frame for frame in told["frames"]}
     shown = [by_name[frame.name] for frame in atlas.shown]
-    labels = labels(shown)
+    names = labels(shown)
     page = render(
         PHOTOGRAPHS_TEMPLATE,
         title=harvest.title,
@@ -329,15 +329,15 @@ def write_harvest_report(
         summary=told,
         words=WORDS,
         shown=shown,
-        labels=labels,
+        labels=names,
         hero=to_svg(draw_hero(atlas), "hero", "The last photograph and its pattern"),
         reference=_photograph_picture("reference", "The reference", draw_reference(atlas)),
         optics=_optics(harvest),
-        sections=_sections(atlas, by_name, labels, progress),
+        sections=_sections(atlas, by_name, names, progress),
         curves=_curves(harvest, told),
         convergence=[
             _photograph_picture(
-                f"convergence-{k}", labels[frame.name], draw_convergence(frame.result)
+                f"convergence-{k}", names[frame.name], draw_convergence(frame.result)
             )
             for k, frame in enumerate(atlas.shown, start=1)
         ],

@@ -95,7 +95,7 @@ KINDS: dict[str, type[Any]] = {
     "resolution": ResolutionStudy,
     "modes": MeasuredModesStudy,
 }
-_SHIPPED = resources.files("modeharvest") / "studies"
+_SHIPPED = resources.files("modeharvest") / "cases" / "studies"
 _QUICK = 2.0
 """A quick study's pixels are that much larger."""
 

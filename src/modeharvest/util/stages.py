@@ -69,10 +69,10 @@ def source_digest(*folders: str) -> str:
 def _sources(
     folder: Traversable, name: str, only: tuple[str, ...]
 ) -> Iterator[tuple[str, Traversable]]:
-    """Code and templates in a folder of the package and below, by their names."""
+    """Code and templates in a folder of the package and below; those of util count always."""
     for entry in folder.iterdir():
         if entry.is_dir():
-            if entry.name != "__pycache__" and (not only or entry.name in only):
+            if entry.name != "__pycache__" and (not only or entry.name in ("util", *only)):
                 yield from _sources(entry, f"{name}{entry.name}/", ())
         elif entry.name.endswith(_SOURCES):
             yield f"{name}{entry.name}", entry

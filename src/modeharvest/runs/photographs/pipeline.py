@@ -46,7 +46,7 @@ from modeharvest.util.typed import plain
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
-_CODE = ("fem", "imaging", "idic", "harvest")
+_CODE = ("fem", "imaging", "idic", "runs")
 """Folders of the package that they depend on; how they are shown is in others."""
 
 
