@@ -1,0 +1,205 @@
+#!/usr/bin/env python3
+"""Run every shipped case and study in a checkout, and compare what two checkouts computed.
+
+    scripts/compare_outputs.py make CHECKOUT OUT [--whole] [--only NAME ...]
+    scripts/env python scripts/compare_outputs.py compare BEFORE AFTER [--tolerance 1e-12]
+
+``make`` runs the commands below in CHECKOUT (studies with --quick unless --whole is given), each into
+a folder of its own in OUT; finished commands are not repeated. ``compare`` walks both: every
+number of every JSON, CSV, HDF5, NPZ, TIFF and VTU file, by the names that
+``scripts/renamed_outputs.toml`` gives to what was called otherwise before. Pages, pictures,
+durations and software versions are left out: they are not what is computed. Exit code 1 where
+anything differs by more than the tolerance (relative, absolute below 1).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+COMMANDS = {
+    "paper-virtual": "run paper-virtual --out {out}",
+    "benchmark": "benchmark make paper-virtual --out {out}",
+    "square-lattice": "modes square-lattice --out {out}",
+    "hexagonal-lattice": "modes hexagonal-lattice --out {out}",
+    "chiral-lattice": "modes chiral-lattice --out {out}",
+    "mode-study": "modes mode-study --out {out}",
+    "star": "benchmark star --out {out}",
+    "modes": "study modes {quick} --out {out}",
+    "resolution": "study resolution {quick} --out {out}",
+    "robustness": "study robustness {quick} --out {out}",
+    "noise": "study noise {quick} --out {out}",
+    "systematic": "study systematic {quick} --out {out}",
+    "paper-real-twin": "run paper-real-twin --out {out}",
+}
+"""Every shipped case and study."""
+
+RENAMED = Path(__file__).with_name("renamed_outputs.toml")
+NOT_COMPUTED = {"timings.json", "stages.json"}
+READ = {".json", ".csv", ".npz", ".tif", ".tiff", ".h5", ".vtu"}
+SKIPPED = {"seconds", "versions", "source", "sha256", "digest", "key", "software", "files"}
+
+
+def make(checkout: Path, out: Path, whole: bool, only: list[str]) -> int:
+    """Run the commands in a checkout, a failed one without stopping; the number that failed."""
+    failed = 0
+    for name, command in COMMANDS.items():
+        done = out / f"{name}.done"
+        if (only and name not in only) or done.exists():
+            continue
+        words = command.format(out=out / name, quick="" if whole else "--quick").split()
+        print("modeharvest", *words, flush=True)
+        run = subprocess.run([checkout / "scripts/env", "modeharvest", *words], check=False)
+        if run.returncode:
+            print(f"failed: {name}", file=sys.stderr)
+            failed += 1
+        else:
+            done.touch()
+    return failed
+
+
+class Renamed:
+    """What files, keys, columns and values are called now that were called otherwise before."""
+
+    def __init__(self, table: Path) -> None:
+        content = tomllib.loads(table.read_text()) if table.is_file() else {}
+        self.names: dict[str, str] = content.get("names", {})
+        self.values: dict[str, str] = content.get("values", {})
+        self.files: dict[str, str] = content.get("files", {})
+        self.removed = set(content.get("removed", {}).get("names", []))
+
+    def path(self, path: Path) -> Path:
+        """Where a file of the earlier run lies now."""
+        return next(
+            (path.with_name(new) for old, new in self.files.items() if path.match(old)), path
+        )
+
+
+def flat(thing: object, renamed: Renamed, at: str = "") -> Iterator[tuple[str, object]]:
+    """Every number and text of a JSON file, with the path of keys that leads to it."""
+    if isinstance(thing, dict):
+        for key, value in thing.items():
+            if key not in SKIPPED | renamed.removed:
+                yield from flat(value, renamed, f"{at}/{renamed.names.get(key, key)}")
+    elif isinstance(thing, list):
+        for index, value in enumerate(thing):
+            yield from flat(value, renamed, f"{at}/{index}")
+    else:
+        yield at, renamed.values.get(thing, thing) if isinstance(thing, str) else thing
+
+
+def contents(path: Path, renamed: Renamed) -> Iterator[tuple[str, object]]:
+    """Every number, text, array and attribute of a file, by name."""
+    import h5py
+    import meshio
+    import numpy as np
+    import pandas as pd
+    import tifffile
+
+    names = renamed.names
+    match path.suffix:
+        case ".json":
+            yield from flat(json.loads(path.read_text()), renamed)
+        case ".csv":
+            for key, column in pd.read_csv(path, comment="#").items():
+                values = [renamed.values.get(v, v) if isinstance(v, str) else v for v in column]
+                yield names.get(str(key), str(key)), np.array(values)
+        case ".npz":
+            with np.load(path, allow_pickle=False) as content:
+                yield from ((names.get(key, key), content[key]) for key in content.files)
+        case ".tif" | ".tiff":
+            yield "image", tifffile.imread(path)
+        case ".vtu":
+            mesh = meshio.read(path)
+            yield "points", mesh.points
+            yield from ((names.get(key, key), value) for key, value in mesh.point_data.items())
+        case ".h5":
+            found: list[tuple[str, object]] = []
+
+            def visit(key: str, node: h5py.Group | h5py.Dataset) -> None:
+                at = "/".join(names.get(part, part) for part in key.split("/"))
+                if isinstance(node, h5py.Dataset):
+                    found.append((at, node[()]))
+                for name, value in node.attrs.items():
+                    if name not in SKIPPED:
+                        found.append((f"{at}@{names.get(name, name)}", value))
+
+            with h5py.File(path) as file:
+                visit("", file)
+                file.visititems(visit)
+            yield from found
+
+
+def difference(before: object, now: object, tolerance: float) -> str:
+    """How two values differ; nothing where they agree."""
+    import numpy as np
+
+    one, other = np.asarray(before), np.asarray(now)
+    if one.shape != other.shape:
+        return f"shape {one.shape} is now {other.shape}"
+    if one.dtype.kind not in "biufc" or other.dtype.kind not in "biufc":
+        unlike = [(x, y) for x, y in zip(one.flat, other.flat, strict=True) if str(x) != str(y)]
+        return f"{len(unlike)} of {one.size} differ, e.g. {unlike[0]}" if unlike else ""
+    one, other = one.astype(complex), other.astype(complex)
+    equal = (one == other) | (np.isnan(one) & np.isnan(other))
+    with np.errstate(invalid="ignore"):
+        distance = np.where(equal, 0, np.abs(one - other) / np.maximum(1, np.abs(one)))
+    worst = float(np.nan_to_num(distance, nan=math.inf).max(initial=0))
+    return "" if worst <= tolerance else f"differs by {worst:.3g}"
+
+
+def compare(before: Path, after: Path, tolerance: float) -> int:
+    """Print every difference; the number of them."""
+    renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
+    files = [
+        p for p in sorted(before.rglob("*")) if p.suffix in READ and p.name not in NOT_COMPUTED
+    ]
+    for old in files:
+        path = old.relative_to(before)
+        new = after / renamed.path(path)
+        if not new.exists():
+            print(f"{path}: missing")
+            differences += 1
+            continue
+        now = dict(contents(new, as_is))
+        for key, value in contents(old, renamed):
+            values += 1
+            what = difference(value, now.pop(key), tolerance) if key in now else "missing"
+            if what:
+                print(f"{path}: {key}: {what}")
+                differences += 1
+        for key in now:
+            print(f"{path}: {key}: new")
+    print(f"{len(files)} files, {values} values and arrays compared: {differences} differences")
+    return differences
+
+
+def main() -> int:
+    """Read the arguments and do what they ask."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("make", help="run all in a checkout")
+    one.add_argument("checkout", type=Path)
+    one.add_argument("out", type=Path)
+    one.add_argument("--whole", action="store_true", help="studies without --quick (hours)")
+    one.add_argument("--only", nargs="*", default=[], choices=[*COMMANDS], metavar="NAME")
+    two = commands.add_parser("compare", help="compare two folders that make left")
+    two.add_argument("before", type=Path)
+    two.add_argument("after", type=Path)
+    two.add_argument("--tolerance", type=float, default=1e-12)
+    given = parser.parse_args()
+    if given.command == "make":
+        return int(make(given.checkout.resolve(), given.out.resolve(), given.whole, given.only) > 0)
+    return int(compare(given.before, given.after, given.tolerance) > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
