@@ -4,8 +4,8 @@
     scripts/compare_outputs.py make CHECKOUT OUT [--whole] [--only NAME ...]
     scripts/env python scripts/compare_outputs.py compare BEFORE AFTER [--tolerance 1e-12]
 
-``make`` runs the commands below in CHECKOUT (studies with --quick unless --whole is given), each into
-a folder of its own in OUT; finished commands are not repeated. ``compare`` walks both: every
+``make`` runs the commands below in CHECKOUT (studies with --quick unless --whole is given), each
+in a folder of its own in OUT; finished commands are not repeated. ``compare`` walks both: every
 number of every JSON, CSV, HDF5, NPZ, TIFF and VTU file, by the names that
 ``scripts/renamed_outputs.toml`` gives to what was called otherwise before. Pages, pictures,
 durations and software versions are left out: they are not what is computed. Exit code 1 where
