@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.runs.benchmark import grade, make_benchmark, truth_folder
+from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.case import read_case, shipped_solution
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
@@ -49,12 +49,12 @@ def measure(folder: Path, pixel: float, spacing: float) -> None:
     points = dense_field(truth, spacing, field)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     wall, cpu = time.perf_counter(), time.process_time()
-    (score,) = grade([field], truth.folder, STRAIN, folder / "graded").scores
+    (found,) = score([field], truth.folder, STRAIN, folder / "graded").scores
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"{points} points on {truth.grid.rows} x {truth.grid.cols} px: {wall:.1f} s, of them "
           f"{cpu:.1f} s on the processor; memory {after:.2f} GB at most, {before:.2f} GB before; "
-          f"rms {score.everywhere.rms_px:.4f} px")  # fmt: skip
+          f"rms {found.everywhere.rms_px:.4f} px")  # fmt: skip
 
 
 def main() -> None:

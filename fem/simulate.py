@@ -12,7 +12,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from modeharvest import __version__
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
@@ -23,6 +22,7 @@ from modeharvest.fem.path.critical import Critical, locate_critical
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.stability import Mode
 from modeharvest.fem.specimen import Specimen
+from modeharvest.util import __version__
 from modeharvest.util.progress import Progress, silent
 
 

@@ -19,6 +19,7 @@ from modeharvest.fem.bloch.dispersion import Dispersion
 from modeharvest.fem.bloch.modes import read_modes
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.report.terminal import print_lattice
+from modeharvest.runs import run
 from modeharvest.runs.lattice.case import LatticeCase, StudyPlan, read_lattice_case
 from modeharvest.runs.lattice.options import (
     DispersionPlan,
@@ -28,7 +29,7 @@ from modeharvest.runs.lattice.options import (
     Search,
     SquareLattice,
 )
-from modeharvest.runs.lattice.pipeline import LatticeAnalysis, bloch, modes
+from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 from modeharvest.util.files import read_json
 
 pytestmark = pytest.mark.dolfinx
@@ -65,7 +66,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which all is done."""
     folder = tmp_path_factory.mktemp("finished") / "out"
-    modes(case, folder)
+    run(case, folder)
     return folder
 
 
@@ -153,19 +154,19 @@ def test_the_table_for_own_plots_is_the_hdf5_s(finished: Path) -> None:
 
 def test_running_again_does_nothing(case: Path, folder: Path) -> None:
     # The folder's name is in the report, so that is made anew once.
-    summary = modes(case, folder)
+    summary = run(case, folder)
     before = stamps(folder)
-    assert modes(case, folder) == summary
-    assert bloch(case, folder) == summary  # shows all that is there
+    assert run(case, folder) == summary
+    assert LatticeAnalysis(case, folder).bloch() == summary  # shows all that is there
     assert stamps(folder) == before
 
 
 def test_a_changed_table_repeats_only_what_depends_on_it(case: Path, folder: Path) -> None:
-    modes(case, folder)
+    run(case, folder)
     before = stamps(folder)
     other = case.with_name("other.toml")
     other.write_text(COARSE.replace("[0.012, 0.015]", "[0.013]"), "utf-8")
-    assert len(modes(other, folder)["branches"][0]["states"]) == 1
+    assert len(run(other, folder)["branches"][0]["states"]) == 1
     redone = changed(before, folder)
     assert {"modes.h5", "family_branch_1.json", "summary.json", "report.html"} <= redone
     assert not {"critical.json", "dispersion.h5", "dispersion.csv"} & redone
@@ -175,7 +176,7 @@ def test_bloch_shows_nothing_of_another_case(case: Path, folder: Path) -> None:
     """Modes of the case before stay in the folder, but not in the report."""
     other = case.with_name("softer.toml")
     other.write_text(COARSE.replace('"two-term-I1"', '"two-term-I1"\nc1 = 0.5'), "utf-8")
-    summary = bloch(other, folder)
+    summary = LatticeAnalysis(other, folder).bloch()
     assert summary["modes"] is None
     assert summary["branches"] == summary["families"] == []
 
@@ -199,7 +200,7 @@ def test_an_interrupted_analysis_continues_to_the_same_end(
         LatticeAnalysis(read_lattice_case(case), folder, interrupt, str(case)).all()
     assert not list(folder.glob("*.part*"))
     assert set(read_json(folder / "stages.json")) == set(order[:first])
-    ours, theirs = modes(case, folder), read_json(finished / "summary.json")
+    ours, theirs = run(case, folder), read_json(finished / "summary.json")
     for key in ("critical", "dispersion", "zone", "modes", "branches"):
         assert ours[key] == theirs[key]
 
@@ -218,7 +219,7 @@ def coarse(**changes: Any) -> LatticeCase:
 
 def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
     case = coarse(search=Search(largest=0.005, divisions=2))
-    summary = modes(case, tmp_path)
+    summary = run(case, tmp_path)
     assert "stable up to 0.005" in summary["outcome"]
     assert not summary["critical"]["found"]
     assert summary["critical"]["value"] > 0  # how far it still was from zero
@@ -228,7 +229,7 @@ def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
     assert summary["families"][0]["of"].startswith("primary path")
     # ... and the tangent's lowest mode where it is asked for.
     asked = case.model_copy(update={"modes": ModesPlan(waves=((1.0, 1.0),), load=0.004)})
-    summary = modes(asked, tmp_path)
+    summary = run(asked, tmp_path)
     assert summary["modes"]["copies"] == [2, 2]
     assert summary["modes"]["load"] == 0.004
     assert summary["modes"]["eigenvalues"][0] > 0
@@ -258,7 +259,7 @@ def test_a_study_goes_on_from_where_it_was(
     assert not part.exists()
     assert len((tmp_path / "study.csv").read_text("utf-8").splitlines()) == 3
     other = coarse(study=replace(plan, ratios=(0.8,), overlays=()))
-    summary = modes(other, tmp_path)
+    summary = run(other, tmp_path)
     # None of the other study's rows.
     assert len((tmp_path / "study.csv").read_text("utf-8").splitlines()) == 2
     assert summary["study"]["lattices"] == 1
@@ -374,5 +375,5 @@ def test_a_truncated_file_is_made_again(
     (folder / "summary.json").unlink()
     path = folder / victim
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    modes(case, folder)
+    run(case, folder)
     assert path.read_bytes() == (finished / victim).read_bytes()

@@ -18,8 +18,9 @@ from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.runs import run
 from modeharvest.runs.case import Case, read_case
-from modeharvest.runs.experiment import Run, run
+from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 

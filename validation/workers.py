@@ -24,7 +24,7 @@ from uuid import uuid4
 
 import numba
 
-from modeharvest import __version__
+from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, write_json
 from modeharvest.util.stages import digest, source_digest, stage_key

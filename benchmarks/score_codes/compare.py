@@ -29,7 +29,7 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.report.terminal import print_grading
-from modeharvest.runs.benchmark import grade, make_benchmark, truth_folder
+from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.case import read_case, shipped_solution
 from modeharvest.util.errors import InputError, MissingDependencyError
 
@@ -147,7 +147,7 @@ def main() -> None:
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
         fields.append(field)
     graded = OUT / "graded"
-    print_grading(grade(fields, truth_folder(public), arguments.strain, graded), graded)
+    print_grading(score(fields, truth_folder(public), arguments.strain, graded), graded)
 
 
 def _arguments() -> argparse.Namespace:

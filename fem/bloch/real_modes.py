@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest import __version__
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, Wave
 from modeharvest.fem.bloch.modes import ModeSet
 from modeharvest.fem.bloch.zone import is_same
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 

@@ -17,7 +17,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.optimize import brentq
 
-from modeharvest import __version__
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.path.continuation import PathFollower, State, combine
@@ -26,6 +25,7 @@ from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.newton import Constraint
 from modeharvest.fem.path.predictor import hermite_weights
 from modeharvest.fem.path.stability import Mode
+from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray
 
 

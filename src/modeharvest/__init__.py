@@ -1,10 +1,85 @@
 """A virtual laboratory for integrated DIC on mechanical metamaterials.
 
-Four packages, used from left to right: ``fem`` (the exact displacement), ``imaging``
-(speckle images of it), ``idic`` (measure those images), ``validation`` (how large the errors
-are). ``runs`` joins them, ``report`` shows what they found, ``cli`` is the command line.
+``fem`` (the exact displacement), ``imaging`` (speckle images of it), ``idic`` (measure those
+images) and ``validation`` (how large the errors are) are used from left to right; ``runs`` joins
+them, ``report`` shows what they found, ``cli`` is the command line.
+
+What most scripts need is here, each name loaded when it is first used::
+
+    import modeharvest as mh
+    solution = mh.simulate(mh.Experiment(strains=(0.078, 0.128)))
 """
 
 from __future__ import annotations
 
-__version__ = "0.1.0"
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from modeharvest.util import __version__
+from modeharvest.util.errors import dolfinx_missing
+
+if TYPE_CHECKING:  # what type checkers and editors see of the table below
+    from modeharvest.fem.experiment import Experiment
+    from modeharvest.fem.field import Solution
+    from modeharvest.fem.materials import Ogden
+    from modeharvest.fem.simulate import simulate
+    from modeharvest.fem.specimen import Specimen
+    from modeharvest.idic.ansatz import Ansatz
+    from modeharvest.idic.correlate import correlate
+    from modeharvest.idic.result import Result
+    from modeharvest.imaging.imageset import make_images
+    from modeharvest.imaging.spec import ImagingSpec
+    from modeharvest.runs import run
+    from modeharvest.runs.benchmark import score
+    from modeharvest.runs.photographs.pipeline import harvest
+
+__all__ = [
+    "Ansatz",
+    "Experiment",
+    "ImagingSpec",
+    "Ogden",
+    "Result",
+    "Solution",
+    "Specimen",
+    "__version__",
+    "correlate",
+    "harvest",
+    "make_images",
+    "run",
+    "score",
+    "simulate",
+]
+
+_HOMES = {
+    "Ansatz": "idic.ansatz",
+    "Experiment": "fem.experiment",
+    "ImagingSpec": "imaging.spec",
+    "Ogden": "fem.materials",
+    "Result": "idic.result",
+    "Solution": "fem.field",
+    "Specimen": "fem.specimen",
+    "correlate": "idic.correlate",
+    "harvest": "runs.photographs.pipeline",
+    "make_images": "imaging.imageset",
+    "run": "runs",
+    "score": "runs.benchmark",
+    "simulate": "fem.simulate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its home when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        home = import_module(f"{__name__}.{_HOMES[name]}")
+    except ModuleNotFoundError as error:
+        if name == "simulate":
+            raise dolfinx_missing("simulate needs") from error
+        raise
+    value = globals()[name] = getattr(home, name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

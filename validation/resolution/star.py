@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest import __version__
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json, read_record, reading, sha256_of, write_json

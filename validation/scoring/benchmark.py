@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modeharvest import __version__
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.imaging.grid import PixelGrid
@@ -31,6 +30,7 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.util import __version__
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import (

@@ -71,12 +71,13 @@ def score(
     the end, and the exit code is then 2.
     """
     from modeharvest.report.terminal import print_grading
-    from modeharvest.runs.benchmark import declarations, grade
+    from modeharvest.runs.benchmark import declarations
+    from modeharvest.runs.benchmark import score as score_fields
     from modeharvest.util.stages import exclusive
 
     declared = declarations(fields, name, unit, y_axis, first_pixel, column)
     with bars() as progress, exclusive(out):
-        done = grade(declared, truth, strain, out, progress=progress)
+        done = score_fields(declared, truth, strain, out, progress=progress)
     print_grading(done, out)
     _refuse(done.refused)
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from modeharvest import __version__
 from modeharvest.cli import messages
 from modeharvest.cli.benchmark import make, resolution, score, star
 from modeharvest.cli.commands import (
@@ -28,6 +27,7 @@ from modeharvest.cli.commands import (
     study,
     validate,
 )
+from modeharvest.util import __version__
 from modeharvest.util.machine import is_first
 
 if TYPE_CHECKING:

@@ -42,7 +42,9 @@ from modeharvest.validation.scoring.score import (
     error_spectrum,
     ranked,
     regions,
-    score,
+)
+from modeharvest.validation.scoring.score import (
+    score as score_field,
 )
 
 
@@ -179,7 +181,7 @@ def truth_folder(public: Path) -> Path:
     return named.with_name(f"{named.name}-truth")
 
 
-def grade(
+def score(
     fields: Mapping[Path, Declared] | Sequence[Path | str],
     truth: Path | str,
     strain: float,
@@ -230,7 +232,7 @@ def grade(
         progress(n, len(every) + 1, f"score: {path.name}")
         try:
             field = read_measured(path, grid, known.id, declared)
-            graded = score(field, true(field.x, field.y), labels, grid, reach_px)
+            graded = score_field(field, true(field.x, field.y), labels, grid, reach_px)
             _, told = check_conventions(field, true, grid)
         except InputError as error:
             refused[str(path)] = str(error)
@@ -253,7 +255,7 @@ def grade(
 def _require_names(fields: Mapping[Path, Declared]) -> None:
     """Raise InputError if there is no field, or two of one name."""
     if not fields:
-        raise InputError("expected fields to grade, got none")
+        raise InputError("expected fields to score, got none")
     names = [declared.name or path.stem for path, declared in fields.items()]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

@@ -29,7 +29,7 @@ from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_imag
 from modeharvest.report.experiment import write_experiment_report
 from modeharvest.runs.case import Case, read_case, shipped_cases, shipped_solution
 from modeharvest.runs.precompile import precompiling
-from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import Progress, silent
@@ -93,12 +93,6 @@ def validate(
 
 
 _COMPLETE = "complete"
-_NO_DOLFINX = (
-    "the finite-element stage needs dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda "
-    "install -c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
-    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'; or take a solution "
-    "made elsewhere: --solution FILE"
-)
 
 
 @dataclass(frozen=True)
@@ -276,7 +270,10 @@ class Run:
         except ImportError as error:
             shipped = self._shipped()
             if shipped is None:
-                raise MissingDependencyError(_NO_DOLFINX) from error
+                raise MissingDependencyError(
+                    f"{dolfinx_missing('the finite-element stage needs')}; or take a solution "
+                    "made elsewhere: --solution FILE"
+                ) from error
             return shipped
         return simulate(self.case.experiment, self.progress)
 
@@ -368,24 +365,3 @@ def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, whe
 def _outcome(info: Mapping[str, Any]) -> str:
     """How far a simulation went, in words."""
     return str(info.get("outcome", _COMPLETE))
-
-
-def run(case: str | Path | Case, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
-    """Run a case from simulation to report; what ``modeharvest run`` does.
-
-    Parameters
-    ----------
-    case
-        A shipped case's name, the path of a TOML file, or a Case.
-    folder
-        Where to leave the files.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
-    """
-    case = case if isinstance(case, Case) else read_case(case)
-    return Run(case, Path(folder), progress).all()

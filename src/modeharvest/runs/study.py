@@ -32,7 +32,6 @@ from typing import Any, Self
 import pandas as pd
 from pydantic import field_validator, model_validator
 
-from modeharvest import __version__
 from modeharvest.fem.field import Solution
 from modeharvest.report.model import Findings, StudyRun, slug, write_study_report
 from modeharvest.report.study_modes import report_modes
@@ -42,6 +41,7 @@ from modeharvest.report.study_robustness import report_robustness
 from modeharvest.report.study_systematic import report_systematic
 from modeharvest.runs.case import Case, checked, kind_of, of_kind, read_tables
 from modeharvest.runs.experiment import Run
+from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json, require_writable, write_json
 from modeharvest.util.progress import Progress, named, silent
@@ -304,34 +304,6 @@ class StudyAnalysis:
             "versions": _versions(),
             "case": self.case.plain(),
         }
-
-
-def study(
-    name: str | Path | StudyCase,
-    folder: Path | str,
-    workers: Workers | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Run a study; what ``modeharvest study`` does.
-
-    Parameters
-    ----------
-    name
-        A shipped study's name, the path of a TOML file, or a StudyCase.
-    folder
-        Where to leave the files.
-    workers
-        Who runs the cases; two processes of this machine by default.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
-    """
-    case = name if isinstance(name, StudyCase) else read_study(name)
-    return StudyAnalysis(case, Path(folder), workers or Workers(), progress).all()
 
 
 def _claim(folder: Path, kind: str) -> None:

@@ -13,3 +13,12 @@ class InputError(ValueError):
 
 class MissingDependencyError(ImportError):
     """An optional library is needed for this step; the message says how to get it."""
+
+
+def dolfinx_missing(what: str) -> MissingDependencyError:
+    """The error for ``what`` needs dolfinx where there is none, and how to get it."""
+    return MissingDependencyError(
+        f"{what} dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda install -c "
+        "conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
+        "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'"
+    )

@@ -33,7 +33,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from modeharvest import __version__
+from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import may_be_alive, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.util.machine import on_first

@@ -30,7 +30,7 @@ from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.lattice.options import ModesPlan, Search
 from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, combination_name
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.errors import InputError, dolfinx_missing
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, named, silent
 
@@ -322,13 +322,6 @@ def _state(path: CellPath, load: float) -> CellState:
     return state
 
 
-_NO_DOLFINX = (
-    "infinite lattices need dolfinx >= 0.9, petsc4py and gmsh: install them with 'conda install "
-    "-c conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
-    "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'"
-)
-
-
 class LatticeModel:
     """Cell and path of a case, made when they are asked for.
 
@@ -355,7 +348,7 @@ class LatticeModel:
         try:
             return self.case.lattice.cell()
         except ImportError as error:
-            raise MissingDependencyError(_NO_DOLFINX) from error
+            raise dolfinx_missing("infinite lattices need") from error
 
     @cached_property
     def cell(self) -> PeriodicCell:
@@ -364,7 +357,7 @@ class LatticeModel:
         try:
             from modeharvest.fem.lattice.cell import PeriodicCell
         except ImportError as error:
-            raise MissingDependencyError(_NO_DOLFINX) from error
+            raise dolfinx_missing("infinite lattices need") from error
         return PeriodicCell(unit, self.case.material)
 
     def path(self, load: float = 0.0) -> CellPath:

@@ -21,7 +21,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from modeharvest import __version__
 from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap, dispersion, zone_map
 from modeharvest.fem.bloch.modes import (
     Branch,
@@ -32,7 +31,7 @@ from modeharvest.fem.bloch.modes import (
     write_xdmf,
 )
 from modeharvest.report.lattice import write_lattice_report
-from modeharvest.runs.lattice.case import LatticeCase, read_lattice_case, stage_keys
+from modeharvest.runs.lattice.case import LatticeCase, stage_keys
 from modeharvest.runs.lattice.modes import (
     LatticeModel,
     PeriodicField,
@@ -53,6 +52,7 @@ from modeharvest.runs.lattice.results import (
     exports_in,
     summary_of,
 )
+from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.progress import Progress, silent
@@ -296,40 +296,3 @@ class LatticeAnalysis:
     def _finished(self) -> dict[str, str]:
         """The keys of the stages that are finished for this very case."""
         return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
-
-
-def bloch(
-    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
-) -> dict[str, Any]:
-    """Analyse a lattice's stability against all waves; what ``modeharvest bloch`` does.
-
-    Parameters
-    ----------
-    case
-        A shipped case's name, the path of a TOML file, or a LatticeCase.
-    folder
-        Where to leave the files.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
-    """
-    return _analysis(case, folder, progress).bloch()
-
-
-def modes(
-    case: str | Path | LatticeCase, folder: Path | str, progress: Progress = silent
-) -> dict[str, Any]:
-    """Do all of a lattice's analysis; what ``modeharvest modes`` does. Parameters as ``bloch``."""
-    return _analysis(case, folder, progress).all()
-
-
-def _analysis(
-    case: str | Path | LatticeCase, folder: Path | str, progress: Progress
-) -> LatticeAnalysis:
-    if isinstance(case, LatticeCase):
-        return LatticeAnalysis(case, Path(folder), progress)
-    return LatticeAnalysis(read_lattice_case(case), Path(folder), progress, str(case))
