@@ -26,7 +26,7 @@ def main() -> None:
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     start = case.correlation.start(ansatz, STRAIN)
     with tempfile.TemporaryDirectory() as folder:
-        images = make_images(Solution.read(path), (STRAIN,), case.imaging, folder)
+        images = make_images(Solution.read(path), case.imaging, folder, (STRAIN,))
         grid, mask, f, g = images.grid, images.mask(), images.reference(), images.deformed(STRAIN)
         g_mask, truth = images.deformed_mask(STRAIN), images.truth(STRAIN).displacement
     best = fit_displacement(truth, grid, ansatz, start, mask).displacement()

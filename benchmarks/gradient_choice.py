@@ -42,7 +42,7 @@ def images(folder: Path) -> ImageSet:
     if path is None:
         raise InputError("expected the shipped solution of paper-virtual, found none")
     spec = replace(read_case("paper-virtual").imaging, pixel_size=PIXEL)
-    make_images(Solution.read(path), [STRAIN], spec, folder)
+    make_images(Solution.read(path), spec, folder, [STRAIN])
     return ImageSet.read(folder)
 
 

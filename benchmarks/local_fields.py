@@ -90,7 +90,7 @@ def main() -> None:
     solution = Solution.read(shipped_solution("paper-virtual"))
     with tempfile.TemporaryDirectory() as folder:
         spec = ImagingSpec(pixel_size=options.pixel_size)
-        images = make_images(solution, options.strains, spec, folder)
+        images = make_images(solution, spec, folder, options.strains)
         for strain in images.strains:
             f, g = images.reference(camera=True), images.deformed(strain, camera=True)
             masks = images.mask(), images.deformed_mask(strain)

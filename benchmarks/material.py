@@ -19,7 +19,7 @@ from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.photograph.matching import HoleMotion, match
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.imaging.imageset import ImageSet, make_images
-from modeharvest.imaging.render import read_truth
+from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import shipped_solution
@@ -40,7 +40,7 @@ def edge_distance(found: BoolArray, truth: BoolArray) -> NDArray[np.float64]:
 def motion_error(motion: HoleMotion, images: ImageSet) -> float:
     """Rms over holes and components [px]."""
     grid, mask = images.grid, images.mask()
-    u = read_truth(images.folder / images.info["snapshots"][0]["truth"]).displacement
+    u = Truth.read(images.folder / images.info["snapshots"][0]["truth"]).displacement
     row, col = np.mgrid[: grid.rows, : grid.cols]
     _, found = motion.in_mm(grid)
     errors = []
@@ -57,7 +57,7 @@ def main() -> None:
     for background in (0.0, 0.2, 0.5, 0.95):
         spec = ImagingSpec(pixel_size=0.01, background=background, sensor=SENSOR)
         with tempfile.TemporaryDirectory() as folder:
-            images = make_images(solution, [STRAIN], spec, folder)
+            images = make_images(solution, spec, folder, [STRAIN])
             truths = images.mask(), images.deformed_mask(STRAIN)
             pictures = images.reference(camera=True), images.deformed(STRAIN, camera=True)
             masks = [find_material(picture).mask for picture in pictures]

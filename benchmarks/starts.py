@@ -92,7 +92,7 @@ class Map:
         assert path is not None, "the case ships its solution"
         spec = replace(case.imaging, pixel_size=pixel_size)
         folder = FOLDER / f"images-{1000 * pixel_size:g}um"
-        images = make_images(Solution.read(path), (STRAIN,), spec, folder)
+        images = make_images(Solution.read(path), spec, folder, (STRAIN,))
         self.pitch = case.experiment.specimen.pitch
         self.how = case.correlation
         self.ansatz = self.how.ansatz(case.experiment.specimen)

@@ -17,7 +17,7 @@ def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
     """Return, for each strain, the rms per component [px] of w and of the best possible fit."""
     solution = simulate(experiment)
     print("critical strain", solution.info["critical"]["strain"])
-    images = make_images(solution, experiment.strains, imaging, folder)
+    images = make_images(solution, imaging, folder, experiment.strains)
     how, grid, mask = SquareLatticeOptions(), images.grid, images.mask()
     ansatz = how.ansatz(experiment.specimen)
 

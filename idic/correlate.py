@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.pair import CheckedImages, checked_mask, location_of
+from modeharvest.idic.pair import CheckedImages
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Brightness
@@ -42,6 +42,7 @@ from modeharvest.idic.uncertainty.residual_test import (
     lags_for,
 )
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import checked_mask, location_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent

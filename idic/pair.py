@@ -17,15 +17,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.idic.uncertainty.noise import CameraNoise
-from modeharvest.imaging.compiled import readable
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import checked_image, checked_mask, grey_levels_in
 from modeharvest.imaging.photographs.files import read_image, read_mask, require_contrast
 from modeharvest.util.arrays import BoolArray, FloatImage
-from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading
 from modeharvest.util.typed import made
 
@@ -142,65 +140,3 @@ class CheckedImages:
     def grey(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """The grey levels of the material, of f and of g."""
         return grey_levels_in(self.f, self.f_mask), grey_levels_in(self.g, self.g_mask)
-
-
-def grey_levels_in(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
-    """The grey levels that a mask leaves."""
-    return image if mask is None else image[mask]
-
-
-def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> NDArray[Any]:
-    """The image as read-only float32; raises InputError unless finite and of the grid's shape."""
-    pixels = np.asarray(image)
-    if pixels.shape != grid.shape:
-        raise InputError(
-            f"expected a {what} image of {grid.rows} x {grid.cols} px like the grid, got shape "
-            f"{pixels.shape}; give two images and a grid of one size"
-        )
-    pixels = pixels.astype(np.float32, copy=False)
-    bad = ~np.isfinite(pixels)
-    if bad.any():
-        raise InputError(
-            f"expected finite grey levels in the {what} image, got NaN or infinity in "
-            f"{location_of(bad)}; fill or crop them"
-        )
-    return readable(pixels)
-
-
-def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
-    """The mask, read-only; raises InputError unless it has the grid's shape and some material."""
-    if mask is None:
-        return None
-    inside = np.ascontiguousarray(mask, dtype=np.bool_)
-    if inside.shape != grid.shape:
-        raise InputError(
-            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
-            f"{inside.shape}"
-        )
-    if not inside.any():
-        raise InputError(f"expected material in the {what}, got one that is False everywhere")
-    return readable(inside)
-
-
-def location_of(bad: BoolArray) -> str:
-    """How many pixels are bad, and where the first one is."""
-    row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    return f"{int(bad.sum())} px, the first at row {row}, column {col}"
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePair:
-    """What is correlated.
-
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) f and g.
-    mask, deformed_mask
-        (rows, cols) True on material.
-    """
-
-    reference: FloatImage
-    deformed: FloatImage
-    mask: BoolArray
-    deformed_mask: BoolArray

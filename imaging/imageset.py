@@ -24,14 +24,14 @@ with the same key need not be made), and:
 With a distortion of the lens, images and masks are as the lens shows them, and the truth is on the
 ideal grid: what a measurement finds in images that were undistorted.
 
-For the contents of the truth files see :mod:`modeharvest.imaging.render`.
+For the contents of the truth files see :mod:`modeharvest.imaging.pair`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -44,15 +44,9 @@ from modeharvest.imaging.camera import Camera, ImagedState
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, locate
+from modeharvest.imaging.pair import ImagePair, Truth
 from modeharvest.imaging.photographs.files import read_image, read_mask
-from modeharvest.imaging.render import (
-    Truth,
-    read_displacement,
-    read_truth,
-    render_deformed,
-    render_reference,
-    write_truth,
-)
+from modeharvest.imaging.render import render_deformed, render_reference
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import BoolArray, FloatArray
@@ -65,17 +59,17 @@ from modeharvest.util.typed import made
 FORMAT = "modeharvest-images-1"
 
 
-def image_key(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> str:
+def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -> str:
     """Digest everything that the images depend on, hexadecimal.
 
     Parameters
     ----------
     solution
         Mesh and displacements.
-    strains
-        Nominal strains of the snapshots to image [-].
     spec
         How.
+    strains
+        Nominal strains of the snapshots to image [-].
 
     Raises
     ------
@@ -170,6 +164,22 @@ class ImageSet:
         """(rows, cols) True where the deformed image shows material."""
         return read_mask(self._whole(self._snapshot(strain)["mask"]))
 
+    def pair(self, strain: float, *, camera: bool = False) -> ImagePair:
+        """The reference and the deformed image at a nominal strain [-]; ``camera``: as exposed."""
+        return ImagePair(
+            self.reference(camera=camera),
+            self.deformed(strain, camera=camera),
+            self.grid,
+            self.mask(),
+            self.deformed_mask(strain),
+            self.truth(strain),
+            strain,
+        )
+
+    def __iter__(self) -> Iterator[ImagePair]:
+        """The pairs of the set without noise, each read when it is its turn."""
+        return map(self.pair, self.strains)
+
     def noise_sd(self, strain: float | None = None) -> FloatArray:
         """(rows, cols) predicted standard deviation of a camera image [fraction of full scale].
 
@@ -179,8 +189,9 @@ class ImageSet:
         return np.sqrt(self.spec.sensor.noise_variance(mean, self.spec.bits))
 
     def truth(self, strain: float) -> Truth:
-        """Read the truth behind the deformed image at a nominal strain [-]."""
-        return read_truth(self._whole(self._snapshot(strain)["truth"]))
+        """The truth behind the deformed image at a nominal strain [-]; read when asked for."""
+        name = self._snapshot(strain)["truth"]
+        return Truth(lambda part: Truth.read(self._whole(name)).part(part))
 
     @property
     def digests(self) -> dict[str, str]:
@@ -195,10 +206,6 @@ class ImageSet:
     def is_whole(self) -> bool:
         """Whether every file is what was written, by its SHA-256."""
         return all(sha256_of(self.folder / name) == s for name, s in self.digests.items())
-
-    def displacement(self, strain: float) -> FloatArray:
-        """(rows, cols, 2) true displacement [mm] at the reference image's pixels, NaN off it."""
-        return read_displacement(self._whole(self._snapshot(strain)["truth"]))
 
     def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
         image = read_image(self._whole(entry["camera_image" if camera else "image"]))
@@ -239,9 +246,9 @@ def is_complete(folder: Path | str, key: str) -> bool:
 
 def make_images(
     solution: Solution,
-    strains: Sequence[float],
     spec: ImagingSpec,
     folder: Path | str,
+    strains: Sequence[float] | None = None,
     progress: Progress = silent,
 ) -> ImageSet:
     """Make (or find finished) the images and the truth of some snapshots.
@@ -250,13 +257,13 @@ def make_images(
     ----------
     solution
         Mesh and displacements.
-    strains
-        Nominal strains of the snapshots to image [-].
     spec
         How.
     folder
-        Where to write; made if it doesn't exist. A whole set of the same solution, strains, spec
+        Where to write; made if it doesn't exist. A whole set of the same solution, spec, strains
         and code is left as it is; any other set there is replaced.
+    strains
+        Nominal strains of the snapshots to image [-]; by default those of all.
     progress
         Listener.
 
@@ -267,10 +274,12 @@ def make_images(
         file name, or the disk refuses.
     """
     folder = Path(folder)
+    if strains is None:
+        strains = tuple(dict.fromkeys(s.nominal_strain for s in solution.snapshots))
     labels = {_label(s) for s in strains}
     if not labels or len(labels) < len(strains):
         raise InputError(f"expected strains that differ by 0.01 % or more, got {list(strains)}")
-    key = image_key(solution, strains, spec)
+    key = image_key(solution, spec, strains)
     if is_complete(folder, key):
         return ImageSet.read(folder)
     _discard(folder)
@@ -335,7 +344,7 @@ def _write_snapshot(
     )  # fmt: skip
     name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
     images = camera.expose(ideal, scene, name, f"{name}_mask.tif")
-    write_truth(camera.folder / truth_name, truth, strain, scene.grid)
+    truth.write(camera.folder / truth_name, strain, scene.grid)
     return {
         "nominal_strain": float(strain),
         **images,

@@ -49,9 +49,9 @@ class ImagingSpec:
         Where there is one, pixels show points, in the images and in their masks as the lens
         distorts them; the truth stays on the ideal grid, that of the images once undistorted.
     affine_distortion
-        False takes the distortion's affine part away (see :func:`without_affine
-        <modeharvest.imaging.distortion.undistort.without_affine>`): it is no more than another pixel size,
-        and can't be told from the images of a target whose shifts are unknown.
+        False takes the distortion's affine part away
+        (:func:`modeharvest.imaging.distortion.undistort.without_affine`): it is no more than
+        another pixel size, unobservable in images of a target whose shifts are unknown.
 
     Raises
     ------

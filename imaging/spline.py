@@ -29,8 +29,8 @@ from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, PPoly
 
-from modeharvest.imaging.compiled import compiled, readable
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.compiled import compiled, readable
 from modeharvest.util.errors import InputError
 
 

@@ -42,7 +42,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
     """The paper's specimen before and after buckling, at a quarter of the paper's resolution."""
     solution = Solution.read(shipped_solution("paper-virtual"))
     folder: Path = tmp_path_factory.mktemp("images")
-    return make_images(solution, [0.078, 0.128], ImagingSpec(pixel_size=PIXEL), folder)
+    return make_images(solution, ImagingSpec(pixel_size=PIXEL), folder, [0.078, 0.128])
 
 
 def start_of(images: ImageSet, strain: float, **more: object) -> InitialGuess:

@@ -443,7 +443,7 @@ def refused(self):  # as where neither the package's folder nor the home can be 
 
 caching._CacheLocator.ensure_cache_path = refused
 with compilation_announced(Console(width=500)):
-    from modeharvest.imaging.compiled import compiled
+    from modeharvest.util.compiled import compiled
     kernel = compiled()(lambda x: x + 1)
     assert kernel(1) == 2
 """

@@ -50,9 +50,9 @@ from modeharvest.imaging.distortion.files import read_distortion, write_distorti
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
-from modeharvest.imaging.render import read_truth
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import read_case
 from modeharvest.runs.lattice.case import read_lattice_case
@@ -128,6 +128,11 @@ def _own(folder: Path) -> dict[str, Subject]:
     }
 
 
+def _whole_truth(path: Path) -> object:
+    names = "displacement", "reference_point", "deformed_displacement", "element", "residual_px"
+    return [getattr(Truth.read(path), name) for name in names]
+
+
 def _sets(folder: Path) -> dict[str, Subject]:
     _, truth = made.make(folder)
     star = make_star_set(
@@ -143,7 +148,8 @@ def _sets(folder: Path) -> dict[str, Subject]:
     def images(path: Path) -> object:
         read = ImageSet.read(_beside(path, truth / "images"))
         strain = read.strains[0]
-        return read.reference(camera=True), read.mask(), read.deformed(strain), read.truth(strain)
+        known = read.truth(strain).displacement
+        return read.reference(camera=True), read.mask(), read.deformed(strain), known
 
     def benchmark(path: Path) -> object:
         known = BenchmarkTruth.read(_beside(path, truth))
@@ -151,7 +157,7 @@ def _sets(folder: Path) -> dict[str, Subject]:
 
     return {
         "images": Subject(truth / "images" / "images.json", images),
-        "truth": Subject(next((truth / "images").glob("truth_*.h5")), read_truth),
+        "truth": Subject(next((truth / "images").glob("truth_*.h5")), _whole_truth),
         "benchmark": Subject(truth / "benchmark.json", benchmark),
         "prepared": Subject(folder / "prepared.json", lambda p: PreparedPhotographs.read(p.parent)),
         "star": Subject(star.folder / "star.json", lambda p: StarSet.read(p.parent)),

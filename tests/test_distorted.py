@@ -128,8 +128,8 @@ SPEC = ImagingSpec(pixel_size=H, margin_px=20, background=BACKGROUND, bits=16)
 def sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[ImageSet, ImageSet]:
     """The same test through a perfect lens, and through one that distorts."""
     folder = tmp_path_factory.mktemp("sets")
-    plain = make_images(bent(), [0.1], SPEC, folder / "plain")
-    return plain, make_images(bent(), [0.1], replace(SPEC, distortion=LENS), folder / "lens")
+    plain = make_images(bent(), SPEC, folder / "plain", [0.1])
+    return plain, make_images(bent(), replace(SPEC, distortion=LENS), folder / "lens", [0.1])
 
 
 def test_truth_stays_on_the_ideal_grid(sets: tuple[ImageSet, ImageSet]) -> None:
@@ -165,22 +165,22 @@ def _eroded(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 def test_sidecar_and_key_know_the_lens(sets: tuple[ImageSet, ImageSet], tmp_path: Path) -> None:
     through = sets[1]
     assert ImageSet.read(through.folder).spec == replace(SPEC, distortion=LENS)
-    keys = {image_key(bent(), [0.1], SPEC), through.info["key"]}
+    keys = {image_key(bent(), SPEC, [0.1]), through.info["key"]}
     file = tmp_path / "lens.json"
     spec = replace(SPEC, distortion=str(file))
     for lens in (LENS, replace(LENS, k1=-0.1)):
         write_distortion(file, lens)
-        keys.add(image_key(bent(), [0.1], spec))
+        keys.add(image_key(bent(), spec, [0.1]))
         assert spec.lens(GRID.shape) == lens
     assert len(keys) == 4
     file.unlink()
     with pytest.raises(InputError, match=r"lens\.json"):
-        image_key(bent(), [0.1], spec)
+        image_key(bent(), spec, [0.1])
 
 
 def test_two_layers_are_read_back(tmp_path: Path) -> None:
     painted = replace(SPEC, speckle=SpeckleSpec(ink=Ink(seed=3)))
-    made = make_images(bent(), [0.1], painted, tmp_path)
+    made = make_images(bent(), painted, tmp_path, [0.1])
     assert ImageSet.read(tmp_path).spec == painted
     content = json.loads((tmp_path / "images.json").read_text())
     del content["spec"]["speckle"]["ink"], content["spec"]["distortion"]  # as of an older version
@@ -199,8 +199,8 @@ def test_pixels_that_average_are_refused(changes: dict[str, object]) -> None:
 
 def test_light_flickers_from_image_to_image_and_evenly_over_each(tmp_path: Path) -> None:
     spec = replace(SPEC, sensor=Sensor(flicker=0.05, flicker_seed=2))
-    made = make_images(bent(), [0.1], spec, tmp_path / "flickering")
-    steady = make_images(bent(), [0.1], SPEC, tmp_path / "steady")
+    made = make_images(bent(), spec, tmp_path / "flickering", [0.1])
+    steady = make_images(bent(), SPEC, tmp_path / "steady", [0.1])
     lights = [made.info["reference"]["light"], made.info["snapshots"][0]["light"]]
     assert lights[0] != lights[1]
     assert all(0.8 < light < 1.2 for light in lights)

@@ -83,7 +83,7 @@ def write_photographs(folder: Path) -> None:
     path = shipped_solution("paper-virtual")
     assert path is not None
     spec = ImagingSpec(pixel_size=0.05, background=0.1, sensor=Sensor(read_noise=0.01))
-    made = make_images(Solution.read(path), (0.128,), spec, folder / "made")
+    made = make_images(Solution.read(path), spec, folder / "made", (0.128,))
     shutil.copy(made.folder / "reference_8bit.tif", folder / "reference.tif")
     shutil.copy(made.folder / "deformed_1280_8bit.tif", folder / "frame_1.tif")
     (folder / "test.toml").write_text(HARVEST, "utf-8")

@@ -47,7 +47,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
     assert path is not None
     spec = ImagingSpec(pixel_size=PIXEL, background=0.1, sensor=Sensor(read_noise=NOISE))
     folder = tmp_path_factory.mktemp("images")
-    return make_images(Solution.read(path), (0.078, 0.128), spec, folder)
+    return make_images(Solution.read(path), spec, folder, (0.078, 0.128))
 
 
 @pytest.fixture(scope="module")

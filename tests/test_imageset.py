@@ -13,7 +13,7 @@ import tifffile
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.imaging import imageset as set_key
 from modeharvest.imaging.imageset import ImageSet, image_key, is_complete, make_images
-from modeharvest.imaging.render import read_truth
+from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
@@ -34,7 +34,7 @@ def plate() -> Solution:
 
 @pytest.fixture
 def made(tmp_path: Path) -> ImageSet:
-    return make_images(plate(), STRAINS, SPEC, tmp_path / "set")
+    return make_images(plate(), SPEC, tmp_path / "set", STRAINS)
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -69,7 +69,7 @@ def test_reads_back(made: ImageSet) -> None:
 
 @pytest.mark.parametrize("bits", [4, 8, 12, 16])
 def test_camera_images_differ_by_half_a_level(tmp_path: Path, bits: int) -> None:
-    made = make_images(plate(), STRAINS[:1], replace(SPEC, bits=bits), tmp_path)
+    made = make_images(plate(), replace(SPEC, bits=bits), tmp_path, STRAINS[:1])
     assert (tmp_path / f"reference_{bits}bit.tif").is_file()
     off = made.reference(camera=True) - made.reference()
     assert np.abs(off).max() <= 0.5 / (2**bits - 1) + 1e-6  # and float32 rounding
@@ -95,12 +95,12 @@ def test_truth_states_units_and_precision(made: ImageSet) -> None:
 
 def test_again_does_nothing(made: ImageSet) -> None:
     before = stamps(made.folder)
-    make_images(plate(), STRAINS, SPEC, made.folder)
+    make_images(plate(), SPEC, made.folder, STRAINS)
     assert stamps(made.folder) == before
 
 
 def test_same_input_same_bits(made: ImageSet, tmp_path: Path) -> None:
-    other = make_images(plate(), STRAINS, SPEC, tmp_path / "other")
+    other = make_images(plate(), SPEC, tmp_path / "other", STRAINS)
     assert other.info["files"] == made.info["files"]
 
 
@@ -116,27 +116,27 @@ def test_another_set_replaces_it_without_leftovers(
     made: ImageSet, strains: tuple[float, ...], spec: ImagingSpec
 ) -> None:
     (made.folder / "notes.txt").write_text("the user's own")
-    again = make_images(plate(), strains, spec, made.folder)
+    again = make_images(plate(), spec, made.folder, strains)
     listed = {*again.info["files"], "images.json", "notes.txt"}
     assert {p.name for p in made.folder.iterdir()} == listed
-    assert is_complete(made.folder, image_key(plate(), strains, spec))
-    assert not is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
+    assert is_complete(made.folder, image_key(plate(), spec, strains))
+    assert not is_complete(made.folder, image_key(plate(), SPEC, STRAINS))
 
 
 def test_key_depends_on_the_displacement() -> None:
     one, other = plate(), plate()
     other.snapshots[1].displacement[3, 1] += 1e-15
-    assert image_key(one, STRAINS, SPEC) != image_key(other, STRAINS, SPEC)
-    assert image_key(one, STRAINS[:1], SPEC) == image_key(other, STRAINS[:1], SPEC)
+    assert image_key(one, SPEC, STRAINS) != image_key(other, SPEC, STRAINS)
+    assert image_key(one, SPEC, STRAINS[:1]) == image_key(other, SPEC, STRAINS[:1])
 
 
 def test_key_depends_on_the_sensor_and_on_the_code_that_makes_pixels(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    keys = {image_key(plate(), STRAINS, SPEC)}
-    keys.add(image_key(plate(), STRAINS, replace(SPEC, sensor=Sensor(read_noise=0.01))))
+    keys = {image_key(plate(), SPEC, STRAINS)}
+    keys.add(image_key(plate(), replace(SPEC, sensor=Sensor(read_noise=0.01)), STRAINS))
     monkeypatch.setattr(set_key, "source_digest", lambda *folders: "of other code")
-    keys.add(image_key(plate(), STRAINS, SPEC))
+    keys.add(image_key(plate(), SPEC, STRAINS))
     assert len(keys) == 3
 
 
@@ -152,9 +152,9 @@ NOISY = replace(SPEC, bits=12, sensor=Sensor(gain=0.9, offset=0.02, full_well=1e
 
 
 def test_a_sensor_is_told_of_and_its_noise_is_the_predicted_one(tmp_path: Path) -> None:
-    made = make_images(plate(), STRAINS, NOISY, tmp_path / "noisy")
+    made = make_images(plate(), NOISY, tmp_path / "noisy", STRAINS)
     assert ImageSet.read(made.folder).spec == NOISY
-    clean = make_images(plate(), STRAINS, SPEC, tmp_path / "clean")
+    clean = make_images(plate(), SPEC, tmp_path / "clean", STRAINS)
     for strain in (None, *STRAINS):
         if strain is None:
             pair, mask = [made.reference(camera=c) for c in (False, True)], made.mask()
@@ -176,8 +176,8 @@ def test_a_sensor_is_told_of_and_its_noise_is_the_predicted_one(tmp_path: Path) 
 
 
 def test_noise_is_an_image_s_own_and_does_not_depend_on_the_others(tmp_path: Path) -> None:
-    both = make_images(plate(), STRAINS, NOISY, tmp_path / "both")
-    alone = make_images(plate(), STRAINS[1:], NOISY, tmp_path / "alone")
+    both = make_images(plate(), NOISY, tmp_path / "both", STRAINS)
+    alone = make_images(plate(), NOISY, tmp_path / "alone", STRAINS[1:])
     name = "deformed_1280_12bit.tif"
     assert both.info["files"][name] == alone.info["files"][name]
     noise = [both.reference(camera=True) - both.reference()]
@@ -189,8 +189,8 @@ def test_noise_is_an_image_s_own_and_does_not_depend_on_the_others(tmp_path: Pat
 
 def test_averaging_pixels_tell_how_they_were_averaged(tmp_path: Path) -> None:
     spec = replace(SPEC, sensor=Sensor(fill_factor=1.0))
-    made = make_images(plate(), STRAINS[:1], spec, tmp_path / "areas")
-    plain = make_images(plate(), STRAINS[:1], SPEC, tmp_path / "points")
+    made = make_images(plate(), spec, tmp_path / "areas", STRAINS[:1])
+    plain = make_images(plate(), SPEC, tmp_path / "points", STRAINS[:1])
     assert made.info["reference"]["quadrature"]["points"] == 0
     deformed = made.info["snapshots"][0]["quadrature"]
     assert deformed["points"] == 9
@@ -209,7 +209,7 @@ def test_a_specimen_that_overlaps_is_told_of(made: ImageSet, tmp_path: Path) -> 
     apart = Mesh(solution.mesh.nodes[[0, 1, 4, 3, 1, 2, 5, 4]], np.arange(8).reshape(2, 4), "Q4")
     slid = np.repeat([[0.2, 0.0], [0.0, 0.0]], 4, axis=0)  # the left half by 4 px to the right
     moved = Solution(apart, (Snapshot(0.1, slid),), {})
-    overlapping = make_images(moved, (0.1,), SPEC, tmp_path / "overlap")
+    overlapping = make_images(moved, SPEC, tmp_path / "overlap", (0.1,))
     # Strictly inside both: 3 columns; of 21 rows, 2 lie on the outline.
     assert overlapping.info["snapshots"][0]["doubly_covered_px"] == 3 * 19
     assert overlapping.info["reference"]["doubly_covered_px"] == 0
@@ -224,11 +224,11 @@ def test_interrupted_set_is_not_taken_for_finished(tmp_path: Path, at: int) -> N
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_images(plate(), STRAINS, SPEC, tmp_path, interrupt)
-    assert not is_complete(tmp_path, image_key(plate(), STRAINS, SPEC))
+        make_images(plate(), SPEC, tmp_path, STRAINS, interrupt)
+    assert not is_complete(tmp_path, image_key(plate(), SPEC, STRAINS))
     with pytest.raises(InputError, match="expected a finished image set"):
         ImageSet.read(tmp_path)
-    assert make_images(plate(), STRAINS, SPEC, tmp_path).strains == STRAINS
+    assert make_images(plate(), SPEC, tmp_path, STRAINS).strains == STRAINS
 
 
 def test_interrupted_replacement_does_not_pass_for_the_old_set(made: ImageSet) -> None:
@@ -236,13 +236,13 @@ def test_interrupted_replacement_does_not_pass_for_the_old_set(made: ImageSet) -
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_images(plate(), STRAINS, replace(SPEC, bits=12), made.folder, interrupt)
-    assert not is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
+        make_images(plate(), replace(SPEC, bits=12), made.folder, STRAINS, interrupt)
+    assert not is_complete(made.folder, image_key(plate(), SPEC, STRAINS))
 
 
 @pytest.mark.parametrize("name", ["truth_1280.h5", "reference.tif", "mask.tif"])
 def test_damage_is_noticed_and_repaired(made: ImageSet, name: str) -> None:
-    key = image_key(plate(), STRAINS, SPEC)
+    key = image_key(plate(), SPEC, STRAINS)
     path = made.folder / name
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
@@ -251,7 +251,7 @@ def test_damage_is_noticed_and_repaired(made: ImageSet, name: str) -> None:
     assert not is_complete(made.folder, key)
     path.unlink()
     assert not is_complete(made.folder, key)
-    make_images(plate(), STRAINS, SPEC, made.folder)
+    make_images(plate(), SPEC, made.folder, STRAINS)
     assert path.read_bytes() == whole
 
 
@@ -262,7 +262,7 @@ def test_an_image_that_is_not_what_was_written_is_not_read(made: ImageSet) -> No
         "mask.tif": made.mask,
         "deformed_0780_8bit.tif": lambda: made.deformed(0.078, camera=True),
         "deformed_1280_mask.tif": lambda: made.deformed_mask(0.128),
-        "truth_0780.h5": lambda: made.truth(0.078),
+        "truth_0780.h5": lambda: made.truth(0.078).displacement,
     }
     others = {"truth_0780.h5": "truth_1280.h5", "deformed_0780_8bit.tif": "reference_8bit.tif"}
     for name, read in readers.items():
@@ -278,13 +278,28 @@ def test_an_image_that_is_not_what_was_written_is_not_read(made: ImageSet) -> No
         assert "\n" not in str(error.value)
 
 
+def test_pairs_come_one_after_the_other(tmp_path: Path) -> None:
+    made = make_images(plate(), SPEC, tmp_path / "set")  # of all snapshots
+    exposed = made.pair(STRAINS[0], camera=True)
+    np.testing.assert_array_equal(exposed.reference, made.reference(camera=True))
+    for strain, pair in zip(STRAINS, made, strict=True):
+        assert pair.strain == strain
+        assert pair.grid == made.grid
+        assert pair.truth is not None
+        np.testing.assert_array_equal(pair.deformed, made.deformed(strain))
+        np.testing.assert_array_equal(pair.deformed_mask, made.deformed_mask(strain))
+        (made.folder / f"truth_{round(1e4 * strain):04d}.h5").unlink()
+        with pytest.raises(InputError, match="truth"):  # it is read when asked for
+            _ = pair.truth.displacement
+
+
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
 def test_truth_cut_short(made: ImageSet, kept: float) -> None:
     path = made.folder / "truth_0780.h5"
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(InputError, match="expected a truth file") as error:
-        read_truth(path)
+        _ = Truth.read(path).displacement
     assert "\n" not in str(error.value)
 
 
@@ -302,11 +317,11 @@ def test_asks_for_what_is_there(made: ImageSet) -> None:
     with pytest.raises(InputError, match=r"have: 0\.0780, 0\.1280"):
         made.deformed(0.1)
     with pytest.raises(InputError, match=r"expected a snapshot at strain 0\.2"):
-        make_images(plate(), (0.2,), SPEC, made.folder)
+        make_images(plate(), SPEC, made.folder, (0.2,))
     for clash in ((), (0.078, 0.078)):
         with pytest.raises(InputError, match=r"differ by 0\.01 %"):
-            make_images(plate(), clash, SPEC, made.folder)
-    assert is_complete(made.folder, image_key(plate(), STRAINS, SPEC))
+            make_images(plate(), SPEC, made.folder, clash)
+    assert is_complete(made.folder, image_key(plate(), SPEC, STRAINS))
 
 
 def test_grid_is_centred_and_holds_every_state_with_its_margin() -> None:

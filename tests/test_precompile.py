@@ -15,19 +15,19 @@ from typing import Any
 
 import pytest
 
-from modeharvest.imaging import compiled
 from modeharvest.runs import precompile
 from modeharvest.runs.precompile import precompiling
+from modeharvest.util import compiled
 
 CALLEE = """
-from modeharvest.imaging.compiled import compiled
+from modeharvest.util.compiled import compiled
 
 @compiled()
 def callee(x: float) -> float:
     return {factor} * x
 """
 CALLER = """
-from modeharvest.imaging.compiled import compiled
+from modeharvest.util.compiled import compiled
 from modeharvest.imaging.callee_of_test import callee
 
 @compiled()
@@ -96,7 +96,7 @@ def children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Child]:
 
     monkeypatch.setattr(subprocess, "Popen", start)
     monkeypatch.setattr(precompile.os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(precompile, "kept_in", lambda kernel: tmp_path / kernel.__name__)
+    monkeypatch.setattr(precompile, "cached_in", lambda kernel: tmp_path / kernel.__name__)
     there = precompile._PARTS["correlate"].stamp
     assert there is not None
     there.parent.mkdir()
@@ -123,7 +123,7 @@ def test_ranks_of_mpirun_start_no_children(
 def test_kernels_that_are_not_kept_are_not_compiled_ahead(
     children: list[Child], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(precompile, "kept_in", lambda kernel: None)
+    monkeypatch.setattr(precompile, "cached_in", lambda kernel: None)
     with precompiling(("image", "correlate")):
         pass
     assert not children

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.render import (
     Rendering,
-    Truth,
     render_deformed,
     render_image,
     render_reference,

@@ -153,7 +153,7 @@ def compare(
         Listener.
     """
     grid, mask, ansatz = images.grid, images.mask(), result.ansatz
-    truth = images.displacement(strain)
+    truth = images.truth(strain).displacement
     best = best_fit(truth, grid, ansatz, (result.unknowns, start), mask, progress)
     left = residual(
         Assembly(ansatz, grid, mask),

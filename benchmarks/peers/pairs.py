@@ -139,7 +139,7 @@ def paper(shape: tuple[int, int] | None, pixel_size: float) -> ImagePair:
     spec = replace(case.imaging, shape=shape, pixel_size=pixel_size)
     ansatz = case.correlation.ansatz(specimen)
     with tempfile.TemporaryDirectory() as folder:
-        images = make_images(solution, (STRAIN,), spec, folder)
+        images = make_images(solution, spec, folder, (STRAIN,))
         return ImagePair(
             images.grid,
             255.0 * images.reference(),

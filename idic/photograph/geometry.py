@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.idic.photograph.matching import (
     BlockMatch,
@@ -28,6 +28,7 @@ from modeharvest.idic.photograph.region import (
 )
 from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError

@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, square_family
-from modeharvest.idic.pair import checked_mask
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_modes import (
     SAME_WAVE,
@@ -46,6 +45,7 @@ from modeharvest.idic.slow_fields import Box, Brightness
 from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import checked_mask
 from modeharvest.util.arrays import FloatArray
 
 _Placed = tuple[InitialMode, Box]

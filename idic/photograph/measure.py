@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry, confirmed_by_speckle, matched_holes
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
@@ -47,6 +47,7 @@ from modeharvest.idic.uncertainty.covariance import (
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.idic.uncertainty.noise import GIVEN, ImageNoise, estimated_noise
 from modeharvest.idic.uncertainty.residual_test import ResidualTest, autocorrelation, lags_for
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -132,7 +133,10 @@ _EXAMPLES = 4
 
 
 def prepared_pair(prepared: PreparedPhotographs, name: str) -> ImagePair:
-    return ImagePair(prepared.image(), prepared.image(name), prepared.mask(), prepared.mask(name))
+    """The reference and a deformed photograph."""
+    return ImagePair(
+        prepared.image(), prepared.image(name), prepared.grid, prepared.mask(), prepared.mask(name)
+    )
 
 
 def residual_test(

@@ -28,10 +28,10 @@ from modeharvest.idic.solver.passes import (
     warp_pass,
 )
 from modeharvest.idic.solver.pixel_blocks import Target
-from modeharvest.imaging.compiled import readable, side_by_side
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.compiled import in_parallel, readable
 from modeharvest.util.errors import InputError
 
 BANDS = 64
@@ -221,7 +221,7 @@ class Assembly:
         moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
-        side_by_side(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
+        in_parallel(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
         off = int(left.sum())
         return self._from_moments(pairs, moments.sum(axis=0), self.pixels - off, off)
 
@@ -327,7 +327,7 @@ def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32])
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
     nothing = np.zeros((0, 0), dtype=np.bool_)
     _run(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), nothing, nothing, u)
-    side_by_side(push_forward_rows, u, slopes, assembly.grid.pixel_size)
+    in_parallel(push_forward_rows, u, slopes, assembly.grid.pixel_size)
 
 
 def _fill(
@@ -355,7 +355,7 @@ def _run(
     tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
-    side_by_side(
+    in_parallel(
         warp_pass, target, assembly.runs, tables, degree, readable(allowed), kept, left, outside
     )
     return int(outside.sum())

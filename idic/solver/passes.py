@@ -41,9 +41,9 @@ from modeharvest.idic.solver.pixel_blocks import (
     start_row,
     take_block,
 )
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.compiled import compiled
 
 
 @compiled(relaxed=True)

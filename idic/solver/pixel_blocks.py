@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled, readable
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage, sample_points
+from modeharvest.util.compiled import compiled, readable
 
 BLOCK = 256
 """Pixels gathered at a time."""

@@ -15,10 +15,10 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled, readable
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage, border_reach
 from modeharvest.util.arrays import BoolArray
+from modeharvest.util.compiled import compiled, readable
 from modeharvest.util.errors import InputError
 
 Float32Image = NDArray[np.float32]

@@ -19,7 +19,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
+from modeharvest.util.compiled import compiled
 from modeharvest.util.errors import InputError
 
 

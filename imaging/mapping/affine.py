@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.mapping.element_table import (
     CLEAR_OF_EDGES,
     EDGE,
@@ -29,6 +28,7 @@ from modeharvest.imaging.mapping.inversion import (
     value,
 )
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.compiled import compiled
 
 _MARGIN_PX = 1e-3  # the bounds are found much more closely, and checked
 _FAR_PX = 1e9

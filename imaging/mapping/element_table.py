@@ -8,7 +8,6 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import (
     bezier_matrix,
@@ -19,6 +18,7 @@ from modeharvest.imaging.mapping.elements import (
     to_bernstein,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 
 BEYOND = (0.25, 0.1, 0.03)
 """How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""

@@ -24,8 +24,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import ArrayLike
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 from modeharvest.util.errors import InputError
 
 EXPONENTS = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [2, 1], [1, 2], [2, 2]])

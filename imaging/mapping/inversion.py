@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.compiled import compiled
 
 Coefficients = tuple[float, ...]
 

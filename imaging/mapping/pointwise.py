@@ -14,7 +14,6 @@ import numpy as np
 from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import (
     bezier_matrix,
@@ -34,6 +33,7 @@ from modeharvest.imaging.mapping.inversion import (
 )
 from modeharvest.imaging.mapping.isoparametric import Located
 from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 
 _BUCKET_PX = 16
 _BLOCK = 1024  # points that one thread takes at a time

@@ -17,7 +17,6 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.mapping.affine import fill_affine
 from modeharvest.imaging.mapping.element_table import (
     CLEAR_OF_EDGES,
@@ -42,6 +41,7 @@ from modeharvest.imaging.mapping.inversion import (
     value,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 
 BAND = 32  # rows
 _BATCH = 1024  # pixels that are inverted together; their work fits into the fastest cache

@@ -11,7 +11,6 @@ from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.compiled import compiled
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.element_table import ElementTable, Pixels, bands, tabulate_elements
 from modeharvest.imaging.mapping.elements import polynomials, require_positive_jacobian
@@ -25,6 +24,7 @@ from modeharvest.imaging.speckle.periodic_spline import (
     workspace,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 
 _BAND = 16  # rows
 

@@ -28,8 +28,8 @@ from numba import prange
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, PPoly
 
-from modeharvest.imaging.compiled import compiled
 from modeharvest.util.arrays import ComplexArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 
 DEGREE = 7
 _TAPS = DEGREE + 1

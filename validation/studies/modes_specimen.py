@@ -200,7 +200,7 @@ class SpecimenSpec:
             divisions=divisions,
             imaging=subject.imaging,
             correlation=subject.correlation,
-            given=image_key(subject.solution, (strain,), subject.imaging)[:16],
+            given=image_key(subject.solution, subject.imaging, (strain,))[:16],
         )
 
     @property

@@ -104,7 +104,7 @@ class ImagePairSpec:
             )
         spec = imaging or self.imaging
         description = {
-            "images": image_key(self.solution, (strain,), spec)[:16],
+            "images": image_key(self.solution, spec, (strain,))[:16],
             "strain": strain,
             "imaging": _SPEC.dump_python(spec, mode="json"),
             "specimen": vars(self.experiment.specimen),
@@ -219,12 +219,12 @@ def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> I
         pass
     solution, strain = Solution.read(folder / "solution.h5"), float(described["strain"])
     spec = _SPEC.validate_python(described["imaging"])
-    if image_key(solution, (strain,), spec)[:16] != described["images"]:
+    if image_key(solution, spec, (strain,))[:16] != described["images"]:
         raise InputError(
             f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
             "take another folder for another experiment"
         )
-    return make_images(solution, (strain,), spec, own, progress)
+    return make_images(solution, spec, own, (strain,), progress)
 
 
 @lru_cache(maxsize=1)

@@ -84,7 +84,7 @@ def compilation_announced(console: Console) -> Iterator[None]:
     """Say once, in one line, when a kernel has to be compiled because none is in the cache yet."""
     from numba.core import event  # here: --help needn't wait for it
 
-    from modeharvest.imaging.compiled import are_kept
+    from modeharvest.util.compiled import is_cached
 
     class Notice(event.Listener):
         told = False
@@ -92,7 +92,7 @@ def compilation_announced(console: Console) -> Iterator[None]:
         def on_start(self, event: Any) -> None:
             if not self.told:
                 self.told = True
-                kept = "once; they are kept on disk" if are_kept() else _NOT_KEPT
+                kept = "once; they are kept on disk" if is_cached() else _NOT_KEPT
                 console.print(f"compiling kernels for this machine: some seconds, {kept}")
 
         def on_end(self, event: Any) -> None:

@@ -168,9 +168,9 @@ class Run:
         """
         solution, folder = self._solution(), self.folder / "images"
         strains, spec = self._strains(solution), self.case.imaging
-        key = image_key(solution, strains, spec)
+        key = image_key(solution, spec, strains)
         self.stages.do(
-            "image", key, lambda: make_images(solution, strains, spec, folder, self.progress).files
+            "image", key, lambda: make_images(solution, spec, folder, strains, self.progress).files
         )
         return ImageSet.read(folder)
 

@@ -21,11 +21,11 @@ import numpy as np
 from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.solver.passes import accumulate
-from modeharvest.imaging.compiled import kept_in, sources
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.mapping.rasterise import rasterise
 from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.util.compiled import cached_in, sources
 from modeharvest.util.machine import is_alone
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.truth import best_fit
@@ -39,7 +39,7 @@ def _images() -> None:
     assert solution is not None
     spec = replace(case.imaging, pixel_size=0.1)
     with tempfile.TemporaryDirectory() as folder:
-        make_images(Solution.read(solution), case.experiment.strains[-1:], spec, folder)
+        make_images(Solution.read(solution), spec, folder, case.experiment.strains[-1:])
 
 
 def _correlation() -> None:
@@ -67,7 +67,7 @@ class _Part:
     @property
     def stamp(self) -> Path | None:
         """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
-        folder = kept_in(self.beside)
+        folder = cached_in(self.beside)
         return None if folder is None else folder / f"precompiled-{sources()}.nbi"
 
 

@@ -30,8 +30,12 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate, fit_displacement
-from modeharvest.idic.pair import ImagePair
-from modeharvest.idic.photograph.measure import MeasuredPhotograph, covariances, noise_of
+from modeharvest.idic.photograph.measure import (
+    MeasuredPhotograph,
+    covariances,
+    noise_of,
+    prepared_pair,
+)
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.final_smoothing import blurred_pair
@@ -43,6 +47,7 @@ from modeharvest.imaging.distortion.target import photograph_target
 from modeharvest.imaging.distortion.undistort import seen_points, undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.runs.case import TwinCase
 from modeharvest.runs.experiment import Run
@@ -128,11 +133,11 @@ def make_twin(
     if spec.distortion is None:
         raise InputError("twin: expected an [imaging.distortion] to calibrate, got none")
     truth, photographs = twin.folder / "truth", twin.experiment.parent
-    key = stage_key([image_key(solution, strains, spec), plain(case.calibration), case.title])
+    key = stage_key([image_key(solution, spec, strains), plain(case.calibration), case.title])
 
     def work() -> list[Path]:
         solution.write(truth / "solution.h5")
-        images = make_images(solution, strains, spec, truth / "images", progress)
+        images = make_images(solution, spec, truth / "images", strains, progress)
         taken = _copy_photographs(images, photographs)
         lens = spec.lens(images.grid.shape)
         assert lens is not None
@@ -438,7 +443,7 @@ def _scene(folder: Path, name: str) -> _Scene:
     experiment = read_photograph_case(twin.experiment)
     harvesting = HarvestRun(experiment, twin.experiment.parent, folder / "harvest")
     prepared, measured = harvesting.prepared(), harvesting.results()[name]
-    pair = ImagePair(prepared.image(), prepared.image(name), prepared.mask(), prepared.mask(name))
+    pair = prepared_pair(prepared, name)
     box = harvesting.geometry.region.cellular
     x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)
     y = np.linspace(box.y_min, box.y_max, _POINTS, dtype=np.float64)

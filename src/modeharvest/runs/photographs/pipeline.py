@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest.idic.local.field import LocalField, read_field, write_field
-from modeharvest.idic.pair import ImagePair, PreparedPhotographs
+from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, pulled_back
 from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.report.photographs import write_harvest_report
 from modeharvest.runs.photographs.case import PhotographCase, read_photograph_case
 from modeharvest.runs.photographs.prepare import (
@@ -228,7 +229,7 @@ class HarvestRun:
             result = found[before].result
             reference, seen = pulled_back(prepared.image(before), result, result.order)
             mask = mask & seen
-        return ImagePair(reference, prepared.image(name), mask, prepared.mask(name))
+        return ImagePair(reference, prepared.image(name), prepared.grid, mask, prepared.mask(name))
 
     def _read(self, name: str) -> MeasuredPhotograph:
         result, field, _ = self._paths(name)

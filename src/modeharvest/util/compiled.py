@@ -96,19 +96,20 @@ def _digest(*paths: Path) -> str:
 
 def sources() -> str:
     """A short text that differs for other kernels, another numba, or another processor."""
-    files = [path for folder in ("imaging", "idic") for path in (_PACKAGE / folder).rglob("*.py")]
+    folders = [_PACKAGE / name for name in ("util", "imaging", "idic")]
+    files = [path for folder in folders for path in folder.rglob("*.py")]
     host = numba.__version__, llvmlite.binding.get_host_cpu_name(), sys.version
     text = _digest(*sorted(filter(_has_kernels, files))), *host
     return hashlib.sha256("".join(text).encode()).hexdigest()[:16]
 
 
-def kept_in(kernel: Callable[..., object]) -> Path | None:
+def cached_in(kernel: Callable[..., object]) -> Path | None:
     """The folder that a kernel is kept in; None if it is not."""
     stats = getattr(kernel, "stats", None)
     return Path(stats.cache_path) if stats is not None and stats.cache_path else None
 
 
-def are_kept() -> bool:
+def is_cached() -> bool:
     """Whether compiled kernels are found again by the next process."""
     return _kept
 
@@ -124,7 +125,7 @@ def readable(values: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def side_by_side(kernel: Callable[..., None], *arguments: Any) -> None:
+def in_parallel(kernel: Callable[..., None], *arguments: Any) -> None:
     """Call ``kernel(*arguments, k, count)``, k = 0 ... count - 1, on as many threads as numba has.
 
     For kernels that share out their work themselves, every count-th part to one thread. Those

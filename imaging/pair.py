@@ -1,0 +1,240 @@
+"""A pair of images to correlate, and the truth behind the deformed one.
+
+A truth file is one HDF5 per deformed image, readable with h5py alone::
+
+    displacement           (2, rows, cols) float64 [mm]  at the reference image's pixels
+    reference_point        (2, rows, cols) float64 [mm]  shown by the deformed image's pixels
+    deformed_displacement  (2, rows, cols) float32 [mm]  at the deformed image's pixels
+    element                (rows, cols)    int32   [-]   at the deformed image's pixels
+    residual_px            (rows, cols)    float32 [px]  of the inverse mapping there
+
+In the file the leading axis holds the components (x, y), so that each is one contiguous image;
+in Python they come last. x right, y up; rows run down the image. NaN (in ``element``: -1) marks
+background. Attributes: nominal_strain and the pixel grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.photographs.files import require_contrast
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.util.compiled import readable
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic_hdf5, open_hdf5
+
+TRUTH_FORMAT = "modeharvest-truth-1"
+_PARTS = {
+    "displacement": ("mm", "displacement (x, y) at the reference image's pixels"),
+    "reference_point": ("mm", "reference point (x, y) shown by the deformed image's pixels"),
+    "deformed_displacement": ("mm", "displacement (x, y) at the deformed image's pixels"),
+    "element": ("-", "element shown by the deformed image's pixels, -1: background"),
+    "residual_px": ("px", "residual of the inverse mapping at the deformed image's pixels"),
+}
+_TYPES = {"element": np.int32, "deformed_displacement": np.float32, "residual_px": np.float32}
+"""Of the parts that aren't float64."""
+_CHUNK_ROWS = 64
+
+
+class HasDisplacement(Protocol):
+    """A measurement: anything that gives a displacement at pixels."""
+
+    def displacement(self, grid: PixelGrid, /) -> FloatArray:
+        """(rows, cols, 2) u [mm] at the pixels of a grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a measurement of one deformed image should find; each part is made when asked for.
+
+    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where
+    there is no material.
+
+    Parameters
+    ----------
+    part
+        Gives a part by its name, the name of its property.
+    """
+
+    part: Callable[[str], NDArray[Any]]
+
+    @classmethod
+    def of(cls, **parts: NDArray[Any]) -> Truth:
+        """A truth in memory, or such parts of it as are known."""
+        return cls(parts.__getitem__)
+
+    @classmethod
+    def read(cls, path: Path | str) -> Truth:
+        """A truth in a file; a part raises InputError if the file is missing or cut short."""
+        return cls(partial(_read_part, path))
+
+    @cached_property
+    def displacement(self) -> FloatArray:
+        """(rows, cols, 2) u at the *reference* image's pixels [mm]."""
+        return self.part("displacement")
+
+    @cached_property
+    def reference_point(self) -> FloatArray:
+        """(rows, cols, 2) X of the material that the *deformed* image's pixels show [mm]."""
+        return self.part("reference_point")
+
+    @cached_property
+    def deformed_displacement(self) -> FloatImage:
+        """(rows, cols, 2) float32 u at the *deformed* image's pixels [mm]."""
+        return self.part("deformed_displacement")
+
+    @cached_property
+    def element(self) -> NDArray[np.int32]:
+        """(rows, cols) int32 element shown by the deformed image's pixels, -1 for background."""
+        return self.part("element")
+
+    @cached_property
+    def residual_px(self) -> FloatImage:
+        """(rows, cols) float32 residual of the inverse mapping in the deformed image [px]."""
+        return self.part("residual_px")
+
+    def write(self, path: Path | str, nominal_strain: float, grid: PixelGrid) -> None:
+        """Write a truth file, whole or not at all."""
+        with atomic_hdf5(path) as file:
+            file.attrs["format"] = TRUTH_FORMAT
+            file.attrs["nominal_strain"] = nominal_strain
+            for name, value in asdict(grid).items():
+                file.attrs[name] = value
+            for name, (unit, meaning) in _PARTS.items():
+                data = self.part(name)
+                data = np.moveaxis(data, -1, 0) if data.ndim == 3 else data
+                chunk = (1,) * (data.ndim - 2) + (min(_CHUNK_ROWS, grid.rows), grid.cols)
+                dataset = file.create_dataset(
+                    name, data=data, chunks=chunk, compression="lzf", shuffle=True
+                )
+                dataset.attrs["unit"] = unit
+                dataset.attrs["meaning"] = meaning
+
+
+def _read_part(path: Path | str, name: str) -> NDArray[Any]:
+    """One of a truth file's arrays, components last."""
+    remedy = "make it again with 'modeharvest image'"
+    with open_hdf5(path, "a truth file (HDF5)", remedy, TRUTH_FORMAT) as file:
+        plane = np.asarray(file[name], dtype=_TYPES.get(name, np.float64))
+        size = file["element"].shape
+        if len(size) != 2 or plane.shape not in (size, (2, *size)):
+            raise InputError(f"expected {name} of (2 x) rows x cols, got {plane.shape}")
+        return np.moveaxis(plane, 0, -1) if plane.ndim == 3 else plane
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """A reference and a deformed image of one size; checked, and read-only.
+
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels f and g; kept as float32.
+    grid
+        Their pixels.
+    mask, deformed_mask
+        (rows, cols) True on material, in f and in g; None for everywhere.
+    truth
+        What a measurement should find, where that is known.
+    strain
+        Nominal strain of the deformed image [-]; NaN where it isn't known.
+
+    Raises
+    ------
+    InputError
+        If sizes differ, a mask is empty, or an image holds NaN or is constant on its material.
+    """
+
+    reference: FloatImage
+    deformed: FloatImage
+    grid: PixelGrid
+    mask: BoolArray | None = None
+    deformed_mask: BoolArray | None = None
+    truth: Truth | None = None
+    strain: float = math.nan
+
+    def __post_init__(self) -> None:
+        for name in ("reference", "deformed"):
+            object.__setattr__(self, name, checked_image(getattr(self, name), name, self.grid))
+        for name in ("mask", "deformed_mask"):
+            mask = checked_mask(getattr(self, name), name.replace("_", " "), self.grid)
+            object.__setattr__(self, name, mask)
+        for grey, what in zip(self.grey, ("reference", "deformed"), strict=True):
+            require_contrast(grey, what)
+
+    @property
+    def grey(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The grey levels of the material, of f and of g."""
+        return grey_levels_in(self.reference, self.mask), grey_levels_in(
+            self.deformed, self.deformed_mask
+        )
+
+    def with_images(self, reference: ArrayLike, deformed: ArrayLike) -> ImagePair:
+        """The same pair with other grey levels: noisy, blurred."""
+        return replace(self, reference=reference, deformed=deformed)
+
+    def rms(self, measured: HasDisplacement) -> float:
+        """Root mean square of truth - measured *per component* over the material [mm].
+
+        Raises
+        ------
+        InputError
+            If there is no truth.
+        """
+        if self.truth is None:
+            raise InputError("expected a pair whose true displacement is known, got one without")
+        error = self.truth.displacement - measured.displacement(self.grid)
+        return float(np.sqrt(np.mean(grey_levels_in(error, self.mask) ** 2)))
+
+
+def grey_levels_in(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
+    """The grey levels that a mask leaves."""
+    return image if mask is None else image[mask]
+
+
+def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> FloatImage:
+    """The image as read-only float32; raises InputError unless finite and of the grid's shape."""
+    pixels = np.asarray(image)
+    if pixels.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} image of {grid.rows} x {grid.cols} px like the grid, got shape "
+            f"{pixels.shape}; give two images and a grid of one size"
+        )
+    pixels = pixels.astype(np.float32, copy=False)
+    bad = ~np.isfinite(pixels)
+    if bad.any():
+        raise InputError(
+            f"expected finite grey levels in the {what} image, got NaN or infinity in "
+            f"{location_of(bad)}; fill or crop them"
+        )
+    return readable(pixels)
+
+
+def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
+    """The mask, read-only; raises InputError unless it has the grid's shape and some material."""
+    if mask is None:
+        return None
+    inside = np.ascontiguousarray(mask, dtype=np.bool_)
+    if inside.shape != grid.shape:
+        raise InputError(
+            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
+            f"{inside.shape}"
+        )
+    if not inside.any():
+        raise InputError(f"expected material in the {what}, got one that is False everywhere")
+    return readable(inside)
+
+
+def location_of(bad: BoolArray) -> str:
+    """How many pixels are bad, and where the first one is."""
+    row, col = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return f"{int(bad.sum())} px, the first at row {row}, column {col}"

@@ -1,0 +1,65 @@
+"""Guards a pair of images: what is refused, and the error against the truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair, Truth
+from modeharvest.util.errors import InputError
+
+GRID = PixelGrid.centred(12, 10, 0.1)
+F = np.random.default_rng(0).integers(0, 255, GRID.shape, dtype=np.uint8)
+LEFT = np.broadcast_to(np.arange(GRID.cols) < 5, GRID.shape)
+
+
+@dataclass
+class Shift:
+    """A measurement: one vector everywhere [mm]."""
+
+    u: ArrayLike
+
+    def displacement(self, grid: PixelGrid) -> NDArray[np.float64]:
+        return np.broadcast_to(np.asarray(self.u, np.float64), (*grid.shape, 2))
+
+
+def test_images_are_kept_as_read_only_float32() -> None:
+    pair = ImagePair(F, F[::-1], GRID, LEFT)
+    assert pair.deformed.dtype == np.float32
+    np.testing.assert_array_equal(pair.deformed, F[::-1])
+    np.testing.assert_array_equal(pair.grey[0], F[LEFT])
+    assert not pair.reference.flags.writeable
+    other = pair.with_images(F, F + 0.5)
+    np.testing.assert_array_equal(other.deformed, F + np.float32(0.5))
+    assert other.mask is not None
+    assert other.grid == GRID
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"deformed": F[:-1]}, "expected a deformed image of 12 x 10 px like the grid"),
+        ({"reference": np.where(F[3, 4] == F, np.nan, F)}, "finite grey levels in the reference"),
+        ({"deformed": 0 * F}, "speckle in the deformed image, got the constant grey level 0"),
+        ({"reference": np.where(LEFT, 7, F)}, "speckle in the reference image"),
+        ({"mask": LEFT[:, 1:]}, "expected a mask of 12 x 10 px like the images"),
+        ({"deformed_mask": LEFT & False}, "expected material in the deformed mask"),
+    ],
+)
+def test_what_cannot_be_correlated_is_refused(
+    change: dict[str, NDArray[np.generic]], message: str
+) -> None:
+    whole = {"reference": F, "deformed": F[::-1], "mask": LEFT}
+    with pytest.raises(InputError, match=message):
+        ImagePair(grid=GRID, **(whole | change))
+
+
+def test_rms_is_per_component_and_of_the_material_alone() -> None:
+    u = np.where(LEFT[..., None], [0.3, -0.1], np.nan)
+    pair = ImagePair(F, F[::-1], GRID, LEFT, truth=Truth.of(displacement=u))
+    assert pair.rms(Shift([0.3, -0.1])) == 0.0
+    assert pair.rms(Shift([0.0, 0.3])) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 2))
+    with pytest.raises(InputError, match="displacement is known"):
+        ImagePair(F, F[::-1], GRID).rms(Shift([0.0, 0.0]))
