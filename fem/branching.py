@@ -49,7 +49,7 @@ def follow_branch(
     found: list[State] = []
     shortest = 0.1 * walker.options.first_amplitude * length
     reach = walker.options.first_amplitude * length  # the largest amplitude to try next
-    walker.factor = None
+    walker.linearisation = None
     while len(found) < len(targets):
         target = targets[len(found)]
         wanted = _amplitude_at(points, target, reach)
@@ -67,7 +67,7 @@ def follow_branch(
             reach = 0.5 * (points[-1].amplitude + min(wanted, reach))
             if reach - points[-1].amplitude < shortest:
                 return found
-            walker.factor = None  # it may be that of the state refused
+            walker.linearisation = None  # it may be that of the state refused
             continue
         points.append(point)
         reach = walker.options.growth * point.amplitude

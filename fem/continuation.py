@@ -13,8 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from petsc4py import PETSc
 
-from modeharvest.fem.corrector import Constraint, Outcome, correct, path_tangent
-from modeharvest.fem.equilibrium import Factor, Structure
+from modeharvest.fem.corrector import (
+    Constraint,
+    Linearisation,
+    Outcome,
+    correct,
+    path_tangent,
+)
+from modeharvest.fem.equilibrium import Structure
 from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.stability import Mode, lowest_modes
 from modeharvest.progress import Progress, silent
@@ -53,13 +59,13 @@ class State:
 class Walker:
     """Follows the paths of one structure; the last state's factor serves the next step.
 
-    ``factor`` and ``modes`` (the lowest ones) belong to the state found last.
+    ``linearisation`` and ``modes`` (the lowest ones) belong to the state found last.
     """
 
     structure: Structure
     options: PathOptions = field(default_factory=PathOptions)
     progress: Progress = silent
-    factor: Factor | None = None
+    linearisation: Linearisation | None = None
     modes: list[Mode] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -83,12 +89,12 @@ class Walker:
 
         None if Newton does not get there, or gets to a state with a reversed element.
         """
-        found = correct(self.structure, guess, strain, self.factor, constraint)
+        found = correct(self.structure, guess, strain, self.linearisation, constraint)
         if (
             found.outcome is not Outcome.CONVERGED
             or self.structure.smallest_jacobian(found.u) <= 0.0
         ):
-            self.factor = None  # it may be that of a state astray
+            self.linearisation = None  # it may be that of a state astray
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)
 
@@ -97,12 +103,13 @@ class Walker:
     ) -> State:
         """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
         eigenvalues: tuple[float, ...] = ()
-        self.factor = self.structure.factor(u)
+        factor = self.structure.factor(u)
         if with_modes:
-            self.modes = lowest_modes(self.factor, self.mass, _MODES, self.modes, _RESIDUAL)
+            self.modes = lowest_modes(factor, self.mass, _MODES, self.modes, _RESIDUAL)
             eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
-        tangent = path_tangent(self.structure, self.factor, load)
-        return State(strain, u, tangent, self.factor.negative_pivots, eigenvalues)
+        tangent = path_tangent(self.structure, factor, load)
+        self.linearisation = Linearisation(factor, tangent, float(load.norm()))
+        return State(strain, u, tangent, factor.negative_pivots, eigenvalues)
 
     # -- the primary path ---------------------------------------------------------------
 
@@ -141,7 +148,7 @@ class Walker:
                 guess = _extrapolate(states, strain)
                 state = self.equilibrium(strain, guess)
                 if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
-                    self.factor = None  # it may be that of the state refused
+                    self.linearisation = None  # it may be that of the state refused
                     step = 0.5 * (strain - here)
                     if step < _SMALLEST_STEP:
                         return False

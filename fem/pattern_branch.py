@@ -108,7 +108,7 @@ def _follow(
         constraint = Constraint(weights, critical.u, amplitude)
         found = walker.equilibrium(*_predicted(points, amplitude), constraint)
         if found is None:
-            step, walker.factor = 0.5 * step, None  # it may belong to the failed state
+            step, walker.linearisation = 0.5 * step, None  # it may belong to the failed state
             continue
         strain_rate = 1.0 / float(weights.dot(found.tangent))
         points.append(
@@ -161,7 +161,8 @@ def _until_critical(walker: Walker, largest: float) -> tuple[State, Critical | N
             return path[-2], critical, "complete"
         path.pop()
         steps = {n: getattr(walker.options, n) / 3.0 for n in ("first_step", "largest_step")}
-        walker.options, walker.factor = replace(walker.options, **steps), None
+        walker.options = replace(walker.options, **steps)
+        walker.linearisation = None
     return path[-1], None, (
         f"unstable between {100 * path[-1].strain:.4g} and {100 * last.strain:.4g} %, where no "
         "bifurcation was found"

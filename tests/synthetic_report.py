@@ -41,6 +41,10 @@ class MadeUpImages(ImageSet):
         """White noise."""
         return np.asarray(np.random.default_rng(0).random(GRID.shape), dtype=np.float32)
 
+    def mask(self) -> NDArray[np.bool_]:
+        """The plate's material."""
+        return MASK
+
     def deformed_mask(self, strain: float) -> NDArray[np.bool_]:
         """The reference's."""
         return MASK
@@ -117,7 +121,8 @@ def atlas(strains: tuple[float, ...] = (0.05, 0.1), ansatz: Ansatz | None = None
     """Everything that the pictures show."""
     found = [comparison(e, 4.0 if _branch(e) != "primary" else 0.1, ansatz) for e in strains]
     images = MadeUpImages(Path(), {})
-    return Atlas(solution(strains), images, found, [spectrum(c) for c in found], UNIT_CELL)
+    results, spectra = [c.result for c in found], [spectrum(c) for c in found]
+    return Atlas(solution(strains), images, strains, results, found, spectra, UNIT_CELL)
 
 
 def case() -> dict[str, Any]:

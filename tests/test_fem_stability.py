@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from fem_bodies import FloatArray, column, vector_of
+from petsc4py import PETSc
 
 from modeharvest.fem.branching import follow_branch
 from modeharvest.fem.continuation import State, Walker, hermite_weights
@@ -41,8 +42,8 @@ def compressed(structure: Structure, strain: float) -> Any:
 
 
 def dense(matrix: Any) -> FloatArray:
-    rows = range(matrix.getSize()[0])
-    return np.asarray(matrix.getValues(list(rows), list(rows)))
+    converted = matrix.convert("dense", PETSc.Mat())  # named: its array doesn't keep it alive
+    return np.array(converted.getDenseArray())
 
 
 @pytest.mark.parametrize(

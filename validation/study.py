@@ -39,11 +39,13 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +66,13 @@ from modeharvest.idic.setup import Identification
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.progress import Progress, silent
 from modeharvest.validation.metrics import describe
+from modeharvest.validation.plots import Atlas
 from modeharvest.validation.published import expectations
-from modeharvest.validation.report import write_report
+from modeharvest.validation.report import draw, write_report
 from modeharvest.validation.truth import Comparison, compare, pattern_size
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,21 +127,27 @@ def validate(
     dict
         The content of ``summary.json``.
     """
-    comparisons = []
-    for k, strain in enumerate(sorted(measured.results)):
-        progress(k, len(measured.results), "compare with the truth")
-        comparisons.append(_compare(measured, strain))
-    with ThreadPoolExecutor(os.cpu_count()) as threads:  # numpy's work, and it lets go of the GIL
-        spectra = list(threads.map(lambda c: _spectrum(c, measured.specimen), comparisons))
-        patterns = [pattern for _, pattern in spectra]
-        snapshots = list(
-            threads.map(lambda c, pattern: _snapshot(c, pattern, measured), comparisons, patterns)
+    strains = sorted(measured.results)
+    results = [measured.results[strain] for strain in strains]
+    # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
+    with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        comparisons = _Awaited([threads.submit(_compare, measured, e) for e in strains])
+        spectra = _Awaited(
+            [threads.submit(_spectrum, comparisons, k, measured) for k in range(len(strains))]
         )
-
-    summary = _summary(measured, case, snapshots)
-    page = folder / "report.html"
-    solution, images = measured.solution, measured.images
-    write_report(page, dict(case), solution, images, comparisons, spectra, summary, progress)
+        snapshots = _Awaited(
+            [
+                threads.submit(_snapshot, comparisons, spectra, k, measured)
+                for k in range(len(strains))
+            ]
+        )
+        atlas = Atlas(
+            measured.solution, measured.images, strains, results, comparisons, spectra,
+            measured.specimen.pitch,
+        )  # fmt: skip
+        drawings = draw(atlas, progress)
+        summary = _summary(measured, case, list(snapshots))
+    write_report(folder / "report.html", case, drawings, summary)
     write_json(folder / "summary.json", summary)
     return summary
 
@@ -166,9 +176,36 @@ def _summary(
     return summary
 
 
-def _spectrum(comparison: Comparison, specimen: Specimen) -> tuple[Spectrum, Pattern]:
+@contextmanager
+def _brief_turns() -> Iterator[None]:
+    """Let no thread keep the GIL for long: by default each of many short kernels waits 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+class _Awaited(Sequence[T]):
+    """Results of threads that may still be at work, waited for where they are used."""
+
+    def __init__(self, coming: Sequence[Future[T]]) -> None:
+        self._coming = coming
+
+    def __len__(self) -> int:
+        return len(self._coming)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._coming[k].result()
+
+
+def _spectrum(
+    comparisons: Sequence[Comparison], k: int, measured: Measured
+) -> tuple[Spectrum, Pattern]:
+    comparison = comparisons[k]
     spectrum = spectral_density(
-        comparison.displacement, comparison.grid, comparison.mask, specimen.pitch
+        comparison.displacement, comparison.grid, comparison.mask, measured.specimen.pitch
     )
     return spectrum, read_pattern(spectrum)
 
@@ -179,7 +216,13 @@ def _compare(measured: Measured, strain: float) -> Comparison:
     return compare(measured.images, strain, result, start, how.camera)
 
 
-def _snapshot(comparison: Comparison, pattern: Pattern, measured: Measured) -> dict[str, Any]:
+def _snapshot(
+    comparisons: Sequence[Comparison],
+    spectra: Sequence[tuple[Spectrum, Pattern]],
+    k: int,
+    measured: Measured,
+) -> dict[str, Any]:
+    comparison, (_, pattern) = comparisons[k], spectra[k]
     result, mask = comparison.result, comparison.mask
     specimen, state = measured.specimen, measured.solution.at(comparison.strain)
     size = pattern_size(comparison, specimen)

@@ -27,7 +27,14 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest.errors import InputError
-from modeharvest.files import may_be_alive, read_json, remove_orphans, sha256_of, write_json
+from modeharvest.files import (
+    make_folder,
+    may_be_alive,
+    read_json,
+    remove_orphans,
+    sha256_of,
+    write_json,
+)
 from modeharvest.ranks import on_first
 from modeharvest.versions import source_digest
 
@@ -224,7 +231,7 @@ class _Lock:
 
     def acquire(self) -> None:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             while self._file is None:
                 self._file = self._locked()
             remove_orphans(self._path.parent)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from modeharvest.cli.arguments import SolutionFile
+from modeharvest.cli.arguments import SolutionFile, folder_option
 from modeharvest.cli.messages import bars
 
 
@@ -19,9 +19,7 @@ def study(
             help="robustness, noise, systematic, modes or resolution; or a TOML file of your own.",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for everything the study leaves.", metavar="DIR")
-    ],
+    out: Annotated[Path, folder_option("--out", "Folder for everything the study leaves.")],
     workers: Annotated[
         int | None, typer.Option(help="Processes on this machine; 2 by default.", metavar="N")
     ] = None,
