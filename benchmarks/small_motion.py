@@ -13,7 +13,8 @@ are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/de
 g), I = sum J J'. "Least squares" is the naive version: the deformed image's own
 gradient, and a quintic spline whatever the speckle.
 
-Run: scripts/env python benchmarks/small_motion.py [--pairs 3] [--only TEXT] [--json FILE]
+Run: scripts/env python benchmarks/small_motion.py [--pairs 3] [--step 0.125] [--only TEXT]
+     [--json FILE]
 """
 
 from __future__ import annotations

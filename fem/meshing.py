@@ -45,6 +45,8 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
             f"imperfection: expected 4 (position_sd + diameter_sd / 2) <= {0.5 * ligament:.3g} mm, "
             f"half a ligament, got {reach:.3g} mm; make the scatter smaller"
         )
+    if imperfection.is_none:
+        return mesh
     random = np.random.default_rng(imperfection.seed)
     centres = specimen.hole_centres
     shift = random.normal(0.0, 1.0, centres.shape) * imperfection.position_sd

@@ -97,7 +97,7 @@ class _Run:
                     self.walker.primary(path, strains)
                 return path, critical
             path.pop()
-            self.walker.factor = None
+            self.walker.linearisation = None
         self.walker.primary(path, strains, refuse_unstable=True)
         return path, None
 

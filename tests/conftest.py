@@ -47,6 +47,16 @@ def pytest_configure(config: pytest.Config) -> None:
         numba.set_num_threads(1)
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what most tests need before several processes begin, or each compiles all of it."""
+    if session.config.getoption("numprocesses", None):
+        from modeharvest.runs.precompile import precompiling
+
+        with precompiling(("image", "correlate")) as kernels:
+            for stage in kernels.children:
+                kernels.wait(stage)
+
+
 def pytest_pycollect_makemodule(
     module_path: Path, parent: pytest.Collector
 ) -> pytest.Module | None:

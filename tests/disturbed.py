@@ -1,13 +1,17 @@
-"""A command run again and again, disturbed each time, until it succeeds.
+"""A command run again and again, disturbed each time, until it succeeds; in one way after another.
 
 ::
 
-    python disturbed.py OUT kill SEED COMMAND...         killed while it writes a file
-    python disturbed.py OUT disk BYTES STEP COMMAND...   on a disk of BYTES, and STEP more each time
+    python disturbed.py WAYS OUT COMMAND...
 
-``OUT`` is what the command leaves. Prints a JSON object for each attempt: ``code``, its exit code
-or minus the signal that ended it, ``said``, what it wrote to stderr, and ``files``, the digests of
-what is there afterwards.
+``WAYS`` is a JSON list of [folder, way, number, ...], each begun in its own folder::
+
+    [FOLDER, "kill", SEED]          killed while it writes a file; undisturbed with a seed of 0
+    [FOLDER, "disk", BYTES, STEP]   on a disk of BYTES, and STEP more each time
+
+``OUT`` is what the command leaves there. Prints a JSON object for each attempt: ``folder``,
+``code``, its exit code or minus the signal that ended it, ``said``, what it wrote to stderr, and
+``files``, the digests of what is there afterwards.
 
 Each attempt is a fork of this process, which has imported what takes long and computed nothing.
 """
@@ -117,7 +121,8 @@ def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         said.seek(0)
         text = said.read().decode()
-    print(json.dumps({"code": code, "said": text, "files": digests(out)}), flush=True)
+    made = {"folder": os.getcwd(), "code": code, "said": text, "files": digests(out)}
+    print(json.dumps(made), flush=True)
     return code
 
 
@@ -130,29 +135,41 @@ def digests(folder: Path) -> dict[str, str]:
     }
 
 
-def main() -> None:
-    out, way, first, *rest = sys.argv[1:]
-    for module in _MODULES:
-        importlib.import_module(f"modeharvest.{module}")
-    assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
+def disturb(out: Path, command: list[str], way: str, first: int, step: int = 0) -> None:
+    """Attempt the command until it succeeds."""
     disk = None
     if way == "disk":
-        step, *rest = rest
         try:
-            disk = Disk(Path(out))
+            disk = Disk(out)
         except OSError as error:
-            print(error)
+            print(error, file=sys.stderr)
             sys.exit(NO_DISK)
     for number in range(_ATTEMPTS):
         prepare: Callable[[], None] = int  # does nothing
         if disk is not None:
-            disk.resize(int(first) + number * int(step))
-        elif int(first):
-            prepare = partial(deadly, 1000 * int(first) + number, number == 0)
-        code = attempt(rest, Path(out), prepare)
+            disk.resize(first + number * step)
+        elif first:
+            prepare = partial(deadly, 1000 * first + number, number == 0)
+        code = attempt(command, out, prepare)
         if code != (-signal.SIGKILL if disk is None else 2):
             return
     sys.exit("it never succeeded")
+
+
+def main() -> None:
+    ways, out, *command = sys.argv[1:]
+    for module in _MODULES:
+        importlib.import_module(f"modeharvest.{module}")
+    assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
+    for folder, *way in json.loads(ways):
+        child = os.fork()  # a disk of one's own is for good
+        if child == 0:
+            os.chdir(folder)
+            disturb(Path(out).absolute(), command, *way)
+            return
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if code:
+            sys.exit(code)
 
 
 if __name__ == "__main__":

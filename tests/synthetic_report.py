@@ -41,6 +41,10 @@ class MadeUpImages(ImageSet):
         """White noise."""
         return np.asarray(np.random.default_rng(0).random(GRID.shape), dtype=np.float32)
 
+    def mask(self) -> NDArray[np.bool_]:
+        """The plate's material."""
+        return MASK
+
     def deformed_mask(self, strain: float) -> NDArray[np.bool_]:
         """The reference's."""
         return MASK
@@ -119,8 +123,9 @@ def atlas(
     """Everything that the pictures show."""
     found = [comparison(e, 4.0 if _branch(e) != "primary" else 0.1, ansatz) for e in strains]
     images = MadeUpImages(Path(), {})
+    results, spectra = [c.result for c in found], [spectrum(c) for c in found]
     return ExperimentReportData(
-        solution(strains), images, found, [spectrum(c) for c in found], UNIT_CELL
+        solution(strains), images, strains, results, found, spectra, UNIT_CELL
     )
 
 

@@ -239,6 +239,46 @@ def test_a_bad_call_is_told_in_one_line(
 
 
 @pytest.mark.parametrize(
+    "call",
+    [
+        "run case.toml",
+        "fem case.toml",
+        "image case.toml --solution solution.h5",
+        "correlate case.toml",
+        "validate case.toml",
+        "bloch square-lattice",
+        "modes square-lattice",
+        "study noise",
+        "harvest experiment.toml",
+        "score two.csv --truth set-truth --strain 0.05",
+        "benchmark make case.toml --solution solution.h5",
+        "benchmark make case.toml --solution solution.h5 --out out --truth",
+        "benchmark star",
+        "benchmark resolution two.csv --set set",
+    ],
+)
+@pytest.mark.parametrize(
+    ("folder", "said"),
+    [
+        ("file", "expected a folder at file, found a file; remove it, or take another folder"),
+        ("file/below", "expected a folder at file, found a file; remove it"),
+        ("", "expected a folder, got an empty name"),
+    ],
+)
+def test_a_file_or_nothing_is_no_folder_to_write_to(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path,
+    call: str, folder: str, said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(place)
+    before = sorted(place.rglob("*"))
+    words = call.split()
+    option = () if words[-1].startswith("--") else ("--out",)
+    assert called(monkeypatch, *words, *option, folder) == 2
+    assert said in error_line(capsys)
+    assert sorted(place.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
     ("old", "new"),
     [
         ('"deformed.png"', '"/no/such/folder/*.png"'),
@@ -252,6 +292,14 @@ def test_a_bad_call_is_told_in_one_line(
         ("0.01", "nan"),
         ("0.01", "1e300"),
         ("cell_size = 0.2", "cell_size = inf"),
+        ("cell_size = 0.2", "cell_size = 0.2\npolygon = [[1, 1], [50, 40]]"),
+        ("cell_size = 0.2", "cell_size = 0.2\npolygon = [[1, 1], [1, 1], [1, 1]]"),
+        ("cell_size = 0.2", "cell_size = 0.2\npolygon = [[1, 1], [50, 40], [50.5, 40.5], [1, 1]]"),
+        ("cell_size = 0.2", "cell_size = 0.2\n[[specimen.regions]]\nname = 'a'"),
+        (
+            "cell_size = 0.2",
+            "cell_size = 0.2\n[[specimen.regions]]\nname = 'a'\npolygon = [[1, 5], [9, 5], [7, 5]]",
+        ),
         ("cell_size = 0.2", "cell_size = 0.2\n[local]\nfirst_pixel = 7"),
         ("cell_size = 0.2", "cell_size = 0.2\n[distortion]\nfile = 'folder.toml'"),
     ],
@@ -265,6 +313,23 @@ def test_a_bad_experiment_is_told_in_one_line(
     assert HARVEST.count(old) == 1
     assert called(monkeypatch, "harvest", path, "--out", tmp_path / "out") == 2
     error_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("polygon", "said"),
+    [
+        ("[[1, 1], [50, 40]]", "at least three corners [column, row], got 2"),
+        ("[[1, 1], [1, 1], [1, 1]]", "with an area, got 3 corners on one line"),
+        ("[[1, 5], [50, 5], [30, 5.5]]", "from [1.0, 5.0] to [50.0, 5.0]"),
+    ],
+)
+@pytest.mark.parametrize("table", ["polygon", "[[specimen.regions]]\nname = 'a'\npolygon"])
+def test_a_polygon_has_an_area(table: str, polygon: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "experiment.toml"
+    path.write_text(f"{HARVEST}{table} = {polygon}\n")
+    with pytest.raises(InputError, match="polygon") as caught:
+        read_photograph_case(path)
+    assert said in str(caught.value)
 
 
 def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:

@@ -127,11 +127,13 @@ def test_a_scheduler_does_the_work_and_what_is_done_outlives_it(
     monkeypatch.undo()
 
     # It dies in the fifth of eight cases.
-    campaign = Campaign("campaign_cases:dies", grid({"x": 0}, x=list(range(8))), tmp_path)
+    campaign = Campaign("campaign_cases:dies_later", grid({"x": 0}, x=list(range(8))), tmp_path)
 
     def hurry(done: float, total: float, what: str) -> None:
         if done == 4:  # from now on only its absence is waited for
+            default_client()._timeout = 1.0
             monkeypatch.setattr(workers, "_PATIENCE_S", 1.0)
+            (tmp_path / "go").touch()
 
     with pytest.raises(InputError, match="went away; 4 of 8 are done and kept"):
         campaign.run(elsewhere, hurry)

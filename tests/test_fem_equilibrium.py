@@ -10,15 +10,16 @@ import pytest
 import ufl
 from fem_bodies import FloatArray, moved, plate, points_of, vector_of
 from mpi4py import MPI
+from petsc4py import PETSc
 from scipy.optimize import brentq
 
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.fem.path.continuation import PathFollower, State
+from modeharvest.fem.path.continuation import PathFollower, State, along
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
-from modeharvest.fem.path.newton import NewtonOutcome, correct
+from modeharvest.fem.path.newton import STRAIN_TOLERANCE, NewtonOutcome, correct
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util.errors import InputError
 
@@ -265,6 +266,30 @@ def test_factor_solves_and_counts() -> None:
     assert (structure.stiffness(u) * factor.solve(rhs) - rhs).norm() < 1e-10 * rhs.norm()
     assert factor.negative_pivots == 0
     assert structure.factorisations == 1
+
+
+def test_half_of_the_tangent_is_kept_and_none_of_it_lost() -> None:
+    structure = structure_of(CURVED, Ogden())
+    u = vector_of(structure, lambda x: 0.02 * np.stack([x[:, 1] ** 2, x[:, 0] * x[:, 1]], axis=1))
+    upper = structure.stiffness(u)
+    whole = dolfinx_api.assemble_matrix(structure._forms.stiffness, structure._bcs, 1.0)
+    difference = upper.convert("dense", PETSc.Mat()) - whole.convert("dense", PETSc.Mat())
+    assert np.abs(difference.getDenseArray()).max() < 1e-14 * whole.norm()
+    assert upper.getType() == "seqsbaij"
+    assert upper.getInfo()["mallocs"] == 0
+
+
+def test_a_correction_from_nearby_needs_the_load_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    walker = PathFollower(structure_of(CURVED, Ogden()))
+    start = walker.start()
+    counted: list[Any] = []
+    load = walker.structure.load
+    monkeypatch.setattr(walker.structure, "load", lambda u: counted.append(u) or load(u))
+    found = walker.equilibrium(1e-3, along(start, 1e-3))
+    assert found is not None
+    assert len(counted) == 1
+    residual = walker.structure.residual(found.u).norm()
+    assert residual <= STRAIN_TOLERANCE * load(found.u).norm()
 
 
 def test_newton_says_when_it_fails() -> None:

@@ -252,6 +252,11 @@ def test_scatter_moves_holes_but_neither_edges_nor_topology() -> None:
         assert 1e-5 < np.linalg.norm(solution[:2]) < 0.05
 
 
+def test_no_scatter_leaves_the_mesh_as_it_is() -> None:
+    mesh = mesh_specimen(SMALL, 0.29)
+    assert perturb(mesh, SMALL, Imperfection(seed=3)) is mesh
+
+
 def test_scatter_has_the_stated_deviation_and_seed() -> None:
     specimen = Specimen(12, 10)
     mesh = mesh_specimen(specimen, 0.29)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from fem_bodies import FloatArray, column, vector_of
+from petsc4py import PETSc
 
 from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.materials import Material, Ogden
@@ -42,8 +43,8 @@ def compressed(structure: Structure, strain: float) -> Any:
 
 
 def dense(matrix: Any) -> FloatArray:
-    rows = range(matrix.getSize()[0])
-    return np.asarray(matrix.getValues(list(rows), list(rows)))
+    converted = matrix.convert("dense", PETSc.Mat())  # named: its array doesn't keep it alive
+    return np.array(converted.getDenseArray())
 
 
 @pytest.mark.parametrize(

@@ -42,8 +42,9 @@ def test_a_folder_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None
     require_writable(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="could not write"):
-        require_writable(tmp_path / "file")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match=r"expected a folder at .*/file, found a file"):
+            require_writable(folder)
 
 
 def test_json_round_trip_and_a_cut_file(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
 
 def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]) -> None:
     first, second = summary["frames"]
-    said = words.labels([first, second, second | {"name": "again"}])
+    said = words.photograph_labels([first, second, second | {"name": "again"}])
     at = "After buckling · 7\N{NO-BREAK SPACE}%"
     assert list(said.values())[1:] == [f"{at} · IMG_2", f"{at} · again"]
     assert "IMG_1" not in said["IMG_1"]

@@ -147,7 +147,7 @@ def test_a_changed_option_repeats_only_what_depends_on_it(case: Path, folder: Pa
     }
 
 
-@pytest.mark.parametrize("step", ["images: strain", "correlate", "compare"])
+@pytest.mark.parametrize("step", ["images: strain", "correlate", "report"])
 def test_an_interrupted_run_continues_to_the_same_end(
     case: Path, finished: Path, tmp_path: Path, step: str
 ) -> None:

@@ -18,15 +18,14 @@ from html_page import Page
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.report import experiment as words
-from modeharvest.report.experiment import write_experiment_report
+from modeharvest.report.experiment import draw, write_experiment_report
 from modeharvest.report.figures.experiment import PANELS, ExperimentReportData
 from modeharvest.report.model import fixed, short
 
 
 def report(atlas: ExperimentReportData, folder: Path, summary: dict[str, Any]) -> str:
     path = folder / "report.html"
-    write_experiment_report(path, made_up.case(), atlas.solution, atlas.images, atlas.comparisons,
-                 atlas.spectra, summary)  # fmt: skip
+    write_experiment_report(path, made_up.case(), draw(atlas), summary)
     return path.read_text("utf-8")
 
 
@@ -119,14 +118,26 @@ def test_a_correlation_without_a_mode_has_no_panels_of_it(tmp_path: Path) -> Non
     assert "mode" not in ids
 
 
-def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:
+def test_progress_is_told_up_to_the_end() -> None:
     told: list[float] = []
-    atlas = made_up.atlas((0.05,))
-    write_experiment_report(tmp_path / "r.html", made_up.case(), atlas.solution, atlas.images,
-                 atlas.comparisons, atlas.spectra, made_up.summary(atlas),
-                 lambda done, total, what: told.append(done / total))  # fmt: skip
+    draw(made_up.atlas((0.05,)), lambda done, total, what: told.append(done / total))
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+def test_the_truth_is_waited_for_last() -> None:
+    class NotYet(list[Any]):
+        def __getitem__(self, k: Any) -> Any:
+            raise TimeoutError
+
+        def __iter__(self) -> Any:
+            raise TimeoutError
+
+    drawn: list[float] = []
+    atlas = replace(made_up.atlas((0.05,)), comparisons=NotYet([0]), spectra=NotYet([0]))
+    with pytest.raises(TimeoutError):
+        draw(atlas, lambda done, total, what: drawn.append(done))
+    assert drawn[-1] == sum(not panel.needs_truth for panel in PANELS) == 7
 
 
 @pytest.mark.parametrize(

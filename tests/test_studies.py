@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +15,8 @@ import pandas as pd
 import pytest
 from html_page import Page
 from scipy import stats
+from test_cli import called, error_line
 
-from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
 from modeharvest.report import study_robustness as told
 from modeharvest.report.study_noise import report_noise
@@ -377,14 +376,6 @@ def test_a_solution_of_another_experiment_is_not_taken(
 # -- the command --------------------------------------------------------------------------
 
 
-def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    """Exit code of the ``modeharvest`` command."""
-    monkeypatch.setattr(sys, "argv", ["modeharvest", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    return int(end.value.code or 0)
-
-
 def test_a_study_from_the_command_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -487,7 +478,12 @@ def check_page(text: str, summary: dict[str, Any]) -> None:
         (("robustnes",), "did you mean 'robustness'"),
         (("robustness", "--workers", "2", "--scheduler", "tcp://x:1"), "got both"),
         (("robustness", "--workers", "0"), "at least 1 worker"),
-        (("robustness", "--memory", "much"), "memory like 4GiB"),
+        (("robustness", "--workers", "-3"), "at least 1 worker, got -3"),
+        (("robustness", "--workers", "1000000000"), "at most 1000 workers"),
+        *(
+            (("robustness", "--memory", memory), f"memory like 4GiB or 500MB, got {memory!r}")
+            for memory in ("much", "", "0", "-4GiB", "nan", "inf", "1e400", "1e30GiB", "1kB")
+        ),
         (("nowhere.toml",), "expected a case file at nowhere.toml"),
     ],
 )
@@ -500,8 +496,19 @@ def test_a_wrong_command_is_told_in_one_line(
 ) -> None:
     out = tmp_path / "out"
     assert called(monkeypatch, "study", *arguments, "--out", out) == 2
-    text = capsys.readouterr().err
-    assert "Traceback" not in text
-    (line,) = [row for row in text.splitlines() if row.startswith("error:")]
-    assert said in line
+    assert said in error_line(capsys)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("workers", ["nan", "inf", "two", "1.5", ""])
+def test_workers_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    workers: str,
+) -> None:
+    out = tmp_path / "out"
+    assert called(monkeypatch, "study", "robustness", "--workers", workers, "--out", out) == 2
+    assert "Traceback" not in (said := capsys.readouterr().err)
+    assert "--workers" in said
     assert not out.exists()

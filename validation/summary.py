@@ -38,9 +38,9 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -160,6 +160,9 @@ def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
     ]  # fmt: skip
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True, eq=False)
 class MeasuredExperiment:
     """What is to be judged.
@@ -213,10 +216,11 @@ def experiment_summary(
 
 
 def displacement_spectrum(
-    comparison: Comparison, specimen: Specimen
+    comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
 ) -> tuple[Spectrum, WavePattern]:
+    comparison = comparisons[k]
     spectrum = spectral_density(
-        comparison.displacement, comparison.grid, comparison.mask, specimen.pitch
+        comparison.displacement, comparison.grid, comparison.mask, measured.specimen.pitch
     )
     return spectrum, read_pattern(spectrum)
 
@@ -228,8 +232,12 @@ def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
 
 
 def snapshot_summary(
-    comparison: Comparison, pattern: WavePattern, measured: MeasuredExperiment
+    comparisons: Sequence[Comparison],
+    spectra: Sequence[tuple[Spectrum, WavePattern]],
+    k: int,
+    measured: MeasuredExperiment,
 ) -> dict[str, Any]:
+    comparison, (_, pattern) = comparisons[k], spectra[k]
     result, mask = comparison.result, comparison.mask
     specimen, state = measured.specimen, measured.solution.at(comparison.strain)
     size = pattern_size(comparison, specimen)

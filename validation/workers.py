@@ -120,6 +120,8 @@ _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
 _MOST_WORKERS = 1000
 """On one machine."""
+_LEAST_BYTES = 2**28
+"""Of a worker's memory: with less it is stopped, and begun again, before it has done anything."""
 _NEVER = "1000 days"
 LOCAL: dict[str, object] = {
     # Forks of one server process, which has imported dask: quicker than new processes.
@@ -168,11 +170,12 @@ class Workers:
         from dask.utils import parse_bytes
 
         try:
-            if not 0 < parse_bytes(self.memory) < 2**60:
-                raise ValueError("nothing, or more than there is anywhere")
-        except (ValueError, TypeError) as error:
+            if not _LEAST_BYTES <= parse_bytes(self.memory) < 2**60:
+                raise ValueError("too little to begin with, or more than there is anywhere")
+        except (ValueError, TypeError, OverflowError) as error:
             raise InputError(
-                f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}"
+                f"expected a worker's memory like 4GiB or 500MB, got {self.memory!r}; at least "
+                "256MiB, which it takes before its first case"
             ) from error
 
     def require_ready(self, function: str, folder: Path) -> None:

@@ -150,13 +150,14 @@ class BlochWaves:
 
     def slope(self, modes: BlochModes) -> FloatArray:
         """(2,) derivatives of the lowest eigenvalue by k . a1 and k . a2 (Hellmann-Feynman)."""
-        x, value = modes.vectors[:, 0], modes.eigenvalues[0]
-        parts = [
-            self.stiffness.slope(modes.wave, axis) @ x
-            - value * (self.cell.mass.slope(modes.wave, axis) @ x)
-            for axis in (0, 1)
-        ]
-        return np.array([np.vdot(x, part).real for part in parts])
+        reduction = self.cell.reduction
+        u = reduction.displacement(modes.vectors[:, 0], modes.wave)
+        vector = u.reshape(-1, 1, 1)
+        forces = applied(self.state.stiffness.__matmul__, vector)
+        forces -= modes.eigenvalues[0] * applied(self.cell.nodal_mass.__matmul__, vector)
+        # T(k) changes by i R_a T(k), and so the quotient by what turns against the forces.
+        work = np.sum(u.conj() * forces.reshape(u.shape), axis=1)
+        return np.asarray(2.0 * work.imag @ reduction.periodicity.shift)
 
     def acoustic(self, angle: float) -> float:
         """Smallest eigenvalue of the acoustic tensor Q_ik = L_ijkl n_j n_l [MPa].

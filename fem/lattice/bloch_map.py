@@ -217,10 +217,6 @@ class Reduction:
         """The factors exp(i k . (R' - R)) of the sorted entries."""
         return np.asarray(np.exp(1j * (self._differences @ np.asarray(wave))))
 
-    def slopes(self, wave: tuple[float, float], axis: int) -> ComplexArray:
-        """Derivatives of ``phases`` by k . a1 or k . a2."""
-        return np.asarray(1j * self._differences[:, axis] * self.phases(wave))
-
     def displacement(self, vector: NDArray[Any], wave: tuple[float, float]) -> NDArray[Any]:
         """(n, 2) nodal displacement T(k) x of a reduced vector (real if x and T(k) are)."""
         masters = np.empty(self.size, dtype=vector.dtype)
@@ -251,10 +247,6 @@ class Reduced:
         if np.abs(phases.imag).max() < 1e-12:
             return self._reduction.assembled(phases.real @ self._blocks)
         return self._reduction.assembled(self._combined(phases))
-
-    def slope(self, wave: tuple[float, float], axis: int) -> csc_array:
-        """The Hermitian derivative by k . a1 (axis 0) or k . a2 (axis 1)."""
-        return self._reduction.assembled(self._combined(self._reduction.slopes(wave, axis)))
 
     def _combined(self, factors: ComplexArray) -> ComplexArray:
         """The sorted entries times complex factors, without a complex copy of them."""

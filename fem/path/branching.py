@@ -60,7 +60,7 @@ def follow_branch(
     found: list[State] = []
     shortest = 0.1 * walker.options.first_amplitude * length
     reach = walker.options.first_amplitude * length  # the largest amplitude to try next
-    walker.factor = None
+    walker.linearisation = None
     while len(found) < len(targets):
         target = targets[len(found)]
         wanted = _amplitude_at(points, target, reach)
@@ -78,7 +78,7 @@ def follow_branch(
             reach = 0.5 * (points[-1].amplitude + min(wanted, reach))
             if reach - points[-1].amplitude < shortest:
                 return found
-            walker.factor = None  # it may be that of the state refused
+            walker.linearisation = None  # it may be that of the state refused
             continue
         points.append(point)
         reach = walker.options.growth * point.amplitude
@@ -222,7 +222,7 @@ def _follow(
         constraint = Constraint(weights, critical.u, amplitude)
         found = walker.equilibrium(*_predicted(points, amplitude), constraint)
         if found is None:
-            step, walker.factor = 0.5 * step, None  # it may belong to the failed state
+            step, walker.linearisation = 0.5 * step, None  # it may belong to the failed state
             continue
         strain_rate = 1.0 / float(weights.dot(found.tangent))
         points.append(
@@ -277,7 +277,8 @@ def _until_critical(walker: PathFollower, largest: float) -> tuple[State, Critic
             return path[-2], critical, "complete"
         path.pop()
         steps = {n: getattr(walker.options, n) / 3.0 for n in ("first_step", "largest_step")}
-        walker.options, walker.factor = replace(walker.options, **steps), None
+        walker.options = replace(walker.options, **steps)
+        walker.linearisation = None
     return path[-1], None, (
         f"unstable between {100 * path[-1].strain:.4g} and {100 * last.strain:.4g} %, where no "
         "bifurcation was found"

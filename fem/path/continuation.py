@@ -14,8 +14,14 @@ import numpy as np
 from petsc4py import PETSc
 
 from modeharvest.fem.experiment import PathOptions
-from modeharvest.fem.path.equilibrium import Structure, SymmetricFactor
-from modeharvest.fem.path.newton import Constraint, NewtonOutcome, correct, path_tangent
+from modeharvest.fem.path.equilibrium import Structure
+from modeharvest.fem.path.newton import (
+    Constraint,
+    Linearisation,
+    NewtonOutcome,
+    correct,
+    path_tangent,
+)
 from modeharvest.fem.path.predictor import hermite_weights
 from modeharvest.fem.path.stability import Mode, lowest_modes
 from modeharvest.util.progress import Progress, silent
@@ -54,13 +60,13 @@ class State:
 class PathFollower:
     """Follows the paths of one structure; the last state's factor serves the next step.
 
-    ``factor`` and ``modes`` (the lowest ones) belong to the state found last.
+    ``linearisation`` and ``modes`` (the lowest ones) belong to the state found last.
     """
 
     structure: Structure
     options: PathOptions = field(default_factory=PathOptions)
     progress: Progress = silent
-    factor: SymmetricFactor | None = None
+    linearisation: Linearisation | None = None
     modes: list[Mode] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -84,12 +90,12 @@ class PathFollower:
 
         None if Newton does not get there, or gets to a state with a reversed element.
         """
-        found = correct(self.structure, guess, strain, self.factor, constraint)
+        found = correct(self.structure, guess, strain, self.linearisation, constraint)
         if (
             found.outcome is not NewtonOutcome.CONVERGED
             or self.structure.smallest_jacobian(found.u) <= 0.0
         ):
-            self.factor = None  # it may be that of a state astray
+            self.linearisation = None  # it may be that of a state astray
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)
 
@@ -98,12 +104,13 @@ class PathFollower:
     ) -> State:
         """Factorise at a converged equilibrium: its inertia, modes, and rate along the path."""
         eigenvalues: tuple[float, ...] = ()
-        self.factor = self.structure.factor(u)
+        factor = self.structure.factor(u)
         if with_modes:
-            self.modes = lowest_modes(self.factor, self.mass, _MODES, self.modes, _RESIDUAL)
+            self.modes = lowest_modes(factor, self.mass, _MODES, self.modes, _RESIDUAL)
             eigenvalues = tuple(mode.eigenvalue for mode in self.modes)
-        tangent = path_tangent(self.structure, self.factor, load)
-        return State(strain, u, tangent, self.factor.negative_pivots, eigenvalues)
+        tangent = path_tangent(self.structure, factor, load)
+        self.linearisation = Linearisation(factor, tangent, float(load.norm()))
+        return State(strain, u, tangent, factor.negative_pivots, eigenvalues)
 
     # -- the primary path ---------------------------------------------------------------
 
@@ -142,7 +149,7 @@ class PathFollower:
                 guess = _extrapolate(states, strain)
                 state = self.equilibrium(strain, guess)
                 if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
-                    self.factor = None  # it may be that of the state refused
+                    self.linearisation = None  # it may be that of the state refused
                     step = 0.5 * (strain - here)
                     if step < _SMALLEST_STEP:
                         return False

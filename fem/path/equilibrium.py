@@ -150,7 +150,7 @@ class Structure:
         self._along = dolfinx.fem.Function(self.V)
         self._along_form = self._forms.stiffness_along(self._along)
         self.factorisations = 0
-        self.tangent: Any = None
+        self.tangent = dolfinx_api.create_symmetric_matrix(self._forms.stiffness)
         self._factor: SymmetricFactor | None = None
 
     def _constrain(self, loading: EdgeCompression) -> None:
@@ -257,11 +257,7 @@ class Structure:
         The matrix is the same object at every call, assembled anew.
         """
         self._load(u)
-        self.tangent = dolfinx_api.assemble_matrix(
-            self._forms.stiffness, self._bcs, 1.0, self.tangent
-        )
-        self.tangent.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        return self.tangent
+        return dolfinx_api.assemble_matrix(self._forms.stiffness, self._bcs, 1.0, self.tangent)
 
     def factor(self, u: PETSc.Vec) -> SymmetricFactor:
         """Factorise the tangent stiffness at ``u``; as the matrix, always the same object."""

@@ -47,12 +47,31 @@ class Constraint:
 
 
 @dataclass(frozen=True, eq=False)
+class Linearisation:
+    """How the structure answers to small changes of an equilibrium: serves states nearby, too.
+
+    Parameters
+    ----------
+    factor
+        Of the tangent stiffness there.
+    tangent
+        du/d(strain) along the path [mm].
+    load_size
+        The norm of the load there [N/mm]: see ``Structure.load``.
+    """
+
+    factor: SymmetricFactor
+    tangent: PETSc.Vec
+    load_size: float
+
+
+@dataclass(frozen=True, eq=False)
 class Correction:
-    """Where Newton's method arrived, the load there (see ``Structure.load``), why it stopped."""
+    """Where Newton's method arrived, and why it stopped; where that is an equilibrium, its load."""
 
     u: PETSc.Vec
     strain: float
-    load: PETSc.Vec
+    load: PETSc.Vec | None
     outcome: NewtonOutcome
 
 
@@ -60,7 +79,7 @@ def correct(
     structure: Structure,
     guess: PETSc.Vec,
     strain: float,
-    factor: SymmetricFactor | None = None,
+    near: Linearisation | None = None,
     constraint: Constraint | None = None,
 ) -> Correction:
     """Find the equilibrium near ``guess``.
@@ -73,12 +92,12 @@ def correct(
         Start (left as it is); its constrained components are set from ``strain``.
     strain
         Nominal strain: prescribed, or with a constraint the start of it.
-    factor
-        Factor of the tangent at a state nearby, if there is one.
+    near
+        That of a state nearby, if there is one.
     constraint
         Prescribe an amplitude instead of the strain.
     """
-    iterate = _Iterate(structure, guess, strain, factor, constraint)
+    iterate = _Iterate(structure, guess, strain, near, constraint)
     outcome = NewtonOutcome.SLOW
     for _ in range(_MAX_ITERATIONS):
         iterate.evaluate()
@@ -104,14 +123,19 @@ class _Iterate:
         structure: Structure,
         guess: PETSc.Vec,
         strain: float,
-        factor: SymmetricFactor | None,
+        near: Linearisation | None,
         constraint: Constraint | None,
     ) -> None:
-        self.structure, self.constraint, self.factor = structure, constraint, factor
+        self.structure, self.constraint = structure, constraint
         self.u, self.strain = guess.copy(), strain
         structure.prescribe(self.u, strain)
-        self.tangent: PETSc.Vec | None = None
-        self._weigh()
+        self.factor: SymmetricFactor | None = None
+        self.load: PETSc.Vec | None = None
+        if near is None:
+            self._weigh()
+        else:
+            self.factor, self.tangent = near.factor, near.tangent
+            self.small = STRAIN_TOLERANCE * near.load_size
         self.factors = 0
         self.last: _NewtonStep | None = None
 
@@ -126,7 +150,7 @@ class _Iterate:
         """Whether the residual and the constraint are within tolerance."""
         if not (self.size <= self.small and abs(self.miss) <= 1e-9):
             return False
-        self._weigh()  # the tolerance was that of the guess
+        self._weigh()  # the tolerance was that of a state nearby
         return self.size <= self.small
 
     def _weigh(self) -> None:
@@ -156,10 +180,11 @@ class _Iterate:
         if step is None:
             if self.factors == _MAX_FACTORS or not math.isfinite(self.size):
                 return False
-            self.factor, self.tangent = self.structure.factor(self.u), None
+            self.factor = self.structure.factor(self.u)
             self.factors += 1
             if self.constraint is not None:
                 self._weigh()
+                self.tangent = path_tangent(self.structure, self.factor, self.load)
             step = self._step(is_fresh=True)
         self._take(step)
         return True
@@ -175,8 +200,6 @@ class _Iterate:
         step, change = self.factor.solve(self.residual), 0.0
         step.scale(-1.0)
         if self.constraint is not None:
-            if self.tangent is None:
-                self.tangent = path_tangent(self.structure, self.factor, self.load)
             weights = self.constraint.weights
             change = -(self.miss + float(weights.dot(step))) / float(weights.dot(self.tangent))
             step.axpy(change, self.tangent)

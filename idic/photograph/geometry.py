@@ -36,6 +36,25 @@ from modeharvest.util.errors import InputError
 Corners = tuple[tuple[float, float], ...]
 
 
+def _require_area(corners: Corners, where: str) -> None:
+    """Raise InputError unless at least three corners [px] are a pixel or more off one line."""
+    if len(corners) < 3:
+        raise InputError(
+            f"{where}: expected a polygon of at least three corners [column, row], got "
+            f"{len(corners)}; add the others, or leave it out"
+        )
+    (x, y), *others = corners
+    sides = [(other_x - x, other_y - y) for other_x, other_y in others]
+    along_x, along_y = max(sides, key=lambda side: math.hypot(*side))
+    length = math.hypot(along_x, along_y)
+    width = max(abs(along_x * v - along_y * u) for u, v in sides) / length if length else 0.0
+    if not width >= 1.0:  # NaN neither
+        raise InputError(
+            f"{where}: expected a polygon with an area, got {len(corners)} corners on one line, "
+            f"from {list(min(corners))} to {list(max(corners))} [column, row]; correct them"
+        )
+
+
 @dataclass(frozen=True)
 class RegionTable:
     """A part of the specimen with a pattern, and modes, of its own.
@@ -52,11 +71,9 @@ class RegionTable:
     polygon: Corners = ()
 
     def __post_init__(self) -> None:
-        if not self.name or len(self.polygon) < 3:
-            raise InputError(
-                "specimen.regions: expected a name and a polygon of at least three corners "
-                f"[column, row], got name = {self.name!r} and {len(self.polygon)} corners"
-            )
+        if not self.name:
+            raise InputError("specimen.regions: expected a name for each, got one without")
+        _require_area(self.polygon, f"specimen.regions {self.name!r}")
 
 
 @dataclass(frozen=True)
@@ -93,10 +110,12 @@ class SpecimenTable:
                 f"specimen: expected a cell_size above 0 mm, got {self.cell_size}; it is the "
                 "distance of neighbouring holes"
             )
-        if self.polygon and (self.cells or len(self.polygon) < 3):
+        if self.polygon:
+            _require_area(self.polygon, "specimen.polygon")
+        if self.polygon and self.cells:
             raise InputError(
-                "specimen: expected a polygon of at least three corners or a mask image 'cells', "
-                f"got {len(self.polygon)} corners and cells = {self.cells!r}"
+                f"specimen: expected a polygon or a mask image 'cells', got both, cells = "
+                f"{self.cells!r}"
             )
         names = [region.name for region in self.regions]
         if len(set(names)) < len(names):

@@ -263,7 +263,7 @@ def _blocks(result: Result, mask: NDArray[np.bool_], block: float) -> list[Assem
         for left in range(0, grid.cols, side):
             here = (slice(top, top + side), slice(left, left + side))
             if mask[here].any():
-                inside = np.zeros_like(mask)
+                inside = np.zeros(mask.shape, np.bool_)
                 inside[here] = mask[here]
                 found.append(Assembly(result.ansatz, grid, inside))
     if len(found) < _FEWEST_BLOCKS:

@@ -8,16 +8,24 @@ from typing import Annotated
 
 import typer
 
-from modeharvest.cli.messages import UNUSABLE, CaseName, OutFolder, SolutionFile, bars, tell
+from modeharvest.cli.messages import (
+    UNUSABLE,
+    CaseName,
+    OutFolder,
+    SolutionFile,
+    bars,
+    folder_option,
+    tell,
+)
 from modeharvest.util.errors import InputError
 
 
 def make(
     case: CaseName,
-    out: Annotated[Path, typer.Option("--out", help="The public folder.", metavar="DIR")],
+    out: Annotated[Path, folder_option("--out", "The public folder.")],
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="Folder for the truth [DIR-truth].", metavar="DIR"),
+        folder_option("--truth", "Folder for the truth [DIR-truth]."),
     ] = None,
     solution: SolutionFile = None,
 ) -> None:
@@ -91,7 +99,7 @@ def _refuse(reasons: Mapping[str, str]) -> None:
 
 
 def star(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the set.", metavar="DIR")],
+    out: Annotated[Path, folder_option("--out", "Folder for the set.")],
     noise: Annotated[
         list[float] | None,
         typer.Option("--noise", help="Share of full scale [0.01]; once for each level."),

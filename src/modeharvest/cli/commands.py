@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars, warn
+from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars, folder_option, warn
 from modeharvest.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -214,9 +214,7 @@ def study(
             help="robustness, noise, systematic, modes or resolution; or a TOML file of your own.",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for everything the study leaves.", metavar="DIR")
-    ],
+    out: Annotated[Path, folder_option("--out", "Folder for everything the study leaves.")],
     workers: Annotated[
         int | None, typer.Option(help="Processes on this machine; 2 by default.", metavar="N")
     ] = None,

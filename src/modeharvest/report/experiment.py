@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import material_text
-from modeharvest.idic.spectra.pattern import REFERENCE_MODE, WavePattern
-from modeharvest.idic.spectra.spectrum import Spectrum
-from modeharvest.imaging.imageset import ImageSet
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.report.figures.curves import draw_convergence, draw_eigenvalues, draw_load
 from modeharvest.report.figures.experiment import (
     PANELS,
@@ -24,7 +23,6 @@ from modeharvest.report.figures.style import to_svg
 from modeharvest.report.model import Picture, render
 from modeharvest.util.files import atomic
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.truth import Comparison
 
 Snapshot = Mapping[str, Any]
 
@@ -254,15 +252,64 @@ EXPERIMENT_SECTIONS = (
 """Anchor, heading and panels of each group of pictures."""
 
 
+@dataclass(frozen=True)
+class Drawings:
+    """The pictures of a validation, made before there are numbers to write below them.
+
+    Parameters
+    ----------
+    headings
+        How each snapshot is called: ``id``, ``state``, ``strain`` and ``branch``.
+    hero
+        SVG of the last snapshot.
+    panels
+        By key, a picture for each snapshot.
+    curves
+        Load path and eigenvalues, where the solution has them.
+    convergence
+        A picture for each snapshot.
+    """
+
+    headings: list[dict[str, str]]
+    hero: str
+    panels: dict[str, list[Picture]]
+    curves: list[Picture]
+    convergence: list[Picture]
+
+
+def draw(atlas: ExperimentReportData, progress: Progress = silent) -> Drawings:
+    """Draw all that is shown of a validation; what needs the truth last, as it may be on its way.
+
+    Parameters
+    ----------
+    atlas
+        What is shown.
+    progress
+        Listener.
+    """
+    solution = atlas.solution
+    headings = [_heading(solution, strain) for strain in atlas.strains]
+    curves = _curves(solution)
+    convergence = [
+        _picture("convergence", "Convergence", heading, draw_convergence(result))
+        for heading, result in zip(headings, atlas.results, strict=True)
+    ]
+    shown = [panel for panel in PANELS if atlas.has_mode or not panel.needs_mode]
+    pictures = {}
+    for n, panel in enumerate(sorted(shown, key=lambda panel: panel.needs_truth)):
+        progress(n, len(shown), "report")
+        pictures[panel.key] = [
+            _picture(panel.key, panel.title, heading, panel.draw(atlas, k),
+                     _panel_caption(panel, atlas, k), panel.exact)
+            for k, heading in enumerate(headings)
+        ]  # fmt: skip
+    hero = to_svg(draw_hero(atlas, len(headings) - 1), "hero", "Image and pattern")
+    progress(1, 1, "report")
+    return Drawings(headings, hero, pictures, curves, convergence)
+
+
 def write_experiment_report(
-    path: Path | str,
-    case: Mapping[str, Any],
-    solution: Solution,
-    images: ImageSet,
-    comparisons: Sequence[Comparison],
-    spectra: Sequence[tuple[Spectrum, WavePattern]],
-    summary: Mapping[str, Any],
-    progress: Progress = silent,
+    path: Path | str, case: Mapping[str, Any], drawings: Drawings, summary: Mapping[str, Any]
 ) -> None:
     """Write the report of a validation, atomically.
 
@@ -272,81 +319,61 @@ def write_experiment_report(
         The HTML file.
     case
         What was run, as plain values (:meth:`modeharvest.runs.case.Case.plain`).
-    solution, images
-        What the truth comes from, and what was measured.
-    comparisons
-        One for each snapshot, by ascending strain.
-    spectra
-        For each of them, spectral densities and what is read off them.
+    drawings
+        Of the same snapshots as the summary's.
     summary
         The content of ``summary.json``.
-    progress
-        Listener.
     """
-    pitch = float(case["experiment"]["specimen"]["pitch"])
-    atlas = ExperimentReportData(solution, images, comparisons, spectra, pitch)
-    headings = [_heading(snapshot, summary) for snapshot in summary["snapshots"]]
     page = render(
         EXPERIMENT_TEMPLATE,
         title=summary.get("title") or "Validation",
         case=case,
         summary=summary,
-        headings=headings,
-        hero=to_svg(draw_hero(atlas, len(comparisons) - 1), "hero", "Image and pattern"),
+        headings=drawings.headings,
+        hero=drawings.hero,
         keys=key_numbers(summary),
         material=material_text(case["experiment"]["material"]),
-        sections=_sections(atlas, summary, headings, progress),
-        curves=_curves(solution, summary),
-        convergence=[
-            _picture("convergence", "Convergence", heading, draw_convergence(c.result))
-            for heading, c in zip(headings, comparisons, strict=True)
-        ],
+        sections=_sections(drawings, summary),
+        curves=drawings.curves,
+        convergence=drawings.convergence,
         numbers=number_rows(summary),
         modes=mode_rows(summary),
         reservations=notes(summary),
-    )  # fmt: skip
+    )
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
-    progress(1, 1, "report")
 
 
-def _sections(
-    atlas: ExperimentReportData,
-    summary: Mapping[str, Any],
-    headings: Sequence[Mapping[str, str]],
-    progress: Progress,
-) -> list[dict[str, Any]]:
-    """The groups of panels, each panel with a picture for every snapshot."""
-    panels = {p.key: p for p in PANELS if atlas.has_mode or not p.needs_mode}
-    cards = {}
-    for n, panel in enumerate(panels.values()):
-        progress(n, len(panels), "report")
-        cards[panel.key] = [
-            _picture(panel.key, panel.title, heading, panel.draw(atlas, k),
-                     _panel_caption(panel, atlas, k, summary), panel.exact)
-            for k, heading in enumerate(headings)
-        ]  # fmt: skip
+def _sections(drawings: Drawings, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The groups of panels, the numbers of each snapshot below its pictures."""
+    panels = {panel.key: panel for panel in PANELS}
+
+    def card(key: str) -> dict[str, Any]:
+        pictures = [
+            replace(picture, fact=picture.fact or panel_numbers(key, snapshot))
+            for picture, snapshot in zip(drawings.panels[key], summary["snapshots"], strict=True)
+        ]
+        return {"panel": panels[key], "pictures": pictures}
+
     return [
-        {"id": anchor, "title": title,
-         "cards": [{"panel": panels[k], "pictures": cards[k]} for k in keys if k in panels]}
+        {"id": anchor, "title": title, "cards": [card(k) for k in keys if k in drawings.panels]}
         for anchor, title, keys in EXPERIMENT_SECTIONS
-    ]  # fmt: skip
+    ]
 
 
-def _panel_caption(
-    panel: SnapshotPanel, atlas: ExperimentReportData, k: int, summary: Mapping[str, Any]
-) -> str:
+def _panel_caption(panel: SnapshotPanel, atlas: ExperimentReportData, k: int) -> str:
+    """What the drawing itself has to say."""
     if panel.key == "phi1":
         return f"drawn as with v₁ = {atlas.shape_scale(k):.3g} mm everywhere"
-    return panel_numbers(panel.key, summary["snapshots"][k])
+    return ""
 
 
-def _curves(solution: Solution, summary: Mapping[str, Any]) -> list[Picture]:
+def _curves(solution: Solution) -> list[Picture]:
     """Load path and eigenvalues, where the solution has them."""
     path, critical = solution.info.get("path"), solution.info.get("critical")
     if not path or not path.get("primary", {}).get("nominal_strain"):
         return []
-    load = draw_load(path, summary.get("critical_strain"))
+    load = draw_load(path, _critical_strain(solution))
     eigenvalues = draw_eigenvalues(path, critical)
     return [
         Picture("load", "Load over strain", to_svg(load, "load", "Load over strain")),
@@ -354,17 +381,22 @@ def _curves(solution: Solution, summary: Mapping[str, Any]) -> list[Picture]:
     ]
 
 
-def _heading(snapshot: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[str, str]:
+def _critical_strain(solution: Solution) -> float | None:
+    critical = solution.info.get("critical")
+    return None if critical is None else float(critical["strain"])
+
+
+def _heading(solution: Solution, strain: float) -> dict[str, str]:
     """How a snapshot is called on the page."""
-    strain, critical = snapshot["nominal_strain"], summary.get("critical_strain")
-    if snapshot["branch"] != "primary":
+    branch, critical = solution.at(strain).branch, _critical_strain(solution)
+    if branch != "primary":
         state = "After buckling"
     elif critical is None:
         state = "Deformed"
     else:
         state = "Before buckling" if strain < critical else "Unstable path"
     return {"id": f"{round(1e4 * strain):04d}", "state": state, "strain": f"{100 * strain:.4g} %",
-            "branch": snapshot["branch"]}  # fmt: skip
+            "branch": branch}  # fmt: skip
 
 
 def _picture(

@@ -52,14 +52,14 @@ def state(frame: Frame) -> str:
     return "Deformed" if has is None else "After buckling" if has else "Before buckling"
 
 
-def label(frame: Frame) -> str:
+def photograph_label(frame: Frame) -> str:
     """How a photograph is called above its pictures."""
     return f"{state(frame)} · {percent(frame['strain'])}"
 
 
-def labels(frames: Sequence[Frame]) -> dict[str, str]:
+def photograph_labels(frames: Sequence[Frame]) -> dict[str, str]:
     """Each photograph's label by its name, which is added where labels would be the same."""
-    said = {frame["name"]: label(frame) for frame in frames}
+    said = {frame["name"]: photograph_label(frame) for frame in frames}
     often = Counter(said.values())
     return {name: text if often[text] == 1 else f"{text} · {name}" for name, text in said.items()}
 
@@ -293,7 +293,7 @@ WORDS = {
     "percent": percent,
     "key_numbers": key_numbers,
     "notes": notes,
-    "label": label,
+    "label": photograph_label,
 }
 """What the template calls by name."""
 
@@ -321,7 +321,7 @@ def write_harvest_report(
     atlas = PhotographReportData(harvest)
     by_name = {frame["name"]: frame for frame in told["frames"]}
     shown = [by_name[frame.name] for frame in atlas.shown]
-    names = labels(shown)
+    labels = photograph_labels(shown)
     page = render(
         PHOTOGRAPHS_TEMPLATE,
         title=harvest.title,
@@ -329,15 +329,15 @@ def write_harvest_report(
         summary=told,
         words=WORDS,
         shown=shown,
-        labels=names,
+        labels=labels,
         hero=to_svg(draw_hero(atlas), "hero", "The last photograph and its pattern"),
         reference=_photograph_picture("reference", "The reference", draw_reference(atlas)),
         optics=_optics(harvest),
-        sections=_sections(atlas, by_name, names, progress),
+        sections=_sections(atlas, by_name, labels, progress),
         curves=_curves(harvest, told),
         convergence=[
             _photograph_picture(
-                f"convergence-{k}", names[frame.name], draw_convergence(frame.result)
+                f"convergence-{k}", labels[frame.name], draw_convergence(frame.result)
             )
             for k, frame in enumerate(atlas.shown, start=1)
         ],

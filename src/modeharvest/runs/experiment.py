@@ -15,8 +15,10 @@ not run again. Two runs of a case leave the same bytes in every file but ``timin
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,8 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
-from modeharvest.report.experiment import write_experiment_report
+from modeharvest.report.experiment import draw, write_experiment_report
+from modeharvest.report.figures.experiment import ExperimentReportData
 from modeharvest.runs.case import Case, read_case, shipped_cases, shipped_solution
 from modeharvest.runs.precompile import precompiling
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
@@ -36,6 +39,7 @@ from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import Stages, exclusive, stage_key
 from modeharvest.validation.summary import (
     MeasuredExperiment,
+    T,
     compare_snapshot,
     displacement_spectrum,
     experiment_summary,
@@ -67,29 +71,56 @@ def validate(
     dict
         The content of ``summary.json``.
     """
-    comparisons = []
-    for k, strain in enumerate(sorted(measured.results)):
-        progress(k, len(measured.results), "compare with the truth")
-        comparisons.append(compare_snapshot(measured, strain))
-    with ThreadPoolExecutor(os.cpu_count()) as threads:  # numpy's work, and it lets go of the GIL
-        spectra = list(
-            threads.map(lambda c: displacement_spectrum(c, measured.specimen), comparisons)
+    strains = sorted(measured.results)
+    results = [measured.results[strain] for strain in strains]
+    # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
+    with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        comparisons = _Awaited([threads.submit(compare_snapshot, measured, e) for e in strains])
+        spectra = _Awaited(
+            [
+                threads.submit(displacement_spectrum, comparisons, k, measured)
+                for k in range(len(strains))
+            ]
         )
-        patterns = [pattern for _, pattern in spectra]
-        snapshots = list(
-            threads.map(
-                lambda c, pattern: snapshot_summary(c, pattern, measured), comparisons, patterns
-            )
+        snapshots = _Awaited(
+            [
+                threads.submit(snapshot_summary, comparisons, spectra, k, measured)
+                for k in range(len(strains))
+            ]
         )
-
-    summary = experiment_summary(measured, case, snapshots)
-    page = folder / "report.html"
-    solution, images = measured.solution, measured.images
-    write_experiment_report(
-        page, dict(case), solution, images, comparisons, spectra, summary, progress
-    )
+        atlas = ExperimentReportData(
+            measured.solution, measured.images, strains, results, comparisons, spectra,
+            measured.specimen.pitch,
+        )  # fmt: skip
+        drawings = draw(atlas, progress)
+        summary = experiment_summary(measured, case, list(snapshots))
+    write_experiment_report(folder / "report.html", case, drawings, summary)
     write_json(folder / "summary.json", summary)
     return summary
+
+
+@contextmanager
+def _brief_turns() -> Iterator[None]:
+    """Let no thread keep the GIL for long: by default each of many short kernels waits 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+class _Awaited(Sequence[T]):
+    """Results of threads that may still be at work, waited for where they are used."""
+
+    def __init__(self, coming: Sequence[Future[T]]) -> None:
+        self._coming = coming
+
+    def __len__(self) -> int:
+        return len(self._coming)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._coming[k].result()
 
 
 _COMPLETE = "complete"

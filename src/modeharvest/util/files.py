@@ -212,7 +212,7 @@ def atomic(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         remove_orphans(path.parent)
         yield temporary
         _flush(temporary, os.O_RDWR)
@@ -254,6 +254,38 @@ def may_be_alive(process: int) -> bool:
     except (OSError, OverflowError):  # another user's; no id at all
         return True
     return True
+
+
+def make_folder(folder: Path | str) -> None:
+    """Make a folder, and those above it, where they are not there yet.
+
+    Raises
+    ------
+    InputError
+        If there is a file in its place, or in that of one above it.
+    OSError
+        If the operating system refuses it for another reason.
+    """
+    folder = Path(folder)
+    require_no_file(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def require_no_file(folder: Path) -> None:
+    """Check that a folder is there or can be: that no file is in its place, or above it.
+
+    Raises
+    ------
+    InputError
+        If one is.
+    """
+    for place in (folder, *folder.parents):
+        if os.path.isdir(place):
+            return
+        if os.path.lexists(place):
+            raise InputError(
+                f"expected a folder at {place}, found a file; remove it, or take another folder"
+            )
 
 
 def require_writable(folder: Path | str) -> None:

@@ -35,7 +35,14 @@ from typing import Any
 
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import may_be_alive, read_json, remove_orphans, sha256_of, write_json
+from modeharvest.util.files import (
+    make_folder,
+    may_be_alive,
+    read_json,
+    remove_orphans,
+    sha256_of,
+    write_json,
+)
 from modeharvest.util.machine import on_first
 
 _SOURCES = (".py", ".html", ".css")
@@ -271,7 +278,7 @@ class _Lock:
 
     def acquire(self) -> None:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
             while self._file is None:
                 self._file = self._locked()
             remove_orphans(self._path.parent)

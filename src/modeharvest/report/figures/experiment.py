@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
+from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
@@ -39,8 +40,10 @@ class ExperimentReportData:
     ----------
     solution, images
         Of the run.
+    strains, results
+        Of each snapshot its nominal strain [-] and what was found, by ascending strain.
     comparisons
-        One for each snapshot.
+        Of each snapshot with the truth.
     spectra
         For each snapshot, its spectral densities and what is read off them.
     pitch
@@ -49,6 +52,8 @@ class ExperimentReportData:
 
     solution: Solution
     images: ImageSet
+    strains: Sequence[float]
+    results: Sequence[Result]
     comparisons: Sequence[Comparison]
     spectra: Sequence[tuple[Spectrum, WavePattern]]
     pitch: float
@@ -66,7 +71,7 @@ class ExperimentReportData:
     @cached_property
     def material(self) -> NDArray[np.bool_]:
         """Where there is material, on :attr:`sheet`'s grid."""
-        seen = self.sheet.average(np.where(self.comparisons[0].mask, 1.0, np.nan))
+        seen = self.sheet.average(np.where(self.images.mask(), 1.0, np.nan))
         return np.asarray(np.isfinite(seen))
 
     @cached_property
@@ -77,11 +82,11 @@ class ExperimentReportData:
     @property
     def has_mode(self) -> bool:
         """Whether the ansatz has a mode to show."""
-        return all(c.result.ansatz.modes for c in self.comparisons)
+        return all(result.ansatz.modes for result in self.results)
 
     def shape_scale(self, k: int) -> float:
         """By how much phi_1 of snapshot k is drawn, for a largest displacement of SHAPE l [mm]."""
-        largest = lengths(self.comparisons[k].result.phi(grid=self.sheet.grid))
+        largest = lengths(self.results[k].phi(grid=self.sheet.grid))
         top = float(largest.max())
         return DRAWN_SHAPE * self.pitch / top if top > 0 else 1.0
 
@@ -108,6 +113,8 @@ class SnapshotPanel:
         Whether there must be a mode.
     exact
         Whether the picture's pixels are to be kept exactly.
+    needs_truth
+        Whether it shows a comparison, or the spectra of the truth.
     """
 
     key: str
@@ -118,16 +125,17 @@ class SnapshotPanel:
     draw: Callable[[ExperimentReportData, int], Figure]
     needs_mode: bool = False
     exact: bool = False
+    needs_truth: bool = False
 
 
 def measured_motion(atlas: ExperimentReportData, k: int) -> DisplacementFunction:
     """The displacement that IDIC found in snapshot k."""
-    result = atlas.comparisons[k].result
+    result = atlas.results[k]
     return lambda x, y: result.ansatz.displacement(result.unknowns, x, y)
 
 
 def _image(atlas: ExperimentReportData, k: int) -> Figure:
-    images, strain = atlas.images, atlas.comparisons[k].strain
+    images, strain = atlas.images, atlas.strains[k]
     return fields.draw_image(
         atlas.sheet, images.deformed(strain), images.deformed_mask(strain), images.grid,
         atlas.solution.at(strain).displacement,
@@ -140,14 +148,14 @@ def _density(component: int) -> Callable[[ExperimentReportData, int], Figure]:
 
 def _v0(component: int) -> Callable[[ExperimentReportData, int], Figure]:
     def draw(atlas: ExperimentReportData, k: int) -> Figure:
-        v0 = UM * atlas.comparisons[k].result.v0(atlas.sheet.grid)[..., component]
+        v0 = UM * atlas.results[k].v0(atlas.sheet.grid)[..., component]
         return fields.draw_field(atlas.sheet, v0, ColourScale.signed(_on_material(atlas, v0), "µm"))
 
     return draw
 
 
 def _v1(atlas: ExperimentReportData, k: int) -> Figure:
-    result, grid = atlas.comparisons[k].result, atlas.sheet.grid
+    result, grid = atlas.results[k], atlas.sheet.grid
     taper = result.ansatz.modes[0].taper
     support = taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :]
     v1 = np.where(support > 0.0, UM * result.v(grid=grid), np.nan)
@@ -158,7 +166,7 @@ def _v1(atlas: ExperimentReportData, k: int) -> Figure:
 
 
 def _phi1(atlas: ExperimentReportData, k: int) -> Figure:
-    result, scale = atlas.comparisons[k].result, atlas.shape_scale(k)
+    result, scale = atlas.results[k], atlas.shape_scale(k)
     return fields.draw_shape(
         atlas.sheet, lambda x, y: scale * result.ansatz.phi(0, result.unknowns, x, y)
     )
@@ -166,7 +174,7 @@ def _phi1(atlas: ExperimentReportData, k: int) -> Figure:
 
 def _fluctuation(component: int) -> Callable[[ExperimentReportData, int], Figure]:
     def draw(atlas: ExperimentReportData, k: int) -> Figure:
-        result = atlas.comparisons[k].result
+        result = atlas.results[k]
         field = UM * result.fluctuation(grid=atlas.sheet.grid)[..., component]
         return fields.draw_field(
             atlas.sheet, field, ColourScale.signed(_on_material(atlas, field), "µm"),
@@ -198,14 +206,14 @@ def _length_of(name: str) -> Callable[[ExperimentReportData, int], Figure]:
 
 def draw_hero(atlas: ExperimentReportData, k: int) -> Figure:
     """The deformed image of snapshot k turning into the pattern that was measured in it."""
-    images, comparison, sheet = atlas.images, atlas.comparisons[k], atlas.sheet
-    field = comparison.result.fluctuation(grid=sheet.grid) if atlas.has_mode else comparison.w
+    images, strain, sheet, result = atlas.images, atlas.strains[k], atlas.sheet, atlas.results[k]
+    field = result.fluctuation(grid=sheet.grid) if atlas.has_mode else atlas.comparisons[k].w
     length = UM * lengths(field)
     if not atlas.has_mode:
         length = sheet.average(length)
     end = ColourScale.size(_on_material(atlas, length), "µm")
     return fields.draw_blend(
-        sheet, images.deformed(comparison.strain), images.deformed_mask(comparison.strain),
+        sheet, images.deformed(strain), images.deformed_mask(strain),
         images.grid, length, ColourScale(GLOW, 0.0, end.high, "µm"), measured_motion(atlas, k),
     )  # fmt: skip
 
@@ -228,13 +236,13 @@ PANELS = (
         "density, the same for all snapshots; what is beyond, on the axes, comes from the "
         "specimen's edges. Rings: the wave vectors found (faint: the largest peak where there is "
         "no pattern).",
-        _density(0),
+        _density(0), needs_truth=True,
     ),
     SnapshotPanel(
         "Syy", "S<sub>yy</sub>", "Spectral density along y", "spect_virt (c)",
         "A wave and its mirror image on either diagonal make four peaks at (±½, ±½): a pattern "
         "that repeats after two cells.",
-        _density(1),
+        _density(1), needs_truth=True,
     ),
     SnapshotPanel(
         "v0x", "v<sub>0</sub> · e<sub>x</sub>", "Smooth field along x", "virt (a) and (i)",
@@ -274,23 +282,23 @@ PANELS = (
         "residual", "f − g∘φ", "Residual", "virt (g) and (o)",
         "Grey levels as a fraction of full scale, in the deformed configuration; single pixels, "
         "not averages. The colours end at the 99th percentile.",
-        _residual, exact=True,
+        _residual, exact=True, needs_truth=True,
     ),
     SnapshotPanel(
         "w", "‖w‖", "Microfluctuation field", "virt (h) and (p)",
         "Truth − IDIC, all that the measurement does not say, in the deformed configuration. "
         "The colours end at the 99.8th percentile.",
-        _length_of("w"),
+        _length_of("w"), needs_truth=True,
     ),
     SnapshotPanel(
         "best", "‖u − u<sub>best</sub>‖", "What the model can't say", "",
         "Truth − best fit of the same unknowns to the true displacement: no measurement with "
         "this ansatz can do better.",
-        _length_of("best_error"),
+        _length_of("best_error"), needs_truth=True,
     ),
     SnapshotPanel(
         "loss", "‖u<sub>IDIC</sub> − u<sub>best</sub>‖", "What the measurement loses", "",
         "IDIC − best fit: what is lost on top, on its own, smaller scale.",
-        _length_of("idic_to_best"),
+        _length_of("idic_to_best"), needs_truth=True,
     ),
 )  # fmt: skip

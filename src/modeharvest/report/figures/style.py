@@ -49,6 +49,7 @@ _RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each v
     "axes.labelcolor": INK,
     "axes.facecolor": "none",
     "axes.linewidth": 0.6,
+    "axes.titley": 1.0,  # by default all ticks are measured to see if the title is in their way
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.unicode_minus": True,
