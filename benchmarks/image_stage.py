@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh, Solution
+from modeharvest.imaging.camera import ImagedState
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.isoparametric import interpolate, locate, map_back
-from modeharvest.imaging.render import render_image
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.case import shipped_solution
@@ -64,13 +64,21 @@ def term_by_term(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
     return np.asarray(((along_row @ coefficients) * along_col).sum(axis=1).real)
 
 
+def render(mesh: Mesh, u: FloatArray, grid: PixelGrid, speckle: Speckle) -> NDArray[np.float32]:
+    """The grey levels at all pixel centres, on a black background; nothing kept of the mapping."""
+    scene = ImagedState(mesh, u, grid, speckle, 0.0)
+    centre, once = np.zeros((1, 2)), np.ones(1)
+    grey = scene.average(centre, once, np.ones(grid.shape, np.bool_))
+    return grey.reshape(grid.shape).astype(np.float32)
+
+
 def growth(mesh: Mesh, u: FloatArray) -> None:
     """Print seconds and peak memory of images of growing size.
 
     Memory shows where it exceeds what making the pattern took.
     """
     speckle = Speckle(SpeckleSpec(), (2048, 2048))
-    render_image(mesh, u, PixelGrid.centred(300, 250, 0.08), speckle, 0.0)
+    render(mesh, u, PixelGrid.centred(300, 250, 0.08), speckle)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print("| Mpx, image | Mpx, material | seconds | ns a pixel | peak memory ÷ float32 image |")
     print("|---|---|---|---|---|")
@@ -82,12 +90,12 @@ def growth(mesh: Mesh, u: FloatArray) -> None:
         for _ in range(3):
             del shown  # two images at a time would count twice
             begin = time.perf_counter()
-            shown = render_image(mesh, u, grid, speckle, 0.0)
+            shown = render(mesh, u, grid, speckle)
             seconds.append(time.perf_counter() - begin)
         peak = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-        pixels, least = shown.mask.size, min(seconds)
-        print(f"| {pixels / 1e6:.1f} | {shown.mask.sum() / 1e6:.1f} | {least:.2f} ", end="")
-        memory = f"{peak / shown.image.nbytes:.2f}" if peak else "-"
+        pixels, least = shown.size, min(seconds)
+        print(f"| {pixels / 1e6:.1f} | {(shown > 0.0).sum() / 1e6:.1f} | {least:.2f} ", end="")
+        memory = f"{peak / shown.nbytes:.2f}" if peak else "-"
         print(f"| {1e9 * least / pixels:.1f} | {memory} |", flush=True)
 
 
@@ -116,8 +124,8 @@ def stages(mesh: Mesh, u: FloatArray) -> None:
     mapping: dict[str, Work] = {
         "inverse mapping": lambda: locate(mesh.nodes + u, mesh.cells, mesh.element, grid),
         "two nodal fields": lambda: interpolate(located, mesh.cells, mesh.element, mesh.nodes),
-        "both at once": lambda: map_back(
-            mesh.nodes + u, mesh.cells, mesh.element, grid, mesh.nodes
+        "both at once": lambda: locate(
+            mesh.nodes + u, mesh.cells, mesh.element, grid, nodal=mesh.nodes
         ),
     }
     speckles: dict[str, Work] = {
@@ -128,7 +136,7 @@ def stages(mesh: Mesh, u: FloatArray) -> None:
         "cubic spline of the reference image": lambda: SplineImage.of(image, 3).sample(row, col)[0],
     }
     whole: dict[str, Work] = {
-        "whole image, mapping and speckle": lambda: render_image(mesh, u, grid, speckle, 0.0),
+        "whole image, mapping and speckle": lambda: render(mesh, u, grid, speckle),
     }
     found = in_turn(mapping | speckles | whole)
     some = np.random.default_rng(0).choice(row.size, POINTS, replace=False)
@@ -141,7 +149,7 @@ def stages(mesh: Mesh, u: FloatArray) -> None:
     for name in speckles:
         errors[name] = f"{abs(found[name][0][some] - truth).max():.1e} of full scale"
     (name,) = whole
-    shown = found[name][0].image[mask][some]
+    shown = found[name][0][mask][some]
     errors[name] = f"{abs(shown - truth).max():.1e} of full scale (float32)"
     print(f"{grid.rows} x {grid.cols} px, {row.size / 1e6:.2f} Mpx of them material, ", end="")
     print(f"{len(mesh.cells)} {mesh.element} cells at a strain of {100 * STRAIN:.1f} %")

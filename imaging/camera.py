@@ -89,8 +89,8 @@ class ImagedState:
         stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
         return float(1.0 / stretches.min())
 
-    def average(self, offsets: FloatArray, weights: FloatArray, wanted: BoolArray) -> FloatArray:
-        """(k,) weighted sum of the intensities at the k wanted pixels moved by each offset.
+    def average(self, offsets: FloatArray, weights: FloatArray, selected: BoolArray) -> FloatArray:
+        """(k,) weighted sum of the intensities at the k selected pixels moved by each offset.
 
         ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
         """
@@ -98,14 +98,14 @@ class ImagedState:
         nodes = mesh.nodes + (0.0 if self.displacement is None else self.displacement)
         require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
         reach = float(np.abs(offsets).max(initial=0.0))
-        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, wanted, reach)], mesh.element)
+        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
         total = render_rows_average(
-            near, nodes, self.grid, self.speckle.spline, self.background, wanted, offsets, weights
+            near, nodes, self.grid, self.speckle.spline, self.background, selected, offsets, weights
         )
-        return total[wanted]
+        return total[selected]
 
-    def _reaching(self, nodes: FloatArray, wanted: BoolArray, reach: float) -> BoolArray:
-        """(m,) True for elements that may hold a point within ``reach`` px of a wanted pixel."""
+    def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
+        """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
         element, shape = reference_element(self.mesh.element), self.grid.shape
         control = bezier_matrix(element.triangular) @ element.coefficients
         position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
@@ -113,7 +113,7 @@ class ImagedState:
         low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
         past = np.clip(np.ceil(hull.max(axis=1) + reach) + 1, 0, shape).astype(np.int64)
         count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=np.int64)
-        count[1:, 1:] = wanted.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+        count[1:, 1:] = selected.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
         (top, left), (bottom, right) = low.T, past.T
         inside = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
         return np.asarray(inside > 0)

@@ -178,7 +178,7 @@ class ImagePair:
             self.deformed, self.deformed_mask
         )
 
-    def with_images(self, reference: ArrayLike, deformed: ArrayLike) -> ImagePair:
+    def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> ImagePair:
         """The same pair with other grey levels: noisy, blurred."""
         return replace(self, reference=reference, deformed=deformed)
 

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.distortion.undistort import Positions
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, map_back
+from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
-from modeharvest.imaging.mapping.render_rows import render_rows
 from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import BoolArray, FloatArray
@@ -153,45 +152,3 @@ def render_deformed(
     image = np.full(grid.shape, background, dtype=np.float32)
     image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
     return Rendering(image, mask, located.doubly_covered), truth
-
-
-def render_image(
-    mesh: Mesh,
-    displacement: FloatArray,
-    grid: PixelGrid,
-    speckle: Speckle,
-    background: float,
-    where: str = "deformed mesh",
-) -> Rendering:
-    """Show the deformed specimen as :func:`render_deformed` does, without the truth.
-
-    Nothing is kept of the mapping, so that it is faster and needs little memory besides the image.
-
-    Parameters
-    ----------
-    mesh
-        The undeformed mesh [mm].
-    displacement
-        (n, 2) at its nodes [mm].
-    grid
-        The pixels.
-    speckle
-        The pattern that the material carries.
-    background
-        Intensity beside the material [fraction of full scale].
-    where
-        What the mesh is called in an error.
-
-    Raises
-    ------
-    InputError
-        If an element is turned inside out.
-    """
-    if speckle.spec.ink is None:
-        return Rendering(*render_rows(mesh, displacement, grid, speckle.spline, background, where))
-    nodes, home = mesh.nodes + displacement, np.stack(grid.to_px(*mesh.nodes.T), axis=1)
-    found = map_back(nodes, mesh.cells, mesh.element, grid, home, where)
-    mask = found.element >= 0
-    image = np.full(grid.shape, background, dtype=np.float32)
-    image[mask] = speckle(*found.values[:, mask])
-    return Rendering(image, mask, found.doubly_covered)

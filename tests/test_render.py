@@ -11,7 +11,6 @@ from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.render import (
     Rendering,
     render_deformed,
-    render_image,
     render_reference,
 )
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
@@ -142,13 +141,3 @@ def test_folding_displacement_is_refused_by_name() -> None:
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
     with pytest.raises(InputError, match="deformed mesh: expected T6 elements with positive"):
         render_deformed(MESH, -1.5 * MESH.nodes * [1, 0], located, GRID, SPECKLE, BACKGROUND)
-
-
-def test_an_image_without_truth_is_that_with_it() -> None:
-    u = wavy(MESH.nodes) * 3.0
-    whole, painted = deformed(u)[0], render_image(MESH, u, GRID, SPECKLE, BACKGROUND)
-    np.testing.assert_array_equal(painted.mask, whole.mask)
-    np.testing.assert_allclose(painted.image, whole.image, atol=FLOAT32)
-    assert painted.doubly_covered == whole.doubly_covered
-    with pytest.raises(InputError, match="deformed mesh: expected T6 elements with positive"):
-        render_image(MESH, -1.5 * MESH.nodes * [1, 0], GRID, SPECKLE, BACKGROUND)

@@ -12,7 +12,7 @@ import riley_side
 from laps import in_turn, use_threads
 from meshes import ELEMENTS, Scene, aligned, bulged, specimen
 
-from modeharvest.imaging.mapping.isoparametric import locate, map_back
+from modeharvest.imaging.mapping.isoparametric import locate
 
 
 def rows(quick: bool) -> dict[str, dict[str, Any]]:
@@ -43,8 +43,8 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
     laps = in_turn(
         {
             "locate": lambda: locate(scene.deformed, mesh.cells, mesh.element, scene.grid),
-            "map back": lambda: map_back(
-                scene.deformed, mesh.cells, mesh.element, scene.grid, nodes
+            "map back": lambda: locate(
+                scene.deformed, mesh.cells, mesh.element, scene.grid, nodal=nodes
             ),
             "riley, three fields": riley_side.nodal(scene, three, options["threads"]),
             "riley, one field": riley_side.nodal(scene, nodes[:, :1], options["threads"]),

@@ -15,8 +15,8 @@ from meshes import Scene, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from modeharvest.imaging.camera import ImagedState
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate
-from modeharvest.imaging.render import render_image
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
@@ -72,9 +72,11 @@ def measure(options: dict[str, Any]) -> dict[str, Any]:
 
 def exact(scene: Scene, speckle: Speckle) -> FloatArray:
     """Our image: the inverse mapping, and the pattern itself at the mapped points [grey levels]."""
-    mesh = scene.mesh
-    shown = render_image(mesh, scene.deformed - mesh.nodes, scene.grid, speckle, 0.0)
-    return np.asarray(GREY_LEVELS * shown.image, dtype=np.float64)
+    mesh, grid = scene.mesh, scene.grid
+    state = ImagedState(mesh, scene.deformed - mesh.nodes, grid, speckle, 0.0)
+    grey = state.average(np.zeros((1, 2)), np.ones(1), np.ones(grid.shape, np.bool_))
+    shown = grey.reshape(grid.shape).astype(np.float32)
+    return np.asarray(GREY_LEVELS * shown, dtype=np.float64)
 
 
 def sampled(speckle: Speckle, factor: int) -> FloatArray:

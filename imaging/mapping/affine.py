@@ -56,7 +56,7 @@ def fill_affine(
     state: NDArray[np.uint8],
     begin: int,
 ) -> None:
-    """Claim the element's pixels in image rows ``first`` ... ``last`` - 1.
+    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1.
 
     ``state`` holds those of a band of rows, whose pixels begin at ``begin``.
     """
@@ -82,7 +82,7 @@ def fill_affine(
                 col += 1
                 continue
             at = row_begin + col
-            n = _claim_run(back, triangular, s, t, state[at - begin : at - begin + past - col])
+            n = _assign_run(back, triangular, s, t, state[at - begin : at - begin + past - col])
             element[at : at + n] = e
             if fields.shape[1] == 0:
                 _line(values[0, at : at + n], s, back.s_col)
@@ -99,10 +99,10 @@ def fill_affine(
 
 
 @compiled(relaxed=True)
-def _claim_run(
+def _assign_run(
     back: _Inverse, triangular: bool, s: float, t: float, state: NDArray[np.uint8]
 ) -> int:
-    """Claim the pixels from (s, t) on, up to the first that is outside or somebody's."""
+    """Assign the pixels from (s, t) on, up to the first that is outside or already assigned."""
     n = state.size
     while -outside(triangular, s + (n - 1) * back.s_col, t + (n - 1) * back.t_col) < -ON_EDGE:
         n -= 1

@@ -24,8 +24,8 @@ BEYOND = (0.25, 0.1, 0.03)
 """How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""
 CLEAR_OF_EDGES = 1e-6
 """In xi, eta; pixels on an edge come out within some 1e-9."""
-UNASSIGNED, EDGE, INSIDE, OVERLAPPING, NOT_WANTED = 0, 1, 2, 3, 4
-"""States of a pixel: not claimed yet, claimed on an element's edge, inside it, inside two."""
+UNASSIGNED, EDGE, INSIDE, OVERLAPPING, EXCLUDED = 0, 1, 2, 3, 4
+"""States of a pixel: not assigned yet, on an element's edge, inside it, inside two; left out."""
 _AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
 
 
@@ -68,7 +68,7 @@ class Pixels(NamedTuple):
 
     element : (n,) int32 element, -1 where none is.
     values : (c, n) fields at the pixels, NaN where no element is.
-    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't wanted, and then
+    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't computed, and then
         ``values`` are left as they were where no element is.
     first_row : of these pixels in the image.
     cols : pixels a row.

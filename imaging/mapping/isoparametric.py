@@ -34,8 +34,9 @@ class Located:
     element
         (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
         does. A pixel on a shared edge or node belongs to the element of the lowest number.
-    xi
-        (rows, cols, 2) local coordinates (xi, eta) in it [-]; NaN where no element is.
+    values
+        (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi, eta)
+        there [-]; NaN where no element is.
     residual_px
         (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px]; NaN
         where no element is.
@@ -44,7 +45,7 @@ class Located:
     """
 
     element: NDArray[np.int32]
-    xi: FloatArray
+    values: FloatArray
     residual_px: NDArray[np.float32]
     doubly_covered: int = 0
 
@@ -54,30 +55,15 @@ class Located:
         return np.asarray(self.element >= 0)
 
     @property
+    def xi(self) -> FloatArray:
+        """(rows, cols, 2) local coordinates, where these were asked for."""
+        return np.moveaxis(self.values, 0, -1)
+
+    @property
     def max_residual_px(self) -> float:
         """The largest residual of the inverse mapping [px]; 0 if no pixel is covered."""
         mask = self.mask
         return float(self.residual_px[mask].max()) if mask.any() else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class MappedBack:
-    """Fields at the pixels of an image.
-
-    Parameters
-    ----------
-    element
-        (rows, cols) int32, as in :class:`Located`.
-    values
-        (c, rows, cols) fields at the pixel centres; NaN where no element is.
-    residual_px, doubly_covered
-        As in :class:`Located`.
-    """
-
-    element: NDArray[np.int32]
-    values: FloatArray
-    residual_px: NDArray[np.float32]
-    doubly_covered: int = 0
 
 
 def locate(
@@ -86,9 +72,9 @@ def locate(
     element: str,
     grid: PixelGrid,
     where: str = "mesh",
-    wanted: BoolArray | None = None,
+    nodal: FloatArray | None = None,
 ) -> Located:
-    """Find element and local coordinates of every pixel centre of a grid.
+    """Find element and local coordinates, or fields, at every pixel centre of a grid.
 
     Parameters
     ----------
@@ -102,41 +88,9 @@ def locate(
         The pixels.
     where
         What to call the mesh in an error.
-    wanted
-        (rows, cols) True where to look; by default everywhere. Other pixels count as background.
-
-    Raises
-    ------
-    InputError
-        If a Jacobian isn't positive everywhere in some element.
-    """
-    found = map_back(nodes, cells, element, grid, np.empty((len(nodes), 0)), where, wanted)
-    return Located(
-        found.element, np.moveaxis(found.values, 0, -1), found.residual_px, found.doubly_covered
-    )
-
-
-def map_back(
-    nodes: FloatArray,
-    cells: IntArray,
-    element: str,
-    grid: PixelGrid,
-    nodal: FloatArray,
-    where: str = "mesh",
-    wanted: BoolArray | None = None,
-) -> MappedBack:
-    """Evaluate nodal fields at every pixel centre of a grid.
-
-    The same as :func:`locate` and :func:`interpolate`, in one pass: faster, and without the
-    memory for local coordinates.
-
-    Parameters
-    ----------
-    nodes, cells, element, grid, where, wanted
-        As for :func:`locate`.
     nodal
-        (n, c) fields at the nodes, for example their undeformed positions. Without any field
-        (c = 0) the values are the two local coordinates.
+        (n, c) fields at the nodes to evaluate instead of the local coordinates: faster than
+        :func:`interpolate` later, and without the memory for those.
 
     Raises
     ------
@@ -146,21 +100,18 @@ def map_back(
     require_positive_jacobian(nodes, cells, element, where)
     elements = tabulate_elements(nodes, cells, element, grid)
     start, visits = bands(elements.row_from, elements.row_to, grid.rows, rasterise.BAND)
-    size, fields = grid.rows * grid.cols, polynomials(element, cells, nodal)
+    fields = polynomials(element, cells, np.empty((len(nodes), 0)) if nodal is None else nodal)
+    size = grid.rows * grid.cols
     pixels = Pixels(
         np.empty(size, dtype=np.int32), np.empty((fields.shape[1] or 2, size)),
         np.empty(size, dtype=np.float32), 0, grid.cols, float(grid.x0), float(grid.y0),
         float(grid.pixel_size),
     )  # fmt: skip
-    everywhere = np.empty(0, dtype=np.bool_)
-    twice = rasterise.rasterise(
-        elements, fields, pixels,
-        everywhere if wanted is None else np.ascontiguousarray(wanted).ravel(),
-        start, visits, in_turn(start.size - 1),
-    )  # fmt: skip
-    return MappedBack(
+    order = in_turn(start.size - 1)
+    overlapping = rasterise.rasterise(elements, fields, pixels, start, visits, order)
+    return Located(
         pixels.element.reshape(grid.shape), pixels.values.reshape(-1, *grid.shape),
-        pixels.residual.reshape(grid.shape), int(twice),
+        pixels.residual.reshape(grid.shape), int(overlapping),
     )  # fmt: skip
 
 
@@ -192,13 +143,7 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
     if nodal.ndim != 2:
         raise InputError(f"expected a nodal field of shape (n, c), got {nodal.shape}")
     coefficients = polynomials(element, cells, np.asarray(nodal, dtype=np.float64))
-    triangular = reference_element(element).triangular
-    return _evaluate(coefficients, triangular, located.element, located.xi)
-
-
-def _evaluate(
-    coefficients: FloatArray, triangular: bool, owner: NDArray[np.int32], xi: FloatArray
-) -> FloatArray:
-    out = np.empty((coefficients.shape[1], *owner.shape))
-    rasterise.evaluate(coefficients, not triangular, owner, xi, out)
+    out = np.empty((coefficients.shape[1], *located.element.shape))
+    curved = not reference_element(element).triangular
+    rasterise.evaluate(coefficients, curved, located.element, located.xi, out)
     return out

@@ -3,7 +3,7 @@
 Where ``isoparametric`` fills a regular grid element by element, this finds the element for each of
 many scattered points, as a lens shows them at its pixels. The plane is cut into buckets that list
 the elements reaching into them; an element that may hold a point by its Bézier control points' box
-is inverted by Newton's method, and only where no element claims the point, exhaustively.
+is inverted by Newton's method, and only where no element is found to hold the point, exhaustively.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ def locate_points(
     points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
     _locate(elements, _buckets(elements.boxes), *points, frame, owner, xi, residual)
     shape = row.shape
-    return Located(owner.reshape(shape), xi.reshape(*shape, 2), residual.reshape(shape))
+    return Located(
+        owner.reshape(shape), np.moveaxis(xi.reshape(*shape, 2), -1, 0), residual.reshape(shape)
+    )
 
 
 def _elements(nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid) -> _Elements:

@@ -21,8 +21,8 @@ from modeharvest.imaging.mapping.affine import fill_affine
 from modeharvest.imaging.mapping.element_table import (
     CLEAR_OF_EDGES,
     EDGE,
+    EXCLUDED,
     INSIDE,
-    NOT_WANTED,
     OVERLAPPING,
     UNASSIGNED,
     ElementTable,
@@ -72,7 +72,6 @@ def rasterise(
     elements: ElementTable,
     fields: FloatArray,
     pixels: Pixels,
-    wanted: BoolArray,
     start: IntArray,
     visits: IntArray,
     order: IntArray,
@@ -80,16 +79,17 @@ def rasterise(
     """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
 
     ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
-    the local coordinates. ``wanted`` (n,) tells where to look, everywhere if it is empty. The
-    elements of band b are ``visits[start[b]:start[b + 1]]``; ``order`` is that of the bands.
+    the local coordinates. The elements of band b are ``visits[start[b]:start[b + 1]]``;
+    ``order`` is that of the bands.
     """
     rows = pixels.element.size // pixels.cols
-    twice = 0
+    everywhere = np.empty(0, dtype=np.bool_)
+    overlapping = 0
     for i in prange(order.size):
         top = order[i] * BAND
-        visited = visits[start[order[i]] : start[order[i] + 1]]
-        twice += fill(elements, fields, pixels, wanted, visited, top, min(top + BAND, rows))
-    return twice
+        bottom, visited = min(top + BAND, rows), visits[start[order[i]] : start[order[i] + 1]]
+        overlapping += fill(elements, fields, pixels, everywhere, visited, top, bottom)
+    return overlapping
 
 
 @compiled()
@@ -97,19 +97,22 @@ def fill(
     elements: ElementTable,
     fields: FloatArray,
     pixels: Pixels,
-    wanted: BoolArray,
+    selected: BoolArray,
     visited: IntArray,
     top: int,
     bottom: int,
 ) -> int:
-    """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many are covered twice."""
+    """Fill the image rows ``top`` ... ``bottom`` - 1 of ``pixels``; how many lie in two elements.
+
+    ``selected`` (n,) tells of a whole image's pixels where to look; everywhere if it is empty.
+    """
     begin, end = (top - pixels.first_row) * pixels.cols, (bottom - pixels.first_row) * pixels.cols
     state = np.zeros(end - begin, dtype=np.uint8)
     pixels.element[begin:end] = -1
-    if wanted.size:
-        asked = wanted[top * pixels.cols : bottom * pixels.cols]
-        for k in range(asked.size):
-            state[k] = UNASSIGNED if asked[k] else NOT_WANTED
+    if selected.size:
+        of_rows = selected[top * pixels.cols : bottom * pixels.cols]
+        for k in range(of_rows.size):
+            state[k] = UNASSIGNED if of_rows[k] else EXCLUDED
     real = np.empty((6, _BATCH))
     batch = Batch(real[0], real[1], real[2], real[3], real[4], real[5],
                   np.empty(_BATCH, dtype=np.int64))  # fmt: skip
@@ -119,28 +122,28 @@ def fill(
             fill_affine(elements, fields, pixels, e, first, last, state, begin)
         else:
             _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
-    return _leave(pixels.element, pixels.values, pixels.residual, state, begin)
+    return _finish_rows(pixels.element, pixels.values, pixels.residual, state, begin)
 
 
 @compiled()
-def _leave(
+def _finish_rows(
     element: NDArray[np.int32],
     values: FloatArray,
     residual: NDArray[np.float32],
     state: NDArray[np.uint8],
     begin: int,
 ) -> int:
-    """Mark what nobody claimed as background; count what two did."""
-    twice = 0
+    """Mark what is unassigned as background; count what lies in two elements."""
+    overlapping = 0
     for k in range(state.size):
-        twice += state[k] == OVERLAPPING
+        overlapping += state[k] == OVERLAPPING
     if residual.size:  # else these pixels are on their way elsewhere
         for k in range(state.size):
             if element[begin + k] < 0:
                 residual[begin + k] = np.nan
                 for field in range(values.shape[0]):
                     values[field, begin + k] = np.nan
-    return twice
+    return overlapping
 
 
 @compiled()
@@ -155,7 +158,7 @@ def _fill_element(
     begin: int,
     batch: Batch,
 ) -> None:
-    """Claim the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
+    """Assign the element's pixels in image rows ``first`` ... ``last`` - 1, batch by batch."""
     centre_row, centre_col = int(elements.centres[e, 0]), int(elements.centres[e, 1])
     polynomial, sides, corners = elements.polynomials[e], elements.sides[e], elements.corners
     curved, cols, first_row = not elements.triangular, pixels.cols, pixels.first_row
@@ -169,13 +172,13 @@ def _fill_element(
         col = max(0, int(np.ceil(low[0] - _MARGIN_PX)) + centre_col)
         past = min(cols, int(np.floor(high[0] + _MARGIN_PX)) + centre_col + 1)
         at = (image_row - first_row) * cols
-        while col < past and state[at + col - begin] == NOT_WANTED:
+        while col < past and state[at + col - begin] == EXCLUDED:
             col += 1
-        while col < past and state[at + past - 1 - begin] == NOT_WANTED:
+        while col < past and state[at + past - 1 - begin] == EXCLUDED:
             past -= 1
         while col < past:
             if count == _BATCH:
-                _claim(elements, fields, pixels, e, state, begin, batch, count)
+                _assign(elements, fields, pixels, e, state, begin, batch, count)
                 count = 0
             stop = min(past, col + _BATCH - count)
             n, col_from = stop - col, float(col - centre_col)
@@ -187,11 +190,11 @@ def _fill_element(
                 where[count + k] = at + col + k
             count += n
             col = stop
-    _claim(elements, fields, pixels, e, state, begin, batch, count)
+    _assign(elements, fields, pixels, e, state, begin, batch, count)
 
 
 @compiled()
-def _claim(
+def _assign(
     elements: ElementTable,
     fields: FloatArray,
     pixels: Pixels,
@@ -201,14 +204,14 @@ def _claim(
     batch: Batch,
     count: int,
 ) -> None:
-    """Invert a batch; claim those of its pixels that are inside and nobody's yet."""
+    """Invert a batch; assign those of its pixels that are inside and still unassigned."""
     polynomial, triangular = elements.polynomials[e], elements.triangular
     row, col, s, t, off, residual, where = batch
     element, residuals = pixels.element, pixels.residual
     invert(polynomial, triangular, row, col, s, t, count)
     _check(elements, pixels, e, row, col, s, t, off, residual, count)
     reach = np.nan  # it is proved when first needed
-    claimed = 0
+    assigned = 0
     for k in range(count):
         depth = -outside(triangular, s[k], t[k])
         if depth < -ON_EDGE and np.isnan(reach):
@@ -231,11 +234,11 @@ def _claim(
             element[at] = e
             if residuals.size:
                 residuals[at] = residual[k]
-            where[claimed], s[claimed], t[claimed] = at, s[k], t[k]
-            claimed += 1
+            where[assigned], s[assigned], t[assigned] = at, s[k], t[k]
+            assigned += 1
         elif depth > CLEAR_OF_EDGES and state[at - begin] == INSIDE:
             state[at - begin] = OVERLAPPING
-    _write(fields, pixels.values, e, triangular, where, s, t, claimed)
+    _write(fields, pixels.values, e, triangular, where, s, t, assigned)
 
 
 @compiled(relaxed=True)

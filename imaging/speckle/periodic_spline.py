@@ -54,7 +54,7 @@ class SplineTable(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Room for a kernel's work on ``BLOCK`` points: their samples, tap weights and fractions."""
+    """Arrays for a kernel's work on ``BLOCK`` points: their samples, tap weights and fractions."""
 
     i: IntArray
     j: IntArray
@@ -146,9 +146,9 @@ def _wave_errors(period: int, fine: int) -> FloatArray:
 
 def _bound(size: FloatArray, row: FloatArray, col: FloatArray) -> float:
     """Sum of |c_k| e_k; all columns but the first stand for two waves."""
-    twice = np.full(size.shape[1], 2.0)
-    twice[0] = 1.0
-    weighted = size @ np.column_stack([twice, twice * col])
+    multiplicity = np.full(size.shape[1], 2.0)
+    multiplicity[0] = 1.0
+    weighted = size @ np.column_stack([multiplicity, multiplicity * col])
     return float(((1.0 + row) * weighted[:, 1] + row * weighted[:, 0]).sum())
 
 
@@ -158,11 +158,11 @@ def _prefiltered(
     """Divide the waves by B^ and lay them into the spectrum of the finer samples."""
     most_rows, most_cols = (period[0] - 1) // 2, (period[1] - 1) // 2
     k_row, k_col = np.arange(-most_rows, most_rows + 1), np.arange(most_cols + 1)
-    wanted = spectrum[k_row, : most_cols + 1]
-    wanted /= (np.sinc(k_row / fine[0]) ** _TAPS)[:, None]
-    wanted /= np.sinc(k_col / fine[1]) ** _TAPS
+    waves = spectrum[k_row, : most_cols + 1]
+    waves /= (np.sinc(k_row / fine[0]) ** _TAPS)[:, None]
+    waves /= np.sinc(k_col / fine[1]) ** _TAPS
     padded = np.zeros((fine[0], fine[1] // 2 + 1), dtype=np.complex128)
-    padded[k_row, : most_cols + 1] = wanted
+    padded[k_row, : most_cols + 1] = waves
     return padded
 
 
@@ -183,7 +183,7 @@ def _sample(table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArra
 
 @compiled()
 def workspace() -> Workspace:
-    """Make room for :func:`sample`."""
+    """Allocate the arrays that :func:`sample` works in."""
     return Workspace(
         np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK, dtype=np.int64),
         np.empty((_TAPS, BLOCK)), np.empty((_TAPS, BLOCK)), np.empty(BLOCK),
@@ -192,17 +192,17 @@ def workspace() -> Workspace:
 
 @compiled(relaxed=True)
 def sample(
-    table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray, desk: Workspace
+    table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray, work: Workspace
 ) -> None:
     """Evaluate up to ``BLOCK`` points: places and weights in vector instructions, then sums."""
-    c, w, v = table.coefficients, desk.w, desk.v
+    c, w, v = table.coefficients, work.w, work.v
     rows, cols = c.shape[0] - DEGREE, c.shape[1] - DEGREE
-    _place(row, table.finer_row, desk.i, desk.beyond)
-    _tap_weights(table.weights, desk.beyond[: out.size], w)
-    _place(col, table.finer_col, desk.j, desk.beyond)
-    _tap_weights(table.weights, desk.beyond[: out.size], v)
+    _place(row, table.finer_row, work.i, work.beyond)
+    _tap_weights(table.weights, work.beyond[: out.size], w)
+    _place(col, table.finer_col, work.j, work.beyond)
+    _tap_weights(table.weights, work.beyond[: out.size], v)
     for k in range(out.size):
-        i, j = desk.i[k], desk.j[k]
+        i, j = work.i[k], work.j[k]
         if i == _NOWHERE or j == _NOWHERE:
             out[k] = np.nan
             continue
