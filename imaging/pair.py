@@ -178,6 +178,15 @@ class ImagePair:
             self.deformed, self.deformed_mask
         )
 
+    @property
+    def masks(self) -> tuple[BoolArray, BoolArray]:
+        """(rows, cols) True on material, of f and of g; everywhere where there is no mask."""
+        f_mask, g_mask = (
+            np.ones(self.grid.shape, dtype=np.bool_) if mask is None else mask
+            for mask in (self.mask, self.deformed_mask)
+        )
+        return f_mask, g_mask
+
     def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> ImagePair:
         """The same pair with other grey levels: noisy, blurred."""
         return replace(self, reference=reference, deformed=deformed)

@@ -286,7 +286,7 @@ def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | Non
     InputError
         If the images don't show the same surface.
     """
-    motions, why_not = geometry.motions_in(pair.deformed_mask)
+    motions, why_not = geometry.motions_in(pair.masks[1])
     if not motions:
         return None, why_not
     motion, seen = _likeliest(pair, motions)

@@ -65,8 +65,8 @@ def noise_of(prepared: PreparedPhotographs, name: str) -> ImageNoise:
         return ImageNoise(sd, sd)
     seen = prepared_pair(prepared, name)
     in_f, in_g = (
-        estimated_noise(image, np.ones(image.shape, dtype=np.bool_) if mask is None else mask).sd
-        for image, mask in ((seen.reference, seen.mask), (seen.deformed, seen.deformed_mask))
+        estimated_noise(image, mask).sd
+        for image, mask in zip((seen.reference, seen.deformed), seen.masks, strict=True)
     )
     return ImageNoise(sd, sd * in_g / in_f if in_f > 0.0 else sd)
 
@@ -95,7 +95,7 @@ def covariances(
     result, blur, order = measured.result, measured.blur_px, measured.result.order
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
     if blur > 0.0:
-        images = blurred_pair(*images, pair.mask, pair.deformed_mask, blur)
+        images = blurred_pair(*images, *pair.masks, blur)
     seen = MatchedImages.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX)
     soft = seen.softness(result)
     by_noise = hessian_corrected_covariance(result, noise, soft)
@@ -119,13 +119,13 @@ def _noises(
 ) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
     """What a blur makes of examples of white noise in both images."""
     rng = np.random.default_rng(0)
-    quiet = blurred_pair(pair.reference, pair.deformed, pair.mask, pair.deformed_mask, blur)
+    quiet = blurred_pair(pair.reference, pair.deformed, *pair.masks, blur)
     for _ in range(_EXAMPLES):
         f, g = (
             image + np.float32(sd) * rng.standard_normal(image.shape, dtype=np.float32)
             for image, sd in ((pair.reference, noise.reference), (pair.deformed, noise.deformed))
         )
-        loud = blurred_pair(f, g, pair.mask, pair.deformed_mask, blur)
+        loud = blurred_pair(f, g, *pair.masks, blur)
         yield loud[0] - quiet[0], loud[1] - quiet[1]
 
 
@@ -277,13 +277,13 @@ def correlated(
         A result on blurred images has no unknowns for gain and offset: levelling did that.
     """
     options, grid = how.options(), geometry.grid
-    masks = pair.mask, pair.deformed_mask
+    masks = pair.masks
     coarse = replace(options, levels=options.levels[:-1])
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
     rough = correlate(*images, grid, ansatz, unknowns, *masks, coarse, progress)
     binned = rough.grid.pixel_size / grid.pixel_size
     leftover_px = binned * identifiability(rough, None).leftover_px
-    finish = final_smoothing(pair.reference, pair.mask, leftover_px)
+    finish = final_smoothing(pair.reference, masks[0], leftover_px)
     if finish.blur_px > 0.0:
         images = blurred_pair(*images, *masks, finish.blur_px)
         ansatz = replace(ansatz, brightness=Brightness())

@@ -428,7 +428,7 @@ class _Scene:
 
     def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
         """Correlate as the harvest finished, from the harvest's result on."""
-        masks = self.pair.mask, self.pair.deformed_mask
+        masks = self.pair.masks
         if self.blur_px > 0.0:
             images = blurred_pair(*images, *masks, self.blur_px)
         options = self.harvesting.experiment.correlation.options()
