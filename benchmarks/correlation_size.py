@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
@@ -41,7 +42,7 @@ HEIGHT_MM, ASPECT, STRAIN = 22.07, 0.8, 0.05
 OFF_PX, NOISE, LAPS = 1.0, 0.5, 3
 MPX, QUICK_MPX = (1, 2, 4, 8, 16, 32, 50), (0.1, 0.2, 0.4)
 DEGREES = tuple(range(3, 13))
-PAPER = Ansatz.square(Box.centred(17.7, 22.1), Box.centred(11.4, 19.0), 1.9)
+PAPER = Ansatz.on(Box.centred(17.7, 22.1), [(square_family(), Box.centred(11.4, 19.0))], 1.9)
 Image = NDArray[np.float32]
 Row = dict[str, Any]
 
@@ -52,7 +53,7 @@ class Pair:
     def __init__(self, mpx: float, ansatz: Ansatz) -> None:
         rows = round(np.sqrt(1e6 * mpx / ASPECT))
         self.grid = PixelGrid.centred(rows, round(ASPECT * rows), HEIGHT_MM / rows)
-        self.ansatz, self.start = ansatz, ansatz.start(STRAIN, 1.0)
+        self.ansatz, self.start = ansatz, ansatz.initial_guess(STRAIN, 1.0)
         rng = np.random.default_rng(0)
         smooth = blurred(rng.standard_normal(self.grid.shape, dtype=np.float32), 3.0)
         g = 128.0 + 50.0 * smooth / smooth.std()

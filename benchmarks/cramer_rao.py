@@ -156,7 +156,7 @@ def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Real
     ansatz = truth.ansatz
     levels = CorrelationOptions().levels if standard_start else (FULL,)
     options = CorrelationOptions(levels, gradient=noise.gradient, gradient_blur_px=noise.blur_px)
-    start = ansatz.start(STRAIN, 1.0) if standard_start else truth.a
+    start = ansatz.initial_guess(STRAIN, 1.0) if standard_start else truth.a
     speckle = Speckle(SpeckleSpec(seed=seed), GRID.shape)
     f, g = truth.images(speckle)
     n_f, n_g = noise.draw(f, g, seed)
@@ -213,7 +213,7 @@ def study(pairs: int, standard_start: bool, only: str) -> dict[str, Any]:
             "told_over_error": unknowns.told_over_error,
             "coverage": vars(unknowns.coverage),
             "chi_square_of_residual": float(
-                np.mean([r.agreement(noise.known).chi_square for r in results])
+                np.mean([r.residual_test(noise.known).chi_square for r in results])
             ),
             "not_converged": sum(r.outcome.value != "converged" for r in results),
         }  # fmt: skip

@@ -24,7 +24,7 @@ def main() -> None:
     case, path = Case(), shipped_solution("paper-virtual")
     assert path is not None
     ansatz = case.correlation.ansatz(case.experiment.specimen)
-    start = case.correlation.start(ansatz, STRAIN)
+    start = ansatz.initial_guess(STRAIN, case.correlation.start_amplitude)
     with tempfile.TemporaryDirectory() as folder:
         images = make_images(Solution.read(path), case.imaging, folder, (STRAIN,))
         grid, mask, f, g = images.grid, images.mask(), images.reference(), images.deformed(STRAIN)

@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.assembly import Assembly
@@ -61,7 +62,7 @@ def contestants(
     ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]
 ) -> tuple[dict[str, Work], int]:
     """What to compare, and at how many pixels."""
-    a = ansatz.start(0.02)
+    a = ansatz.initial_guess(0.02)
     quintic, cubic = SplineImage.of(g, 5), SplineImage.of(g, 3)
     assembly = Assembly(ansatz, GRID, mask)
     u = ansatz.displacement(a, GRID.x, GRID.y)[mask] / GRID.pixel_size
@@ -104,7 +105,7 @@ def peak_memory(ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]) -> 
     options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
     images = f.astype(np.float32), g.astype(np.float32)
     tracemalloc.start()
-    correlate(*images, GRID, ansatz, ansatz.start(0.001, 0.1), mask, mask, options)
+    correlate(*images, GRID, ansatz, ansatz.initial_guess(0.001, 0.1), mask, mask, options)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak / images[0].nbytes
@@ -115,7 +116,7 @@ def main() -> None:
     mask = material()
     noise = np.random.default_rng(0).normal(size=(2, *GRID.shape))
     f, g = (ndimage.gaussian_filter(image, 3.0) for image in noise)
-    ansatz = Ansatz.square(Box.centred(15.2, 20.8), Box.centred(11.4, 19.0), 1.9)
+    ansatz = Ansatz.on(Box.centred(15.2, 20.8), [(square_family(), Box.centred(11.4, 19.0))], 1.9)
     to_compare, pixels = contestants(ansatz, f, g, mask)
     seconds = medians(to_compare)
     unit = seconds["bicubic value and gradient"]

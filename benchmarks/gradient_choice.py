@@ -50,7 +50,7 @@ def distances(pair: ImageSet, seeds: int) -> Iterator[tuple[float, str, float]]:
     """Noise, what weighs, and the mean distance from the best fit over the seeds [px]."""
     case = read_case("paper-virtual")
     ansatz = case.correlation.ansatz(case.experiment.specimen)
-    start, grid = case.correlation.start(ansatz, STRAIN), pair.grid
+    start, grid = ansatz.initial_guess(STRAIN, case.correlation.start_amplitude), pair.grid
     f, g = pair.reference(), pair.deformed(STRAIN)
     masks = pair.mask(), pair.deformed_mask(STRAIN)
     used = eroded(masks[0], 2)

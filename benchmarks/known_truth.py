@@ -52,7 +52,7 @@ class Truth:
         mode = FourierMode.scaled(square_family("junction"), 1.0, everywhere)
         ansatz = Ansatz(Box.centred(2.6, 3.0), (mode,))
         rng = np.random.default_rng(0)
-        a = ansatz.start(STRAIN, 1.5)
+        a = ansatz.initial_guess(STRAIN, 1.5)
         for c in (0, 1):
             a[ansatz.v0_slice(c)] += 0.003 * rng.normal(size=ansatz.v0_space.size)
         a[ansatz.v_slice(0)][1:] += 0.05 * rng.normal(size=ansatz.v_space.size - 1)

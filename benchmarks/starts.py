@@ -96,7 +96,7 @@ class Map:
         self.pitch = case.experiment.specimen.pitch
         self.how = case.correlation
         self.ansatz = self.how.ansatz(case.experiment.specimen)
-        self.standard = self.how.start(self.ansatz, STRAIN)
+        self.standard = self.ansatz.initial_guess(STRAIN, self.how.start_amplitude)
         self.grid = images.grid
         self._input = self._read(images)
 

@@ -23,7 +23,7 @@ def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
 
     errors = {}
     for strain in images.strains:
-        start = how.start(ansatz, strain)
+        start = ansatz.initial_guess(strain, how.start_amplitude)
         f, g, g_mask = images.reference(), images.deformed(strain), images.deformed_mask(strain)
         result = correlate(f, g, grid, ansatz, start, mask, g_mask, how.options())
         truth = images.truth(strain).displacement

@@ -7,13 +7,14 @@ Source: the paper's Eq. (u_dic). Everything is in mm in the physical frame (x ri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, square_family
 from modeharvest.idic.slow_fields import Box, Brightness, ChebyshevField
 from modeharvest.util.arrays import FloatArray
@@ -89,6 +90,33 @@ def require_degrees(v0_degree: int, v_degree: int) -> None:
         )
 
 
+@dataclass(frozen=True)
+class AnsatzOptions:
+    """Degrees of an ansatz; the paper's by default.
+
+    Parameters
+    ----------
+    v0_degree, v_degree
+        Total degrees of the Chebyshev polynomials of v0 and of every v_i.
+    gain_degree, offset_degree
+        Total degrees of a gain and of an offset between the images' grey levels; None for none.
+    """
+
+    v0_degree: int = 5
+    v_degree: int = 6
+    gain_degree: int | None = None
+    offset_degree: int | None = None
+
+    def __post_init__(self) -> None:
+        require_degrees(self.v0_degree, self.v_degree)
+        _ = self.brightness  # checks its degrees
+
+    @property
+    def brightness(self) -> Brightness:
+        """Which of gain and offset are unknowns."""
+        return Brightness(self.gain_degree, self.offset_degree)
+
+
 @dataclass(frozen=True, eq=False)
 class Ansatz:
     """Slow field v0, amplitudes v_i and modes phi_i, and the order of their unknowns.
@@ -119,25 +147,62 @@ class Ansatz:
         require_degrees(self.v0_degree, self.v_degree)
 
     @classmethod
-    def square(
-        cls, domain: Box, cellular: Box, unit_cell: float, origin: str = "junction"
+    def on(
+        cls,
+        domain: Box,
+        families: Sequence[tuple[ModeFamily, Box]],
+        cell_size: float,
+        options: AnsatzOptions | None = None,
     ) -> Ansatz:
-        """Make the paper's ansatz for a square stacking of holes: 77 unknowns.
+        """Make an ansatz of mode families, each on a part of the domain.
 
         Parameters
         ----------
         domain
             The specimen [mm].
-        cellular
-            The part of it that has holes [mm]; the mode fades to zero outside it over half a
-            unit cell.
-        unit_cell
+        families
+            Each with the cellular part [mm] that its mode fades out of over half a unit cell.
+        cell_size
             l [mm].
-        origin
-            "junction" or "hole": what lies at x = y = 0.
+        options
+            Degrees; the paper's by default.
         """
-        taper = Taper(cellular, 0.5 * unit_cell)
-        return cls(domain, (FourierMode.scaled(square_family(origin), unit_cell, taper),))
+        how = options or AnsatzOptions()
+        modes = tuple(
+            FourierMode.scaled(family, cell_size, Taper(cellular, 0.5 * cell_size))
+            for family, cellular in families
+        )
+        return cls(domain, modes, how.v0_degree, how.v_degree, how.brightness)
+
+    @classmethod
+    def square(
+        cls,
+        specimen: Specimen,
+        *,
+        fixed_mode: bool = False,
+        options: AnsatzOptions | None = None,
+    ) -> Ansatz:
+        """Make the paper's ansatz for a specimen with square stacking of holes: 77 unknowns.
+
+        The mode's phases put its origin on a solid junction between four holes, whatever the
+        number of holes: [1, 1, 1, -1, 1, 0, 0] where it is even both ways.
+
+        Parameters
+        ----------
+        specimen
+            Whose middle is the origin.
+        fixed_mode
+            Keep phi_1 at the ideal pattern, for images without a pattern to find it from.
+        options
+            Degrees; the paper's by default.
+        """
+        (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
+        x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
+        y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.pitch
+        family = square_family("junction").moved((x0, y0))
+        family = family.fixed() if fixed_mode else family
+        domain = Box(-width, width, -height, height)
+        return cls.on(domain, [(family, Box(-a, a, -b, b))], specimen.pitch, options)
 
     @property
     def v0_space(self) -> ChebyshevField:
@@ -200,7 +265,7 @@ class Ansatz:
             raise InputError(f"expected finite unknowns, got {a[bad]} for {self.names[bad]}")
         return a
 
-    def start(self, strain: float = 0.0, amplitude: float = 1.0) -> FloatArray:
+    def initial_guess(self, strain: float = 0.0, amplitude: float = 1.0) -> FloatArray:
         """Where a correlation begins, as in the paper.
 
         Parameters

@@ -36,7 +36,7 @@ from modeharvest.idic.solver.weighting import (
 )
 from modeharvest.idic.uncertainty.noise import NoiseTransfer
 from modeharvest.idic.uncertainty.residual_test import (
-    LOCAL_MINIMUM,
+    MOST_DECORRELATED,
     autocorrelation,
     decorrelated_fraction,
     lags_for,
@@ -121,7 +121,7 @@ def correlate(
     clock.lap("judge the residual")
     gradient = None if options.gradient is None else Gradient(options.gradient)
     weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
-    without = (*WITHOUT_RESULT, Outcome.TRAPPED)
+    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
     if level == FULL and result.outcome not in without and not weighting.is_least_squares:
         weights = instrument(weighting, images, search.pair, assembly, found.unknowns)
         found, how = search.reweighed(found, assembly, weights)
@@ -286,7 +286,7 @@ class _Clock:
         self._last = now
 
 
-WITHOUT_RESULT = (Outcome.LEFT_IMAGE, Outcome.SINGULAR)
+WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes with nothing to judge."""
 
 
@@ -313,7 +313,7 @@ def make_result(
         weight_square=float(np.mean(np.diag(weight)[constants])) * per_px,
         residual_rms=float(np.sqrt(found.equations.mean_square)),
         pixels=found.equations.pixels,
-        left_image=found.equations.left_image,
+        outside_image=found.equations.outside_image,
         outcome=found.outcome,
         condition_number=eigen.condition_number,
     )
@@ -341,8 +341,8 @@ def assess(
     """
     left = residual(used, found.unknowns, pair.reference, pair.deformed)
     lost, lags_px = decorrelated_fraction(pair.reference, left), lags_for(width_px)
-    if lost > LOCAL_MINIMUM and found.outcome not in WITHOUT_RESULT:
-        found = replace(found, outcome=Outcome.TRAPPED)
+    if lost > MOST_DECORRELATED and found.outcome not in WITHOUT_RESULT:
+        found = replace(found, outcome=Outcome.LOCAL_MINIMUM)
     order = pair.deformed.order
     return replace(
         make_result(ansatz, pair.grid, found, how),
@@ -350,7 +350,7 @@ def assess(
         order=order,
         residual_correlation=autocorrelation(left, lags_px),
         residual_lags_px=lags_px,
-        unmatched=lost,
+        decorrelated_fraction=lost,
         weighting=weighting or Weighting(width_px=width_px),
     )
 
@@ -370,7 +370,7 @@ def weighting_for(
         As specified; None is as the noise asks for, if the residual is noise, and otherwise the
         deformed image's gradient, and no blur.
     """
-    is_noise = result.agreement().is_white
+    is_noise = result.residual_test().is_white
     if gradient is None:
         gradient = Gradient.REFERENCE if is_noise else Gradient.DEFORMED
     if blur_px is None:

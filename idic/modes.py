@@ -121,13 +121,13 @@ class ModeFamily:
         full = self.matrix @ np.asarray(parameters, dtype=np.float64) + self.offset
         return full.reshape(-1, PER_WAVE)
 
-    def held(self) -> ModeFamily:
+    def fixed(self) -> ModeFamily:
         """The family whose only mode is this one's start: no parameters are left.
 
         For images without a pattern, in which the mode's parameters can't be seen.
         """
         waves = self.waves(self.start).ravel()
-        return ModeFamily(f"{self.name}, held", np.zeros((waves.size, 0)), waves, np.zeros(0))
+        return ModeFamily(f"{self.name}, fixed", np.zeros((waves.size, 0)), waves, np.zeros(0))
 
     def moved(self, shift: ArrayLike) -> ModeFamily:
         """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
@@ -184,7 +184,7 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
     """Make the family in which every wave has its own five parameters.
 
     An amplitude common to all waves is what v_i already describes, so the largest amplitude
-    of the start is held fixed.
+    of the start is fixed.
 
     Parameters
     ----------
@@ -203,10 +203,10 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
         raise InputError(f"expected waves of shape (w, 5), got {full.shape}")
     flat = full.ravel()
     amplitudes = np.where(np.tile([1, 1, 0, 0, 0], len(full)) == 1, np.abs(flat), -1.0)
-    held = int(np.argmax(amplitudes))
-    kept = np.delete(np.arange(flat.size), held)
+    largest = int(np.argmax(amplitudes))
+    kept = np.delete(np.arange(flat.size), largest)
     offset = np.zeros(flat.size)
-    offset[held] = flat[held]
+    offset[largest] = flat[largest]
     names = [f"{p}{w + 1}" for w in range(len(full)) for p in ("A", "B", "kx", "ky", "c")]
     units = ["-", "-", "-", "-", "mm"] * len(full)
     return ModeFamily(

@@ -50,7 +50,7 @@ class Result:
     residual_rms
         Root mean square of the residual over the pixels used: grey levels, or mm per component
         for a fit to a displacement.
-    pixels, left_image
+    pixels, outside_image
         Pixels used, and pixels mapped outside the deformed image. A fit to a displacement
         counts each pixel twice, once for each component.
     outcome
@@ -63,10 +63,10 @@ class Result:
         Seconds for each step; not in a result's file, which two runs leave the same.
     residual_correlation
         Rms autocorrelation of the residual [-]: near 0 for noise; NaN for a fit to a
-        displacement. See :meth:`agreement`.
+        displacement. See :meth:`residual_test`.
     residual_lags_px
         How far apart it was taken [px].
-    unmatched
+    decorrelated_fraction
         Share of the image in which f and g(x + u) have little to do with each other [-]; above
         0.1 the outcome is TRAPPED. NaN for a fit to a displacement.
     weighting
@@ -86,13 +86,13 @@ class Result:
     inverse: FloatArray
     residual_rms: float
     pixels: int
-    left_image: int
+    outside_image: int
     outcome: Outcome
     condition_number: float
     history: tuple[Iteration, ...] = ()
     timings_s: Mapping[str, float] = field(default_factory=dict)
     residual_correlation: float = float("nan")
-    unmatched: float = float("nan")
+    decorrelated_fraction: float = float("nan")
     residual_lags_px: tuple[int, ...] = LAGS_PX
     weighting: Weighting = field(default_factory=Weighting)
     slope_square: float = 0.0
@@ -168,7 +168,7 @@ class Result:
         in_f = known.reference**2
         in_g = known.deformed**2 * self.noise_transfer.density
         variance = in_f + in_g
-        is_noise = noise is not None or self.agreement().is_white
+        is_noise = noise is not None or self.residual_test().is_white
         if variance > 0.0 and is_noise and np.isfinite(self.residual_correlation):
             share = self.noise_in_slope(known)
             own = in_f if self.weighting.gradient is Gradient.REFERENCE else in_g
@@ -196,7 +196,7 @@ class Result:
         in_g = self.noise_transfer.value * known.deformed**2
         return float(np.sqrt(known.reference**2 + in_g))
 
-    def agreement(self, noise: ImageNoise | float | None = None) -> ResidualTest:
+    def residual_test(self, noise: ImageNoise | float | None = None) -> ResidualTest:
         """Whether the residual is noise: what the standard errors rest on.
 
         Parameters
@@ -322,12 +322,12 @@ def result_to_dict(result: Result) -> dict[str, Any]:
         "units": list(result.ansatz.units),
         "residual_rms": _finite(result.residual_rms),
         "pixels": result.pixels,
-        "left_image": result.left_image,
+        "outside_image": result.outside_image,
         "condition_number": _finite(result.condition_number),
         "history": [{k: _finite(v) for k, v in vars(s).items()} for s in result.history],
         "residual_correlation": _finite(result.residual_correlation),
         "residual_lags_px": list(result.residual_lags_px),
-        "unmatched": _finite(result.unmatched),
+        "decorrelated_fraction": _finite(result.decorrelated_fraction),
         "weighting": {
             "gradient": weighting.gradient.value,
             "blur_px": weighting.blur_px,
@@ -347,7 +347,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
     weighting = content["weighting"]
-    plain = ("pixels", "left_image", "order")
+    plain = ("pixels", "outside_image", "order")
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
     return {
         **{name: content[name] for name in plain},
@@ -361,7 +361,7 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
         "history": tuple(Iteration(**step) for step in steps),
         "residual_correlation": _or(np.nan, content["residual_correlation"]),
         "residual_lags_px": tuple(content["residual_lags_px"]),
-        "unmatched": _or(np.nan, content["unmatched"]),
+        "decorrelated_fraction": _or(np.nan, content["decorrelated_fraction"]),
         "slope_square": _or(np.inf, content["slope_square"]),
         "weight_square": _or(np.inf, content["weight_square"]),
         "noise_transfer": NoiseTransfer(**content["noise_transfer"]),

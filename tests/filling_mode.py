@@ -32,7 +32,7 @@ def square(unit_cell: float = 1.0) -> Ansatz:
 def disturbed(ansatz: Ansatz, amplitude: float, seed: int = 0) -> FloatArray:
     """Unknowns whose displacement reaches 11 px for an amplitude of 1.5 mm."""
     rng = np.random.default_rng(seed)
-    a = ansatz.start(STRAIN, amplitude)
+    a = ansatz.initial_guess(STRAIN, amplitude)
     for c in (0, 1):
         a[ansatz.v0_slice(c)] += 0.003 * rng.normal(size=ansatz.v0_space.size)
     for i, mode in enumerate(ansatz.modes):

@@ -26,7 +26,7 @@ STEP = 1e-6
 
 
 def one_mode() -> Ansatz:
-    return Ansatz.square(DOMAIN, CELLULAR, UNIT_CELL)
+    return Ansatz.on(DOMAIN, [(square_family(), CELLULAR)], UNIT_CELL)
 
 
 def two_modes() -> Ansatz:
@@ -41,7 +41,7 @@ def two_modes() -> Ansatz:
 def random_unknowns(ansatz: Ansatz, seed: int, size: float = 0.01) -> FloatArray:
     """Disturb every unknown of the start by about ``size``."""
     rng = np.random.default_rng(seed)
-    return ansatz.start(0.03, 0.8) + size * rng.normal(size=ansatz.size)
+    return ansatz.initial_guess(0.03, 0.8) + size * rng.normal(size=ansatz.size)
 
 
 def inner_mask(margin_mm: float = 0.0) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.local.field import sampled_field
-from modeharvest.idic.modes import FourierMode
+from modeharvest.idic.modes import FourierMode, square_family
 from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
@@ -57,9 +57,9 @@ MASK = material(*np.meshgrid(GRID.x, GRID.y))
 
 def ansatz(held: bool = False) -> Ansatz:
     """The paper's, its mode held or free."""
-    made = Ansatz.square(DOMAIN, CELLULAR, PITCH)
+    made = Ansatz.on(DOMAIN, [(square_family(), CELLULAR)], PITCH)
     mode = made.modes[0]
-    family = mode.family.held() if held else mode.family
+    family = mode.family.fixed() if held else mode.family
     return replace(made, modes=(FourierMode(family, mode.half_wavelength, mode.scale, mode.taper),))
 
 
@@ -78,7 +78,7 @@ def photographs(a: Ansatz, unknowns: FloatArray) -> tuple[Any, Any, NDArray[np.b
 def frame(name: str, strain: float, amplitude: float, held: bool = False) -> HarvestedFrame:
     """A photograph whose pattern has that amplitude [mm, times max phi = 0.04]."""
     kinematics = ansatz(held)
-    a = kinematics.start(strain, amplitude)
+    a = kinematics.initial_guess(strain, amplitude)
     _, deformed, seen = photographs(kinematics, a)
     steps = ((8, 1, 3.0), (8, 2, 0.1), (1, 1, 0.2), (1, 2, 1e-4))
     result = Result(
@@ -101,13 +101,13 @@ def frame(name: str, strain: float, amplitude: float, held: bool = False) -> Har
         mask=seen,
         result=result,
         identifiability=identifiability(result, MASK),
-        agreement=result.agreement(NOISE),
+        residual_test=result.residual_test(NOISE),
         error_x=x,
         error_y=y,
         by_noise=field_errors(result, x, y, result.covariance(NOISE)),
-        by_leftover=field_errors(result, x, y, leftover),
+        by_model_error=field_errors(result, x, y, leftover),
         noise_covariance=result.covariance(NOISE),
-        leftover_covariance=leftover,
+        model_error_covariance=leftover,
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
         local=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)),
@@ -151,7 +151,7 @@ def harvest(
 ) -> Harvest:
     """Photographs (name, strain, amplitude), everything known; the first one's mode is held."""
     frames = tuple(frame(*state, held=k == 0) for k, state in enumerate(states))
-    reference, _, _ = photographs(ansatz(), ansatz().start(0.0, 0.0))
+    reference, _, _ = photographs(ansatz(), ansatz().initial_guess(0.0, 0.0))
     timeline = [moment(one) for one in frames]
     truth = {
         one.name: FrameTruth(
@@ -190,4 +190,4 @@ def harvest(
 def moment(one: HarvestedFrame) -> Moment:
     """Its place in the time line."""
     seen = one.identifiability
-    return Moment(one.name, one.strain_x, seen.amplitude_px[0], seen.leftover_px, 0.01)
+    return Moment(one.name, one.strain_x, seen.amplitude_px[0], seen.model_error_px, 0.01)

@@ -62,7 +62,7 @@ def plate(cells: int = 6) -> Mesh:
 
 def result(ansatz: Ansatz, amplitude: float) -> Result:
     """A pattern of that amplitude [mm, times max phi = 0.04], found on two levels."""
-    a = ansatz.start(0.05, amplitude)
+    a = ansatz.initial_guess(0.05, amplitude)
     steps = ((8, 1, 3.0), (8, 2, 0.1), (1, 1, 0.2), (1, 2, 1e-4))
     history = tuple(Iteration(f, n, 0.01, s, 0.0, 1000) for f, n, s in steps)
     return Result(ansatz, GRID, a, 1e-6 * np.eye(ansatz.size), 0.05, int(MASK.sum()), 0,

@@ -39,29 +39,31 @@ def noisy(v0_degree: int = 5) -> Result:
     ansatz, _, f, g = case()
     ansatz = replace(ansatz, v0_degree=v0_degree)
     noise = NOISE * np.random.default_rng(5).normal(size=(2, *GRID.shape))
-    return correlate(f + noise[0], g + noise[1], GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    return correlate(
+        f + noise[0], g + noise[1], GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK
+    )
 
 
 def test_noise_is_recognised_and_chi_squared_is_one() -> None:
-    judged = noisy().agreement(NOISE)
-    assert judged.is_white
-    assert judged.is_predicted
-    assert judged.chi_square == pytest.approx(1.0, abs=0.03)
-    assert "is noise" in judged.sentence
+    test = noisy().residual_test(NOISE)
+    assert test.is_white
+    assert test.is_predicted
+    assert test.chi_square == pytest.approx(1.0, abs=0.03)
+    assert "is noise" in test.sentence
 
 
 def test_a_wrong_noise_is_recognised() -> None:
-    judged = noisy().agreement(1.3 * NOISE)
-    assert judged.is_white
-    assert not judged.is_predicted
-    assert "not what it is said to be" in judged.sentence
+    test = noisy().residual_test(1.3 * NOISE)
+    assert test.is_white
+    assert not test.is_predicted
+    assert "not what it is said to be" in test.sentence
 
 
 def test_a_displacement_that_the_ansatz_lacks_is_recognised_without_knowing_the_noise() -> None:
-    judged = noisy(1).agreement()
-    assert not judged.is_white
-    assert "not noise" in judged.sentence
-    assert np.isnan(judged.chi_square)
+    test = noisy(1).residual_test()
+    assert not test.is_white
+    assert "not noise" in test.sentence
+    assert np.isnan(test.chi_square)
 
 
 def test_autocorrelation_of_white_noise_and_of_a_wave() -> None:
@@ -102,8 +104,8 @@ def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
     # What was once looked at for every speckle is beyond small ones.
     assert ResidualTest(autocorrelation(beside_noise), f.size).is_white == (width < 6.0)
     moved = SplineImage.of(noise[1]).sample(*(0.97 * np.stack([rows, cols]) + 3))[0]
-    judged = ResidualTest(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
-    assert judged.is_white, judged.sentence
+    test = ResidualTest(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
+    assert test.is_white, test.sentence
 
 
 def test_lags_of_the_paper_s_speckle() -> None:
@@ -157,7 +159,7 @@ def test_a_strong_mode_is_observable() -> None:
     moved = np.random.default_rng(6).uniform(-0.5, 0.5, size=(2, rows.size))
     _, d_row, d_col = SplineImage.of(g).sample(rows + moved[0], cols + moved[1])
     per_px = np.sqrt((d_row**2 + d_col**2).mean())
-    assert seen.leftover_px == pytest.approx(result.residual_rms / per_px, rel=0.05)
+    assert seen.model_error_px == pytest.approx(result.residual_rms / per_px, rel=0.05)
 
 
 def test_worst_combination_is_an_eigenvector_of_the_scaled_matrix() -> None:
@@ -173,12 +175,12 @@ def test_without_a_pattern_the_mode_is_said_to_be_unobservable() -> None:
     """A smooth displacement that the ansatz lacks a part of, as before buckling."""
     ansatz = manufactured.one_mode()
     cubic = Ansatz(ansatz.domain, v0_degree=3)
-    truth = cubic.start(0.03)
+    truth = cubic.initial_guess(0.03)
     truth += 0.004 * np.random.default_rng(3).normal(size=cubic.size)
     f, g = manufactured.image_pair(manufactured.speckle(), cubic, truth)
     low = replace(ansatz, v0_degree=1, v_degree=0)
     mask = manufactured.inner_mask(0.1)
-    result = correlate(f, g, GRID, low, low.start(0.03, 0.1), mask)
+    result = correlate(f, g, GRID, low, low.initial_guess(0.03, 0.1), mask)
     seen = identifiability(result, mask)
     assert seen.unobservable == (0,)
     assert "phi1 is not observable" in seen.warnings[0]
@@ -186,7 +188,7 @@ def test_without_a_pattern_the_mode_is_said_to_be_unobservable() -> None:
 
 def test_unknowns_without_information_are_named() -> None:
     ansatz = case()[0]
-    a = ansatz.start(STRAIN, 0.0)  # v1 = 0: phi1 has no effect
+    a = ansatz.initial_guess(STRAIN, 0.0)  # v1 = 0: phi1 has no effect
     still = replace(noisy(), unknowns=a)
     inverse = still.inverse.copy()
     lost = np.arange(ansatz.size)[ansatz.phi_slice(0)]

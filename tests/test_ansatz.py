@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.util.errors import InputError
 
@@ -16,7 +17,7 @@ few = settings(max_examples=15, deadline=None, derandomize=True)
 
 
 def test_the_papers_77_unknowns() -> None:
-    ansatz = Ansatz.square(Box.centred(15.2, 20.8), Box.centred(11.4, 19.0), 1.9)
+    ansatz = Ansatz.on(Box.centred(15.2, 20.8), [(square_family(), Box.centred(11.4, 19.0))], 1.9)
     assert ansatz.size == 21 + 21 + 28 + 7 == 77
     assert len(set(ansatz.names)) == 77
     assert ansatz.names[0] == "v0x[0,0]"
@@ -77,8 +78,10 @@ def test_grid_points_and_parts_agree() -> None:
 
 
 def test_start_is_the_applied_compression() -> None:
-    ansatz = Ansatz.square(Box(-7.0, 8.2, -10.4, 10.4), Box.centred(11.4, 19.0), 1.9)
-    a = ansatz.start(0.128, amplitude=0.5)
+    ansatz = Ansatz.on(
+        Box(-7.0, 8.2, -10.4, 10.4), [(square_family(), Box.centred(11.4, 19.0))], 1.9
+    )
+    a = ansatz.initial_guess(0.128, amplitude=0.5)
     ends = ansatz.v0(a, np.array([0.6 - 5.7, 0.6 + 5.7]), np.array([3.0]))[0]
     # The cellular part, 11.4 mm long, gets shorter by 12.8 % around the domain's centre.
     np.testing.assert_allclose(ends, [[0.128 * 5.7, 0], [-0.128 * 5.7, 0]], atol=1e-14)
@@ -106,7 +109,7 @@ def test_bad_input() -> None:
     ansatz = manufactured.one_mode()
     with pytest.raises(InputError, match=r"expected 77 unknowns.*\(76,\)"):
         ansatz.displacement(np.zeros(76), np.zeros(2), np.zeros(2))
-    bad = ansatz.start()
+    bad = ansatz.initial_guess()
     bad[43] = np.nan
     with pytest.raises(InputError, match=r"v1\[1,0\]"):
         ansatz.checked(bad)

@@ -9,11 +9,11 @@ import pytest
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.ansatz import AnsatzOptions
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField, sampled_field
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
-    InitialGuessOptions,
     initial_guess,
 )
 from modeharvest.idic.photograph.motion import (
@@ -23,7 +23,7 @@ from modeharvest.idic.photograph.motion import (
     robust_fit,
 )
 from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.idic.slow_fields import Box, Brightness
+from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, square_mode
 from modeharvest.imaging.grid import PixelGrid
@@ -69,12 +69,12 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
     """After buckling, at 12.8 %: nothing but images, masks, cell size and the cellular part."""
     start = start_of(images, 0.128)
     assert start.family == "square"
-    assert not start.held
+    assert not start.fixed
     found = correlated(images, 0.128, start.ansatz, start.unknowns)
     assert found.outcome is Outcome.CONVERGED
     setup = SquareLatticeOptions()
     ansatz = setup.ansatz(Specimen())
-    paper = correlated(images, 0.128, ansatz, setup.start(ansatz, 0.128))
+    paper = correlated(images, 0.128, ansatz, ansatz.initial_guess(0.128, setup.start_amplitude))
     apart = (found.displacement() - paper.displacement())[images.mask()] / PIXEL
     # One minimum, reached from two sides: the tolerance of the iteration is 1e-3 px.
     assert np.sqrt(np.mean(apart**2)) < 2e-3
@@ -83,10 +83,10 @@ def test_images_alone_lead_where_the_papers_start_leads(images: ImageSet) -> Non
 def test_without_a_pattern_the_mode_is_held(images: ImageSet) -> None:
     """Before buckling, at 7.8 %: the lattice's own pattern, its origin on a junction, held."""
     start = start_of(images, 0.078)
-    assert start.held
+    assert start.fixed
     assert start.pattern.family == "none"
     assert start.ansatz.modes[0].family.size == 0
-    assert any("held at the square pattern" in s for s in start.sentences)
+    assert any("fixed at the square pattern" in s for s in start.sentences)
     x, y = np.linspace(-5, 5, 31), np.linspace(-9, 9, 41)
     phi = start.ansatz.phi(0, start.unknowns, x, y)
     ideal = square_mode(REFERENCE_MODE, PITCH, x[None, :], y[:, None])
@@ -248,7 +248,7 @@ def test_a_wrong_cell_size_is_contradicted(images: ImageSet) -> None:
 def test_options_are_what_the_ansatz_can_say() -> None:
     mask = holes_mask(GRID, PITCH * np.eye(2), 0.7, (PITCH / 2, PITCH / 2))
     local = sampled_field(patterned(GRID), GRID, mask, 2)
-    options = InitialGuessOptions(2, 1, Brightness(gain_degree=0))
+    options = AnsatzOptions(2, 1, gain_degree=0)
     ansatz = from_field(local, Box.centred(11.4, 15.2), options=options).ansatz
     assert ansatz.size == 2 * 6 + 3 + 7 + 1
     assert ansatz.domain == Box(*GRID.extent)

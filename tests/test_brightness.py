@@ -43,7 +43,7 @@ def lit_differently() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 def found(brightness: Brightness) -> Result:
     f, g, _, _ = lit_differently()
     ansatz = replace(case()[0], brightness=brightness)
-    return correlate(f, g, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    return correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
 
 
 def test_slowly_varying_gain_and_offset_are_recovered() -> None:
@@ -75,7 +75,7 @@ def test_left_out_they_spoil_the_displacement() -> None:
 def test_asked_for_without_need_they_are_one_and_zero() -> None:
     ansatz, truth, f, g = case()
     ansatz = replace(ansatz, brightness=Brightness(0, 0))
-    result = correlate(f, g, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
     np.testing.assert_allclose(result.unknowns[-2:], 0.0, atol=1e-6)
     assert error_px(result, np.concatenate([truth, [0.0, 0.0]])) < 1e-5
 
@@ -83,7 +83,7 @@ def test_asked_for_without_need_they_are_one_and_zero() -> None:
 def test_a_displacement_has_no_brightness() -> None:
     ansatz = Ansatz(manufactured.DOMAIN, v0_degree=2, brightness=SLOW)
     u = np.stack(np.meshgrid(0.01 * GRID.x, 0.02 * GRID.y), axis=-1)
-    fit = fit_displacement(u, GRID, ansatz, ansatz.start())
+    fit = fit_displacement(u, GRID, ansatz, ansatz.initial_guess())
     assert fit.ansatz.size == ansatz.size - SLOW.size
     assert fit.residual_rms < 1e-12
 

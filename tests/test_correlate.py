@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate, fit_displacement
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level, eroded
 from modeharvest.imaging.grid import PixelGrid
@@ -34,7 +36,7 @@ def truth(ansatz: Ansatz) -> FloatArray:
 
 def near(ansatz: Ansatz) -> FloatArray:
     """A start within reach of the truth."""
-    return ansatz.start(0.03, 0.8)
+    return ansatz.initial_guess(0.03, 0.8)
 
 
 def rms_px(u: FloatArray, v: FloatArray, mask: NDArray[np.bool_] = MASK) -> float:
@@ -62,15 +64,15 @@ def noisy(images: Images) -> Images:
 
 @pytest.fixture(scope="module")
 def found(images: Images, ansatz: Ansatz) -> Result:
-    return correlate(*images, GRID, ansatz, ansatz.start(0.03), MASK)
+    return correlate(*images, GRID, ansatz, ansatz.initial_guess(0.03), MASK)
 
 
 def test_manufactured_ansatz_is_recovered(found: Result, ansatz: Ansatz) -> None:
     true = ansatz.displacement(truth(ansatz), GRID.x, GRID.y)
-    start = ansatz.displacement(ansatz.start(0.03), GRID.x, GRID.y)
+    start = ansatz.displacement(ansatz.initial_guess(0.03), GRID.x, GRID.y)
     assert rms_px(start, true) > 1.0  # there was something to find
     assert found.outcome is Outcome.CONVERGED
-    assert found.left_image == 0
+    assert found.outside_image == 0
     assert rms_px(found.displacement(), true) < 1e-5
     np.testing.assert_allclose(found.mode_parameters(), truth(ansatz)[-7:], atol=1e-4)
     assert found.residual_rms < 1e-5
@@ -176,12 +178,9 @@ def test_transpose_of_both_images(noisy: Images, ansatz: Ansatz) -> None:
     # New column = old row: x' = -y and y' = -x.
     f, g = noisy
     domain, cellular = manufactured.DOMAIN, manufactured.CELLULAR
-    turned = Ansatz.square(
-        type(domain)(domain.y_min, domain.y_max, domain.x_min, domain.x_max),
-        type(domain)(cellular.y_min, cellular.y_max, cellular.x_min, cellular.x_max),
-        manufactured.UNIT_CELL,
-    )
-    start = turned.start(0.0, 0.8)
+    box, part = (Box(b.y_min, b.y_max, b.x_min, b.x_max) for b in (domain, cellular))
+    turned = Ansatz.on(box, [(square_family(), part)], manufactured.UNIT_CELL)
+    start = turned.initial_guess(0.0, 0.8)
     start[turned.v0_slice(1)][2] = -0.03 * turned.domain.half[1]  # now compressed along y
     grid = PixelGrid.centred(GRID.cols, GRID.rows, PIXEL)
     plain = correlate(f, g, GRID, ansatz, near(ansatz), MASK)
@@ -194,7 +193,7 @@ def test_best_fit_of_a_displacement_in_the_ansatz_is_exact(ansatz: Ansatz) -> No
     a = truth(ansatz)
     u = ansatz.displacement(a, GRID.x, GRID.y)
     u[~MASK] = np.nan
-    fit = fit_displacement(u, GRID, ansatz, ansatz.start(0.03), MASK)
+    fit = fit_displacement(u, GRID, ansatz, ansatz.initial_guess(0.03), MASK)
     assert fit.outcome is Outcome.CONVERGED
     assert fit.residual_rms < 1e-9
     np.testing.assert_allclose(fit.unknowns, a, atol=1e-7)
@@ -227,7 +226,7 @@ def test_holes_are_kept_out_of_blur_and_sampling(images: Images, ansatz: Ansatz)
 
     mask, g_mask = solid(x, y) & MASK, solid(origin[..., 0], origin[..., 1])
     f, g = (np.where(m, im, -9.0) for m, im in zip((mask, g_mask), images, strict=True))
-    found = correlate(f, g, GRID, ansatz, ansatz.start(0.03), mask, g_mask)
+    found = correlate(f, g, GRID, ansatz, ansatz.initial_guess(0.03), mask, g_mask)
     assert found.outcome is Outcome.CONVERGED
     # Grey level -9 is 13 sd away. 3 px from a hole's edge the smooth continuation behind it
     # still rings by about 0.43^3 of a misfit below 1 sd, for one pixel in ten.
@@ -237,10 +236,10 @@ def test_holes_are_kept_out_of_blur_and_sampling(images: Images, ansatz: Ansatz)
 
 
 def test_start_far_outside_the_image_is_an_outcome(images: Images, ansatz: Ansatz) -> None:
-    start = ansatz.start()
+    start = ansatz.initial_guess()
     start[0] = 2.0  # 200 of 320 px
     found = correlate(*images, GRID, ansatz, start, MASK)
-    assert found.outcome is Outcome.LEFT_IMAGE
+    assert found.outcome is Outcome.OUTSIDE_IMAGE
     np.testing.assert_array_equal(found.unknowns, start)
 
 
@@ -252,7 +251,7 @@ def spoiled(image: FloatArray) -> FloatArray:
 
 def test_bad_input_is_named(images: Images, ansatz: Ansatz) -> None:
     f, g = images
-    start = ansatz.start()
+    start = ansatz.initial_guess()
     with pytest.raises(InputError, match=r"deformed image of 360 x 320.*\(359, 320\)"):
         correlate(f, g[1:], GRID, ansatz, start)
     with pytest.raises(InputError, match=r"reference image, got NaN.*2 px.*row 7, column 9"):

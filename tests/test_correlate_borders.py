@@ -35,7 +35,7 @@ FLOAT_PX = 2e-6
 @cache
 def truth() -> FloatArray:
     """A shift by 12 px to the right, and everything else disturbed."""
-    a = ANSATZ.start(STRAIN)
+    a = ANSATZ.initial_guess(STRAIN)
     a += 0.003 * np.random.default_rng(0).normal(size=a.size)
     a[0] += SHIFT_PX * PIXEL
     return a
@@ -67,9 +67,9 @@ def test_without_those_that_land_at_the_border_the_error_is_that_of_float_images
 ) -> None:
     """A spline feels the border by 0.43 a pixel: 1e-4 of it are left after 10 px."""
     mask = landing() > 10
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.start(STRAIN), mask)
+    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), mask)
     assert found.outcome is Outcome.CONVERGED
-    assert found.left_image == 0
+    assert found.outside_image == 0
     assert error_px(found.displacement(), mask) < 1e-4  # GaussNewtonOptions.tolerance_px
     tight = correlate(*images(seed), GRID, ANSATZ, found.unknowns, mask, options=TIGHT)
     assert error_px(tight.displacement(), mask) < FLOAT_PX
@@ -82,11 +82,11 @@ def test_a_strip_that_leaves_the_image_does_not_pull(seed: int) -> None:
     Pixels that land within 8 px of the border would be sampled from a spline that feels the
     mirror image beyond it: with them the displacement was off by 4e-3 to 5e-3 px.
     """
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.start(STRAIN), options=TIGHT)
+    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), options=TIGHT)
     assert found.outcome is Outcome.CONVERGED
     left, at_border = landing() < 0, (landing() >= 0) & (landing() < 7.5)
     assert 0.05 * GRID.rows * GRID.cols < left.sum()
-    assert found.left_image == pytest.approx(left.sum(), abs=3)
+    assert found.outside_image == pytest.approx(left.sum(), abs=3)
     assert found.pixels == pytest.approx((~left & ~at_border).sum(), rel=1e-3)
     # By then the border's pull has fallen to 0.43^7.5 = 0.002 of those 5e-3 px.
     assert error_px(found.displacement(), ~left) < 1e-5
@@ -103,7 +103,7 @@ def test_what_is_behind_a_mask_is_never_looked_at(seed: int) -> None:
         f_rest, g_rest = (np.full(GRID.shape, filling) if filling is not None
                           else rng.normal(size=GRID.shape) for _ in range(2))  # fmt: skip
         filled = np.where(f_mask, f, f_rest), np.where(g_mask, g, g_rest)
-        start = ANSATZ.start(STRAIN)
+        start = ANSATZ.initial_guess(STRAIN)
         found.append(correlate(*filled, GRID, ANSATZ, start, f_mask, g_mask))
     for other in found[1:]:
         np.testing.assert_array_equal(other.unknowns, found[0].unknowns)

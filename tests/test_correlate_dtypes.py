@@ -36,7 +36,7 @@ STRAIN = 0.02
 @cache
 def images() -> tuple[FloatArray, FloatArray]:
     """Whole grey levels of 0 to 255, as float64."""
-    a = ANSATZ.start(STRAIN)
+    a = ANSATZ.initial_guess(STRAIN)
     a += 0.003 * np.random.default_rng(1).normal(size=a.size)
     f, g = manufactured.image_pair(manufactured.speckle(4, GRID), ANSATZ, a, GRID)
     return np.rint(255 * f), np.rint(255 * g)
@@ -52,7 +52,7 @@ def mask() -> NDArray[np.bool_]:
 
 def correlated(f: Array, g: Array, f_mask: Array | None = None) -> Result:
     f_mask = mask() if f_mask is None else f_mask
-    return correlate(f, g, GRID, ANSATZ, ANSATZ.start(STRAIN), f_mask, f_mask)
+    return correlate(f, g, GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), f_mask, f_mask)
 
 
 @cache
@@ -158,7 +158,7 @@ def test_lists_are_images_too() -> None:
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_nothing_is_written_into_what_was_given(dtype: str) -> None:
     f, g = (image.astype(dtype) for image in images())
-    given = f, g, mask().copy(), ANSATZ.start(STRAIN)
+    given = f, g, mask().copy(), ANSATZ.initial_guess(STRAIN)
     before = [array.copy() for array in given]
     correlate(f, g, GRID, ANSATZ, given[3], given[2], given[2])
     for array, copy in zip(given, before, strict=True):
@@ -182,12 +182,12 @@ def test_images_of_64_px(rows: int) -> None:
     """Coarse levels that would be smaller than 32 px are left out, and the rest arrives."""
     grid = PixelGrid.centred(rows, 64, PIXEL)
     ansatz = Ansatz(Box.centred(0.64, 0.7), v0_degree=1)
-    truth = ansatz.start(STRAIN)
+    truth = ansatz.initial_guess(STRAIN)
     truth += 0.004 * np.random.default_rng(rows).normal(size=truth.size)
     f, g = manufactured.image_pair(manufactured.speckle(rows, grid), ansatz, truth, grid)
     inner = np.zeros(grid.shape, dtype=np.bool_)
     inner[12:-12, 12:-12] = True
-    found = correlate(f, g, grid, ansatz, ansatz.start(), inner)
+    found = correlate(f, g, grid, ansatz, ansatz.initial_guess(), inner)
     assert found.outcome is Outcome.CONVERGED
     assert {step.factor for step in found.history} == {2, 1}
     u = ansatz.displacement(truth, grid.x, grid.y)

@@ -31,7 +31,7 @@ def test_a_kink_where_the_taper_ends_costs_little() -> None:
     ansatz = manufactured.one_mode()
     truth = disturbed(ansatz, 1.5)
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
-    result = correlate(f, g, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-3
 
@@ -46,7 +46,7 @@ def test_cubic_and_quintic_agree_to_the_error_of_the_cubic() -> None:
 def test_8_bit_images_are_as_good_as_quantisation_allows() -> None:
     ansatz, truth, f, g = case()
     f8, g8 = np.round(255 * f), np.round(255 * g)
-    result = correlate(f8, g8, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    result = correlate(f8, g8, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
     assert result.outcome is Outcome.CONVERGED
     # Mean square error of the displacement: a quadratic form of Gaussian unknowns, with mean
     # tr(K) and variance 2 tr(K^2); 4 standard deviations leave 1 in 10^4.
@@ -117,7 +117,7 @@ def noisy() -> tuple[Ansatz, FloatArray, FloatArray, Result]:
     ansatz, _, f, g = case()
     rng = np.random.default_rng(3)
     f, g = (image + 0.01 * rng.normal(size=image.shape) for image in (f, g))
-    result = correlate(f, g, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK, options=TIGHT)
+    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK, options=TIGHT)
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, case()[1]) > 1e-3
     return ansatz, f, g, result
@@ -135,7 +135,7 @@ def test_pixel_size() -> None:
     mode = FourierMode.scaled(square_family("junction"), s, taper)
     large = Ansatz(Box(*(s * np.array([b.x_min, b.x_max, b.y_min, b.y_max]))), (mode,))
     grid = PixelGrid.centred(*GRID.shape, s * PIXEL)
-    result = correlate(f, g, grid, large, large.start(STRAIN, s), MASK, options=TIGHT)
+    result = correlate(f, g, grid, large, large.initial_guess(STRAIN, s), MASK, options=TIGHT)
     assert rms_px(result.displacement() / s, expected.displacement()) < SAME_PX
     in_mm = np.array([unit == "mm" for unit in ansatz.units])
     np.testing.assert_allclose(
@@ -151,7 +151,7 @@ def test_translation_of_the_frame() -> None:
     mode = FourierMode.scaled(square_family("junction"), 1.0, taper)
     moved = Ansatz(Box(b.x_min + dx, b.x_max + dx, b.y_min + dy, b.y_max + dy), (mode,))
     grid = PixelGrid(*GRID.shape, PIXEL, GRID.x0 + dx, GRID.y0 + dy)
-    start = moved.start(STRAIN, 1.0)
+    start = moved.initial_guess(STRAIN, 1.0)
     start[moved.phi_slice(0)][5:] = -(dx + dy), -(-dx + dy)
     result = correlate(f, g, grid, moved, start, MASK, options=TIGHT)
     assert rms_px(result.displacement(), expected.displacement()) < SAME_PX

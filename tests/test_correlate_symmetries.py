@@ -56,7 +56,7 @@ ANSATZ = square_ansatz(Box.centred(1.3, 1.4))
 def images(seed: int) -> tuple[FloatArray, FloatArray]:
     """Noisy, so that the minimum is not the truth and the residual does not vanish."""
     rng = np.random.default_rng(seed)
-    a = ANSATZ.start(STRAIN, 1.2)
+    a = ANSATZ.initial_guess(STRAIN, 1.2)
     a += 0.01 * rng.normal(size=a.size)
     f, g = manufactured.image_pair(manufactured.speckle(seed, GRID), ANSATZ, a, GRID)
     return f + NOISE * rng.normal(size=f.shape), g + NOISE * rng.normal(size=g.shape)
@@ -64,7 +64,9 @@ def images(seed: int) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def expected(seed: int) -> Result:
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.start(STRAIN, 1.0), MASK, options=TIGHT)
+    found = correlate(
+        *images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN, 1.0), MASK, options=TIGHT
+    )
     assert found.outcome is Outcome.CONVERGED
     return found
 
@@ -85,7 +87,7 @@ def test_grey_levels(seed: int, gain: float, negative: bool, offset: float) -> N
     """Any unit of grey levels, and the negative: the same displacement, the same error bars."""
     gain = -gain if negative else gain
     f, g = (gain * (image + offset) for image in images(seed))
-    found = correlate(f, g, GRID, ANSATZ, ANSATZ.start(STRAIN, 1.0), MASK, options=TIGHT)
+    found = correlate(f, g, GRID, ANSATZ, ANSATZ.initial_guess(STRAIN, 1.0), MASK, options=TIGHT)
     assert apart_px(found.displacement(), expected(seed).displacement()) < SAME_PX
     assert found.residual_rms == pytest.approx(abs(gain) * expected(seed).residual_rms, rel=1e-5)
     errors, theirs = found.standard_errors(), expected(seed).standard_errors()
@@ -101,7 +103,9 @@ def test_pixel_size(seed: int, s: float) -> None:
     """Metres or micrometres: what is a length scales, what is a number stays."""
     ansatz = square_ansatz(Box.centred(1.3 * s, 1.4 * s), s)
     grid = PixelGrid.centred(*GRID.shape, s * PIXEL)
-    found = correlate(*images(seed), grid, ansatz, ansatz.start(STRAIN, s), MASK, options=TIGHT)
+    found = correlate(
+        *images(seed), grid, ansatz, ansatz.initial_guess(STRAIN, s), MASK, options=TIGHT
+    )
     assert apart_px(found.displacement() / s, expected(seed).displacement()) < SAME_PX
     assert found.condition_number == pytest.approx(expected(seed).condition_number, rel=1e-2)
     in_mm = np.array([unit == "mm" for unit in ansatz.units])
@@ -122,7 +126,9 @@ def test_translation_of_the_frame(seed: int, dx: float, dy: float) -> None:
     domain = Box(b.x_min + dx, b.x_max + dx, b.y_min + dy, b.y_max + dy)
     moved = replace(ANSATZ, domain=domain, modes=(mode,))
     grid = replace(GRID, x0=GRID.x0 + dx, y0=GRID.y0 + dy)
-    found = correlate(*images(seed), grid, moved, moved.start(STRAIN, 1.0), MASK, options=TIGHT)
+    found = correlate(
+        *images(seed), grid, moved, moved.initial_guess(STRAIN, 1.0), MASK, options=TIGHT
+    )
     assert apart_px(found.displacement(), expected(seed).displacement()) < SAME_PX
 
 
@@ -148,7 +154,7 @@ def test_translation_of_the_deformed_image(seed: int, down: int, right: int) -> 
     """Whole pixels are added to the displacement, and to nothing else."""
     f, g = images(seed)
     moved = np.roll(g, (down, right), axis=(0, 1))
-    start = ANSATZ.start(STRAIN, 1.0)
+    start = ANSATZ.initial_guess(STRAIN, 1.0)
     for c, by in enumerate((right, -down)):
         start[ANSATZ.v0_slice(c)][0] += by * PIXEL
     found = correlate(f, moved, GRID, ANSATZ, start, MASK, options=TIGHT)
@@ -175,7 +181,7 @@ def test_turns_and_mirrors(seed: int, quarters: int, mirrored: bool) -> None:
     ansatz = square_ansatz(Box.centred(*(2 * half)))
     grid = PixelGrid.centred(*(GRID.shape if quarters % 2 == 0 else GRID.shape[::-1]), PIXEL)
     # Mirrored, the pattern is its own negative.
-    start = ansatz.start(0.0, -1.0 if mirrored else 1.0)
+    start = ansatz.initial_guess(0.0, -1.0 if mirrored else 1.0)
     along = int(abs(Q[1, 0]))  # now compressed along this axis: T_1 of x is third, of y second
     start[ansatz.v0_slice(along)] = _compression(ansatz, along)
     f, g = (turned(image) for image in images(seed))

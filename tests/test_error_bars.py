@@ -66,7 +66,7 @@ def test_errors_are_those_of_unknowns_drawn_from_the_covariance() -> None:
 def test_no_mode_no_error_of_a_mode() -> None:
     result, _, _ = noisy()
     plain = replace(result.ansatz, modes=())
-    fit = correlate(*noisy()[1:], GRID, plain, plain.start(0.03), MASK)
+    fit = correlate(*noisy()[1:], GRID, plain, plain.initial_guess(0.03), MASK)
     errors = field_errors(fit, X, Y, fit.covariance(NOISE))
     assert errors.v.shape == (0, 6, 7)
     assert errors.fluctuation.shape == (0, 6, 7, 2)
@@ -119,7 +119,7 @@ def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
     assert np.sqrt(np.mean(told**2) / np.mean(bound**2)) == pytest.approx(1.0, abs=0.12)
 
 
-@pytest.mark.parametrize(("leftover", "sd"), [(0.0, 0.01), (0.01, 0.02)])
+@pytest.mark.parametrize(("model_error", "sd"), [(0.0, 0.01), (0.01, 0.02)])
 def test_seeds_of_noise_scatter_as_the_curvature_predicts(leftover: float, sd: float) -> None:
     result, f, g = noisy(leftover, noise=sd)
     assert result.weighting.is_least_squares == (leftover > 0.0)

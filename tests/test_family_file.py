@@ -167,7 +167,7 @@ def test_a_family_from_a_file_can_be_fitted(tmp_path: Path) -> None:
     cellular, grid = Box.centred(8 * PITCH, 8 * PITCH), PixelGrid.centred(160, 160, 0.1)
     mode = FourierMode.scaled(found.family, found.pitch, Taper(cellular, 0.5 * PITCH))
     ansatz = Ansatz(Box.centred(8 * PITCH, 8 * PITCH), (mode,), v0_degree=1, v_degree=1)
-    start = ansatz.start(0.02, 3.0)
+    start = ansatz.initial_guess(0.02, 3.0)
     truth = start.copy()
     truth[ansatz.phi_slice(0)] += 0.01 * rng.uniform(-1, 1, found.family.size)
     u = ansatz.displacement(truth, grid.x[None, :], grid.y[:, None])

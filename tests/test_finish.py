@@ -108,7 +108,7 @@ def test_a_blurred_finish_comes_nearer_to_the_best_fit(
 ) -> None:
     """Speckles of 5 px, and waves of 3 or 4 px that the ansatz doesn't have."""
     ansatz = Ansatz(Box.centred(4.4, 4.4), (), v0_degree=3)
-    a = ansatz.start(0.01) + 1e-3 * np.random.default_rng(seed).normal(size=ansatz.size)
+    a = ansatz.initial_guess(0.01) + 1e-3 * np.random.default_rng(seed).normal(size=ansatz.size)
 
     def displacement(points: FloatArray) -> FloatArray:
         x, y = points[..., 0], points[..., 1]
@@ -130,7 +130,7 @@ def test_a_blurred_finish_comes_nearer_to_the_best_fit(
     fine = replace(options, levels=options.levels[-1:])
     rough = correlate(f, g, GRID, ansatz, np.zeros(ansatz.size), mask, None, coarse)
     binned = rough.grid.pixel_size / PIXEL
-    finish = final_smoothing(f, mask, binned * identifiability(rough).leftover_px)
+    finish = final_smoothing(f, mask, binned * identifiability(rough).model_error_px)
     assert finish.width_px == pytest.approx(5.0, abs=0.5)
     assert finish.blur_px > 2.0
     best = fit_displacement(displacement(at), GRID, ansatz, a, mask)

@@ -118,10 +118,10 @@ def test_an_unknown_without_information_stays_where_it_is() -> None:
 
 def test_a_start_outside_the_image_is_not_iterated() -> None:
     found = run(line, [20.0, 0.0], left=0.5)
-    assert found.outcome is Outcome.LEFT_IMAGE
+    assert found.outcome is Outcome.OUTSIDE_IMAGE
     assert found.history == ()
     # As much as is allowed may be outside.
-    assert run(line, [20.0, 0.0], left=0.5, max_left=0.5).outcome is Outcome.CONVERGED
+    assert run(line, [20.0, 0.0], left=0.5, max_outside=0.5).outcome is Outcome.CONVERGED
 
 
 def test_a_step_that_leaves_the_image_is_refused() -> None:
@@ -185,5 +185,5 @@ def test_bad_options() -> None:
         GaussNewtonOptions(tolerance_px=0.0)
     with pytest.raises(InputError, match="at least 1 iteration"):
         GaussNewtonOptions(max_iterations=0)
-    with pytest.raises(InputError, match="max_left in"):
-        GaussNewtonOptions(max_left=1.5)
+    with pytest.raises(InputError, match="max_outside in"):
+        GaussNewtonOptions(max_outside=1.5)

@@ -14,6 +14,7 @@ from synthetic_photographs import NOISE, Photographed, lattice_points, of
 
 from modeharvest.cli.root import main
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.uncertainty.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
@@ -23,7 +24,7 @@ from modeharvest.runs.photographs.pipeline import HarvestRun
 PITCH, PIXEL = 1.9, 0.035
 CELLULAR, DOMAIN = Box.centred(3 * PITCH, 4 * PITCH), Box.centred(3 * PITCH + 1.6, 4 * PITCH + 1.6)
 HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (0.0, PITCH / 2))
-ANSATZ = Ansatz.square(DOMAIN, CELLULAR, PITCH)
+ANSATZ = Ansatz.on(DOMAIN, [(square_family(), CELLULAR)], PITCH)
 EXPERIMENT = f"""
 [images]
 reference = "reference.tif"
@@ -46,7 +47,7 @@ def scene(seed: int = 2) -> Photographed:
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with nothing wrong in it."""
     folder = tmp_path_factory.mktemp("sound")
-    states = {f"frame_{n}": of(ANSATZ, ANSATZ.start(0.02 * n, 0.0)) for n in (1, 2, 3)}
+    states = {f"frame_{n}": of(ANSATZ, ANSATZ.initial_guess(0.02 * n, 0.0)) for n in (1, 2, 3)}
     scene().save(folder, states)
     (folder / "experiment.toml").write_text(EXPERIMENT)
     return folder
@@ -184,7 +185,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
     grid = np.stack(np.meshgrid(np.arange(40, 210, 8), np.arange(40, 270, 8)), -1).reshape(-1, 2)
     for n in (1, 2, 3):
         points = np.column_stack(scene().grid.to_mm(grid[:, 1], grid[:, 0]))
-        u = of(ANSATZ, ANSATZ.start(0.02 * n, 0.0))(points) / PIXEL
+        u = of(ANSATZ, ANSATZ.initial_guess(0.02 * n, 0.0))(points) / PIXEL
         rows = np.column_stack([grid, u[:, 0], -u[:, 1]])
         header = "x [px],y [px],u [px],v [px]"
         np.savetxt(folder / f"f{n}.csv", rows, delimiter=",", header=header, comments="")
@@ -194,7 +195,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
     assert list(results) == ["frame_1", "frame_3"]
     for n in (1, 3):
         local = results[f"frame_{n}"].local
-        truth = of(ANSATZ, ANSATZ.start(0.02 * n, 0.0))(np.column_stack([local.x, local.y]))
+        truth = of(ANSATZ, ANSATZ.initial_guess(0.02 * n, 0.0))(np.column_stack([local.x, local.y]))
         assert np.abs(local.u - truth).max() < 1e-6 * PITCH
 
 

@@ -59,7 +59,7 @@ def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> N
         family = free_family([[*across, *(2 * xi), 0.4 * k]])
         modes.append(FourierMode.scaled(family, PITCH, Taper(cellular, PITCH / 2)))
     ansatz = Ansatz(domain, tuple(modes), v0_degree=3, v_degree=0)
-    a = ansatz.start(0.05)
+    a = ansatz.initial_guess(0.05)
     for i, size in enumerate((3.0, -2.2, 2.6)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(vectors, Box.centred(5 * PITCH + 0.1, 6.4 * vectors[1, 1]), (0.0, 0.0))
@@ -93,7 +93,7 @@ def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
         for family, box in ((square_family("junction"), above), (shear, below))
     )
     ansatz = Ansatz(domain, modes, v0_degree=3, v_degree=0)
-    a = ansatz.start(0.04)
+    a = ansatz.initial_guess(0.04)
     for i, size in enumerate((3.0, 2.5)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(PITCH * np.eye(2), cellular, (PITCH / 2, PITCH / 2))
@@ -143,7 +143,7 @@ def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_p
     ):  # fmt: skip
         mode = FourierMode.scaled(family, PITCH, Taper(cellular, PITCH / 2))
         ansatz = Ansatz(domain, (mode,), v0_degree=3, v_degree=0)
-        states[name] = of(ansatz, ansatz.start(0.04, size))
+        states[name] = of(ansatz, ansatz.initial_guess(0.04, size))
     scene.save(tmp_path, states)
     results = harvesting(tmp_path).results()
     assert [m.result.ansatz.modes[0].family.name for m in results.values()] == [

@@ -57,7 +57,7 @@ def report(harvest: Harvest, folder: File) -> str:
 
 def bare(harvest: Harvest) -> Harvest:
     """One photograph of which only the correlation is known."""
-    frame = replace(harvest.frames[1], mask=None, by_leftover=None, leftover_covariance=None,
+    frame = replace(harvest.frames[1], mask=None, by_model_error=None, model_error_covariance=None,
                     spectrum=None, pattern=None, local=None, start_sentences=())  # fmt: skip
     return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
                    calibration=None, full_scale=None, sentences=(), truth=None,
@@ -119,7 +119,7 @@ def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
     for panel in photograph_panels(PhotographReportData(harvest)):
         known = panel.key not in ("Sxx", "Syy", "w", "true_w", "best", "loss")
-        known &= not panel.key.endswith("leftover")
+        known &= not panel.key.endswith("model_error")
         assert (f"{panel.key}-1" in page.ids) is known, panel.key
     for name in ("skipped", "optics", "obtained", "timeline", "truth"):
         assert name not in page.ids
@@ -128,7 +128,7 @@ def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None
 def test_a_plain_global_dic_has_a_report_too(harvest: Harvest, tmp_path: File) -> None:
     frame = bare(harvest).frames[0]
     plain = Ansatz(made_up.DOMAIN, (), v0_degree=3)
-    result = replace(frame.result, ansatz=plain, unknowns=plain.start(0.05),
+    result = replace(frame.result, ansatz=plain, unknowns=plain.initial_guess(0.05),
                      inverse=1e-12 * np.eye(plain.size))  # fmt: skip
     by_noise = result.covariance(made_up.NOISE)
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
@@ -146,7 +146,7 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
         free_family([[0.3, 1.0, 1.2, 0.4, 0.1]]), made_up.PITCH, Taper(made_up.CELLULAR, 0.25)
     )
     both = replace(frame.result.ansatz, modes=(*frame.result.ansatz.modes, single))
-    result = replace(frame.result, ansatz=both, unknowns=both.start(0.05, 0.4),
+    result = replace(frame.result, ansatz=both, unknowns=both.initial_guess(0.05, 0.4),
                      inverse=1e-12 * np.eye(both.size))  # fmt: skip
     by_noise = result.covariance(made_up.NOISE)
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
@@ -175,7 +175,7 @@ def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]
 
 def test_advice_that_was_taken_is_not_given_again(harvest: Harvest) -> None:
     held, free = harvest.frames[0], replace(harvest.frames[1], name="free")
-    weak = free.result.ansatz.start(0.05, 0.01)
+    weak = free.result.ansatz.initial_guess(0.05, 0.01)
     result = replace(free.result, unknowns=weak)
     free = replace(free, result=result, identifiability=identifiability(result, made_up.MASK))
     told = harvest_summary(replace(harvest, frames=(held, free)))["frames"]
@@ -220,7 +220,7 @@ def test_the_summary_tells_the_measured_numbers(harvest: Harvest, summary: dict[
     errors = result.standard_errors(made_up.NOISE)[part]
     assert [p["sd_noise"] for p in mode["parameters"]] == pytest.approx(errors)
     assert mode["waves"][0]["sd_noise"] == pytest.approx(errors[1:3] / 2)
-    assert mode["waves"][0]["sd_leftover"] == pytest.approx([0.5e-4, 0.5e-4])
+    assert mode["waves"][0]["sd_model_error"] == pytest.approx([0.5e-4, 0.5e-4])
     # w was made up: two waves of 4 um, of 0.32 px, on top of what was measured; as seen at the
     # local DIC's points, of which every sixth pixel has one.
     at = made_up.wave()[3::6, 3::6][made_up.MASK[3::6, 3::6]] / made_up.GRID.pixel_size

@@ -10,6 +10,7 @@ import tifffile
 from synthetic_photographs import Displacement, Photographed, lattice_points, of
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
@@ -31,8 +32,8 @@ def scene(seed: int = 2) -> Photographed:
 
 def truth(strain: float) -> Displacement:
     """A pitchfork: beyond a strain, a pattern whose square grows with the strain."""
-    ansatz = Ansatz.square(DOMAIN, CELLULAR, PITCH)
-    return of(ansatz, ansatz.start(strain, 20.0 * np.sqrt(max(0.0, strain - CRITICAL))))
+    ansatz = Ansatz.on(DOMAIN, [(square_family(), CELLULAR)], PITCH)
+    return of(ansatz, ansatz.initial_guess(strain, 20.0 * np.sqrt(max(0.0, strain - CRITICAL))))
 
 
 @pytest.fixture(scope="module")

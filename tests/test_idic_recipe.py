@@ -22,12 +22,12 @@ def test_the_printed_family_is_recovered() -> None:
     names: dict[str, Any] = {}
     exec(compile(block, str(PAGE), "exec"), names)
     ansatz: Ansatz = names["ansatz"]
-    truth = ansatz.start(0.04, 1.5)
+    truth = ansatz.initial_guess(0.04, 1.5)
     truth[: ansatz.phi_offset(0)] += 0.003 * np.random.default_rng(0).normal(size=26)
     truth[ansatz.phi_slice(0)] += [0.02, 0.03, -0.04, 0.05]
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
     mask = manufactured.inner_mask(0.1)
-    result = correlate(f, g, GRID, ansatz, ansatz.start(strain=0.04, amplitude=1.0), mask)
+    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(strain=0.04, amplitude=1.0), mask)
     assert result.outcome is Outcome.CONVERGED
     error = (result.displacement() - ansatz.displacement(truth, GRID.x, GRID.y))[mask] / PIXEL
     assert np.sqrt((error**2).sum(axis=-1).mean()) < 1e-5

@@ -39,11 +39,11 @@ def simple() -> tuple[Ansatz, FloatArray, FloatArray, FloatArray]:
     """Few unknowns, so that the image has plenty of pixels; noisy, so that it matters which."""
     mode = FourierMode.scaled(square_family("junction"), 1.0, EVERYWHERE)
     ansatz = Ansatz(DOMAIN, (mode,), v0_degree=1, v_degree=0)
-    a = ansatz.start(STRAIN, 1.3)
+    a = ansatz.initial_guess(STRAIN, 1.3)
     a[ansatz.phi_slice(0)] += 0.02
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, a)
     noise = 0.02 * np.random.default_rng(0).normal(size=(2, *GRID.shape))
-    return ansatz, ansatz.start(STRAIN, 1.0), f + noise[0], g + noise[1]
+    return ansatz, ansatz.initial_guess(STRAIN, 1.0), f + noise[0], g + noise[1]
 
 
 def found() -> Result:
@@ -86,7 +86,7 @@ def test_a_whole_correlation_does_not_depend_on_the_number_of_threads(threads: i
     np.testing.assert_array_equal(one.unknowns, two.unknowns)
     np.testing.assert_array_equal(one.inverse, two.inverse)
     assert one.residual_correlation == two.residual_correlation
-    assert one.unmatched == two.unmatched
+    assert one.decorrelated_fraction == two.decorrelated_fraction
 
 
 @pytest.mark.parametrize("unit_cell", [1.2, 1.4])
@@ -97,7 +97,7 @@ def test_on_two_cells_the_coarse_levels_do_not_wander(unit_cell: float) -> None:
     the 50 that are allowed.
     """
     ansatz, truth, f, g = case(unit_cell)
-    result = correlate(f, g, GRID, ansatz, ansatz.start(STRAIN, 1.0), MASK)
+    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
     assert result.condition_number > 5e4
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
@@ -151,7 +151,7 @@ def test_the_smallest_images(size: int) -> None:
     row, col = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in GRID.shape)
     slow = Ansatz(box, (), v0_degree=3)
     _, _, f, _ = case()
-    a = slow.start(0.01)
+    a = slow.initial_guess(0.01)
     a[[0, 5, 11]] += 0.4 * PIXEL
     part = np.ascontiguousarray(f[row, col])
     u = slow.displacement(a, grid.x, grid.y) / PIXEL
@@ -160,11 +160,11 @@ def test_the_smallest_images(size: int) -> None:
     # f is g's spline at x + u, so that the truth is exact.
     warped = spline.sample(r - u[..., 1], c + u[..., 0])[0]
     inside = np.isfinite(warped)
-    result = correlate(np.nan_to_num(warped), part, grid, slow, slow.start(0.0), inside)
+    result = correlate(np.nan_to_num(warped), part, grid, slow, slow.initial_guess(0.0), inside)
     assert result.outcome is Outcome.CONVERGED
     assert rms_px(result.displacement(), u * PIXEL, inside) < 1e-4
-    whole, shown = Ansatz.square(box, box, 0.4), np.nan_to_num(warped)
-    start = whole.start(0.01, 0.1)
+    whole, shown = Ansatz.on(box, [(square_family(), box)], 0.4), np.nan_to_num(warped)
+    start = whole.initial_guess(0.01, 0.1)
     result = correlate(shown, part, grid, whole, start, inside)
     assert result.outcome in (Outcome.CONVERGED, Outcome.MAX_ITERATIONS)
     begun = residual(Assembly(whole, grid, inside), start, shown.astype(np.float32), spline)

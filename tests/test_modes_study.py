@@ -166,7 +166,9 @@ def test_the_size_of_the_cells_changes_nothing(measured: tuple[Any, ...]) -> Non
     assert (base["pitch_mm"], large["pitch_mm"]) == (1.9, 3.8)
     for name in modes_specimen.PARAMETERS:
         assert large[name] == pytest.approx(base[name], abs=1e-5), name
-        assert large[f"{name}_sd_leftover"] == pytest.approx(base[f"{name}_sd_leftover"], rel=1e-3)
+        assert large[f"{name}_sd_model_error"] == pytest.approx(
+            base[f"{name}_sd_model_error"], rel=1e-3
+        )
     for name in ("w_px", "best_px", "lost_px", "overlap_truth", "overlap_lattice", "amplitude"):
         assert large[name] == pytest.approx(base[name], rel=1e-4), name
 
@@ -177,10 +179,10 @@ def test_what_is_measured_of_the_paper_s_specimen(measured: tuple[Any, ...]) -> 
     base = table.iloc[0]
     assert base["best_px"] < base["w_px"] < base["best_px"] + base["lost_px"]
     assert base["overlap_truth"] < base["best_overlap_truth"] < 1.0
-    apart = [(base[n] - base[f"best_{n}"]) / base[f"{n}_sd_leftover"]
+    apart = [(base[n] - base[f"best_{n}"]) / base[f"{n}_sd_model_error"]
              for n in modes_specimen.PARAMETERS]  # fmt: skip
     assert np.abs(apart).max() < 4.0
-    assert 0.0 < base["a2_sd_noise"] < base["a2_sd_leftover"]
+    assert 0.0 < base["a2_sd_noise"] < base["a2_sd_model_error"]
 
 
 def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None:
@@ -204,13 +206,13 @@ def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
     odd.loc[0, "unstable_pivots"] = 2.0
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
-    odd.loc[2, "outcome"] = "trapped"
+    odd.loc[2, "outcome"] = "local_minimum"
     said = " ".join(modes_findings(odd, folder, "seed 0").sentences)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said
     assert "the branch could be followed to 0.1 l only" in said
-    assert "l 3.8 mm: the correlation ended trapped" in said
+    assert "l 3.8 mm: the correlation ended local_minimum" in said
 
 
 def test_a_description_comes_back_as_it_was(measured: tuple[Any, ...]) -> None:

@@ -100,19 +100,19 @@ def test_images_against_the_explicit_jacobian(name: str, order: int) -> None:
     J, r = dense(ansatz, a, mask, f, spline)
     assert_same(got, J, r)
     assert got.pixels == len(r)
-    assert got.left_image == mask.sum() - len(r)
+    assert got.outside_image == mask.sum() - len(r)
     assert got.mean_square == pytest.approx((r**2).mean())
 
 
 def test_pixels_that_leave_the_image_are_counted_and_take_no_part() -> None:
     ansatz, mask = manufactured.one_mode(), np.ones(GRID.shape, dtype=np.bool_)
-    a = ansatz.start()
+    a = ansatz.initial_guess()
     a[0] = 100.5 * GRID.pixel_size  # 100.5 px to the right
     f, g = images()
     spline = SplineImage.of(g)
     got = Assembly(ansatz, GRID, mask).images(a, f, spline)
     J, r = dense(ansatz, a, mask, f, spline)
-    assert got.left_image == mask.sum() - len(r) >= 100 * GRID.rows
+    assert got.outside_image == mask.sum() - len(r) >= 100 * GRID.rows
     assert_same(got, J, r)
 
 
@@ -164,7 +164,7 @@ def test_gradient_against_differences_of_the_cost(
     evaluate = make(ansatz)
     a = manufactured.random_unknowns(ansatz, 4, 0.02)
     here = evaluate(a)
-    assert here.left_image == 0
+    assert here.outside_image == 0
     # Steps of 1e-5 standard deviations of a residual: each moves the cost by 1e-5 of its size.
     h = 1e-5 * np.sqrt(2 * here.cost / np.diag(here.matrix))
     differences = [
@@ -220,7 +220,7 @@ def test_two_halves_add_up_to_the_whole() -> None:
         Assembly(ansatz, GRID, m).images(a, f, spline) for m in (mask, left, mask & ~left)
     )
     total = part + rest
-    assert (total.pixels, total.left_image) == (whole.pixels, whole.left_image)
+    assert (total.pixels, total.outside_image) == (whole.pixels, whole.outside_image)
     assert total.cost == pytest.approx(whole.cost, rel=1e-12)
     size = np.sqrt(np.diag(whole.matrix))
     np.testing.assert_allclose(
@@ -232,7 +232,7 @@ def test_no_pixel_is_an_infinite_mean_and_no_fault() -> None:
     ansatz = manufactured.one_mode()
     f, g = images()
     empty = Assembly(ansatz, GRID, np.zeros(GRID.shape, dtype=np.bool_))
-    got = empty.images(ansatz.start(), f, SplineImage.of(g))
+    got = empty.images(ansatz.initial_guess(), f, SplineImage.of(g))
     assert got.pixels == 0
     assert got.mean_square == np.inf
     assert not got.matrix.any()

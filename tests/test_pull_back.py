@@ -25,14 +25,14 @@ def test_an_image_against_the_pulled_back_one_gives_the_whole_displacement() -> 
     ansatz, truth, f, g = case()
     first = correlate(f, g, GRID, ansatz, truth, MASK)
     back, seen = pulled_back(g, first)
-    again = correlate(back, g, GRID, ansatz, ansatz.start(0.05, 1.0), MASK & seen)
+    again = correlate(back, g, GRID, ansatz, ansatz.initial_guess(0.05, 1.0), MASK & seen)
     assert error_px(again, truth) < 1e-4
 
 
 def test_pixels_off_the_image_are_told() -> None:
     ansatz, truth, f, g = case()
     result = correlate(f, g, GRID, ansatz, truth, MASK)
-    shifted = ansatz.start()
+    shifted = ansatz.initial_guess()
     shifted[ansatz.v0_slice(0)][0] = 20.5 * GRID.pixel_size
     shifted[ansatz.v_slice(0)] = 0.0
     back, seen = pulled_back(g, replace(result, unknowns=shifted))

@@ -105,9 +105,9 @@ def test_pixels_of_the_finest_level_keep_their_distance_from_the_edges() -> None
     f = np.random.default_rng(3).uniform(size=GRID.shape)
     pair = coarse(f, f, COARSE_TO_FINE[-1], mask, g_mask)
     np.testing.assert_array_equal(pair.mask, eroded(mask, 3))
-    assert pair.allowed is not None
+    assert pair.valid is not None
     inner = (slice(8, -8),) * 2
-    np.testing.assert_array_equal(pair.allowed[inner], eroded(g_mask, 2)[inner])
+    np.testing.assert_array_equal(pair.valid[inner], eroded(g_mask, 2)[inner])
 
 
 @pytest.mark.parametrize(("order", "shape", "border"), [(5, (150, 140), 8), (3, (90, 140), 5),
@@ -121,7 +121,7 @@ def test_pixels_of_the_finest_level_keep_their_distance_from_the_border(
     pair = level_pair(f, f, grid, None, None, COARSE_TO_FINE[-1], edge_px=3, order=order)
     expected = np.zeros(shape, dtype=np.bool_)
     expected[border:-border, border:-border] = True
-    np.testing.assert_array_equal(pair.allowed, expected)
+    np.testing.assert_array_equal(pair.valid, expected)
     assert pair.mask.all()
 
 
@@ -132,7 +132,7 @@ def test_without_the_deformed_mask_the_reference_is_not_normalised_either() -> N
     level = COARSE_TO_FINE[1]
     pair, plain = coarse(f, f, level, mask), coarse(f, f, level)
     np.testing.assert_array_equal(pair.reference, plain.reference)
-    assert pair.allowed is None
+    assert pair.valid is None
     assert pair.mask.sum() < plain.mask.sum()
 
 

@@ -80,7 +80,7 @@ def test_on_a_full_rectangle_the_transfer_is_bessel_s(degree: int, axis: int) ->
         [AddedWave("v0", axis, p, phase, 1.0).shape(points) for p in period for phase in phases],
         axis=-1,
     )
-    found = TangentFit(ansatz, ansatz.start(), points).fit(waves)
+    found = TangentFit(ansatz, ansatz.initial_guess(), points).fit(waves)
     # The power of both phases together: their shares, weighted by their own power.
     power = (waves**2).sum(axis=(0, 1))
     both = (wave_share(found.whole, waves) * power).reshape(-1, 2).sum(1) / power.reshape(
@@ -242,8 +242,8 @@ def test_the_shipped_study_spells_out_the_defaults() -> None:
     assert case.imaging.pixel_size == 0.02
     quick = case.quick()
     assert quick.study.measured == (5,)
-    with pytest.raises(InputError, match="hold_mode"):
-        case.study.require(SquareLatticeOptions(hold_mode=True))
+    with pytest.raises(InputError, match="fixed_mode"):
+        case.study.require(SquareLatticeOptions(fixed_mode=True))
     with pytest.raises(InputError, match="camera = false"):
         case.study.require(SquareLatticeOptions(camera=True))
 

@@ -31,7 +31,7 @@ def some_result(seed: int = 0, outcome: Outcome = Outcome.CONVERGED) -> Result:
         inverse=half.T @ half,
         residual_rms=0.1 / 3,
         pixels=12345,
-        left_image=7,
+        outside_image=7,
         outcome=outcome,
         condition_number=1e5 / 7,
         history=(Iteration(8, 1, 0.1, 1 / 3, 1e-4, 99), Iteration(1, 1, 0.02, 2e-5, 0.0, 12345)),
@@ -43,7 +43,7 @@ def assert_equal(one: Result, other: Result) -> None:
     for name in ("unknowns", "inverse"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for name in (
-        "grid", "residual_rms", "pixels", "left_image", "outcome", "condition_number",
+        "grid", "residual_rms", "pixels", "outside_image", "outcome", "condition_number",
         "history", "names", "noise_sd", "iterations", "undetermined",
     ):  # fmt: skip
         assert getattr(one, name) == getattr(other, name)

@@ -30,7 +30,7 @@ FINE = CorrelationOptions(levels=(Level(1, 0.0),), gradient="deformed", gradient
 @cache
 def truth() -> NDArray[np.float64]:
     rng = np.random.default_rng(0)
-    return np.asarray(ANSATZ.start(0.01) + 0.003 * rng.normal(size=ANSATZ.size))
+    return np.asarray(ANSATZ.initial_guess(0.01) + 0.003 * rng.normal(size=ANSATZ.size))
 
 
 @cache
@@ -58,7 +58,7 @@ def test_what_a_spline_makes_of_noise_between_pixels(
     )
     grid = PixelGrid.centred(500, 500, PIXEL)
     ansatz = Ansatz(Box.centred(5.0, 5.0), v0_degree=1)
-    a = ansatz.start(0.0)
+    a = ansatz.initial_guess(0.0)
     a[[ansatz.v0_slice(c).start for c in (0, 1)]] = np.array(shift_px) * PIXEL
     found = NoiseTransfer.of(ansatz, a, grid, np.ones(grid.shape, dtype=np.bool_), order)
     # 225 625 pixels: a variance scatters by sqrt(2/225 625) = 0.3 %, twice that correlated ones'.
@@ -96,7 +96,7 @@ def test_noise_in_the_gradient_is_taken_back(sd: float) -> None:
 
 def test_a_residual_that_is_noise_tells_as_much() -> None:
     sd, noisy = 0.01, correlated(0.01, 0.01)
-    assert noisy.agreement().is_white
+    assert noisy.residual_test().is_white
     np.testing.assert_allclose(noisy.covariance(), noisy.covariance(noisy.noise_sd))
     # 36 000 px: 0.4 %, though not all of them independent.
     assert noisy.noise_sd == pytest.approx(sd, rel=0.015)
@@ -117,7 +117,7 @@ def test_noise_in_the_reference_only_leaves_the_gradient_alone() -> None:
 
 def test_a_fit_to_a_displacement_has_no_gradient() -> None:
     u = ANSATZ.displacement(truth(), GRID.x, GRID.y)
-    fit = fit_displacement(u, GRID, ANSATZ, ANSATZ.start(0.01), MASK)
+    fit = fit_displacement(u, GRID, ANSATZ, ANSATZ.initial_guess(0.01), MASK)
     np.testing.assert_array_equal(fit.covariance(0.001), 2 * 0.001**2 * fit.inverse)
 
 

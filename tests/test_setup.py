@@ -20,7 +20,7 @@ def test_the_start_is_the_specimens_own_pattern(holes_x: int, holes_y: int) -> N
     """phi of the start is +-0.04 times Specimen.pattern over the whole cellular part."""
     specimen = Specimen(holes_x=holes_x, holes_y=holes_y)
     ansatz = SETUP.ansatz(specimen)
-    start = SETUP.start(ansatz, 0.1)
+    start = ansatz.initial_guess(0.1, SETUP.start_amplitude)
     a, b = specimen.cellular_half_size
     x, y = np.linspace(-a, a, 23), np.linspace(-b, b, 31)
     phi = ansatz.phi(0, start, x, y).reshape(-1, 2)
@@ -36,7 +36,7 @@ def test_the_modes_origin_is_a_solid_junction(holes_x: int, holes_y: int, pitch:
     """There phi vanishes and turns the material rigidly, as between four holes."""
     specimen = Specimen(holes_x, holes_y, diameter=0.8 * pitch, pitch=pitch)
     ansatz = SETUP.ansatz(specimen)
-    start = SETUP.start(ansatz, 0.0)
+    start = ansatz.initial_guess(0.0, SETUP.start_amplitude)
     _, k1x, k1y, k2x, k2y, c1, c2 = start[ansatz.phi_slice(0)]
     origin = np.linalg.solve([[k1x, k1y], [k2x, k2y]], [-c1, -c2])  # both phases zero
     corner = -np.array(specimen.cellular_half_size)
@@ -48,7 +48,7 @@ def test_the_modes_origin_is_a_solid_junction(holes_x: int, holes_y: int, pitch:
 def test_the_papers_numbers() -> None:
     specimen = Specimen()
     ansatz = SETUP.ansatz(specimen)
-    start = SETUP.start(ansatz, 0.128)
+    start = ansatz.initial_guess(0.128, SETUP.start_amplitude)
     assert ansatz.size == len(ansatz.names) == len(ansatz.units) == 77
     np.testing.assert_array_equal(start[ansatz.phi_slice(0)], [1, 1, 1, -1, 1, 0, 0])
     assert dict(zip(ansatz.names, ansatz.units, strict=True))["phi1.a6"] == "mm"
@@ -89,11 +89,11 @@ def test_bad_values_are_named(values: dict[str, float], words: str) -> None:
 
 def test_a_held_mode_has_no_unknowns_and_is_the_ideal_one() -> None:
     specimen = Specimen(holes_x=5, holes_y=4)
-    free, held = (SquareLatticeOptions(hold_mode=h).ansatz(specimen) for h in (False, True))
+    free, held = (SquareLatticeOptions(fixed_mode=h).ansatz(specimen) for h in (False, True))
     assert held.size == free.size - 7
     x, y = np.linspace(-5, 5, 7), np.linspace(-4, 4, 9)
     np.testing.assert_allclose(
-        held.phi(0, held.start(), x, y), free.phi(0, free.start(), x, y), atol=1e-15
+        held.phi(0, held.initial_guess(), x, y), free.phi(0, free.initial_guess(), x, y), atol=1e-15
     )
 
 

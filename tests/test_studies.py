@@ -97,7 +97,7 @@ def test_intervals_are_wilson_s(good: int, n: int) -> None:
 
 def test_numbers_of_a_robustness_study() -> None:
     table = starts_table([1e-9] * 97 + [0.5, 2.0, 4.0])
-    table.loc[98, "outcome"] = "trapped"
+    table.loc[98, "outcome"] = "local_minimum"
     table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
     found = told.robustness_findings(table, 0.1, "seed 0")
@@ -118,7 +118,7 @@ def test_numbers_of_a_robustness_study() -> None:
 def test_the_basin_ends_where_the_first_start_is_lost() -> None:
     parts = []
     for radius, lost in ((0.05, 0), (0.1, 0), (0.2, 1), (0.3, 0), (0.5, 3)):
-        part = starts_table([9.0] * lost + [1e-9] * (4 - lost), ["trapped"] * lost
+        part = starts_table([9.0] * lost + [1e-9] * (4 - lost), ["local_minimum"] * lost
                             + ["converged"] * (4 - lost))  # fmt: skip
         parts.append(part.assign(radius=radius))
     found = told.robustness_findings(pd.concat(parts, ignore_index=True), 0.1, "seed 0")
@@ -322,7 +322,7 @@ def test_a_quick_study_is_smaller() -> None:
         ("[study]\nradii = [0.1]", "other than radius"),
         ("[study]\nradii = [0.2, 0.2]", "radii that differ"),
         ("[study]\nstrain = 0.1", "among experiment.strains"),
-        ("[study]\n[correlation]\nhold_mode = true", "hold_mode = false"),
+        ("[study]\n[correlation]\nfixed_mode = true", "fixed_mode = false"),
         ('[study]\nkind = "noise"\nlevels = [1.0]', "levels above 0"),
         ('[study]\nkind = "noise"\npairs = 1', "expected 2 to 100000 pairs"),
         ('[study]\nkind = "noise"\n[correlation]\ncamera = true', "camera = false"),

@@ -50,7 +50,7 @@ def test_a_pattern_from_the_beginning_is_said() -> None:
 
 def test_mean_strain_is_that_of_the_slow_field() -> None:
     ansatz, _, f, g = case()
-    a = ansatz.start(0.037, 1.0)
+    a = ansatz.initial_guess(0.037, 1.0)
     result = correlate(f, g, GRID, ansatz, a, MASK)
     along, across = mean_strain(replace(result, unknowns=a), Box.centred(2.0, 2.4))
     assert along == pytest.approx(0.037 * 1.0, rel=1e-12)

@@ -47,7 +47,7 @@ def beyond_the_ansatz() -> NDArray[np.float64]:
 def comparison() -> Comparison:
     """A truth of ansatz and fast fluctuation; a "measurement" a known step off its best fit."""
     ansatz, mask = one_mode(), body()
-    start = ansatz.start(0.05, 1.0)
+    start = ansatz.initial_guess(0.05, 1.0)
     truth = ansatz.displacement(start, GRID.x, GRID.y) + beyond_the_ansatz()
     truth = np.where(mask[..., None], truth, np.nan)
     best = fit_displacement(truth, GRID, ansatz, start, mask)
@@ -64,7 +64,7 @@ def test_the_best_fit_is_the_lowest_minimum_though_it_is_looked_for_on_few_pixel
 ) -> None:
     monkeypatch.setattr(truth_module, "_ENOUGH", 800)  # every third pixel or so
     ansatz, mask = one_mode(), body()
-    near = ansatz.start(0.05, 1.0)
+    near = ansatz.initial_guess(0.05, 1.0)
     trapped = near.copy()
     trapped[ansatz.phi_slice(0)][1:3] *= 2.5  # wave vectors that lead to another minimum
     truth = ansatz.displacement(near, GRID.x, GRID.y) + beyond_the_ansatz()
@@ -131,7 +131,7 @@ def test_pythagoras_of_the_errors(comparison: Comparison) -> None:
 def test_pattern_is_measured_by_region(comparison: Comparison) -> None:
     """A mode of maximum norm 0.04 times v1 = 1 mm is 0.04 mm = 2 px somewhere on the material."""
     ansatz = comparison.result.ansatz
-    plain = replace(comparison.result, unknowns=ansatz.start(0.0, 1.0))
+    plain = replace(comparison.result, unknowns=ansatz.initial_guess(0.0, 1.0))
     size = pattern_size(replace(comparison, result=plain), SPECIMEN)
     assert 0.9 * 2 < size.anywhere <= 2 * (1 + 1e-9)
     assert size.corners <= size.anywhere

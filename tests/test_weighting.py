@@ -43,7 +43,7 @@ NOISE, PAIRS = 0.02, 40
 def truth() -> FloatArray:
     """A few per cent of strain and of rotation."""
     rng = np.random.default_rng(0)
-    return np.asarray(ANSATZ.start(0.03) + 0.01 * rng.normal(size=ANSATZ.size))
+    return np.asarray(ANSATZ.initial_guess(0.03) + 0.01 * rng.normal(size=ANSATZ.size))
 
 
 @cache
@@ -54,7 +54,7 @@ def pair(seed: int = 3) -> tuple[FloatArray, FloatArray]:
 def test_the_deformed_image_itself_as_the_instrument_changes_nothing() -> None:
     f, g = (image.astype(np.float32) for image in pair())
     spline, used = SplineImage.of(g), Assembly(ANSATZ, GRID, MASK)
-    a = ANSATZ.start(0.028)
+    a = ANSATZ.initial_guess(0.028)
     given = warped_back(used, a, f, spline)
     own, same = used.images(a, f, spline), used.images(a, f, spline, instrument=given)
     # float32 slopes, of which 10^4 are summed.
@@ -117,8 +117,10 @@ def test_a_displacement_left_over_keeps_the_least_squares_minimum() -> None:
     low = replace(ANSATZ, v0_degree=1)
     noise = NOISE * np.random.default_rng(1).normal(size=(2, *GRID.shape))
     f, g = pair()
-    found = correlate(f + noise[0], g + noise[1], GRID, low, low.start(0.03), MASK, options=FINEST)
-    assert not found.agreement().is_white
+    found = correlate(
+        f + noise[0], g + noise[1], GRID, low, low.initial_guess(0.03), MASK, options=FINEST
+    )
+    assert not found.residual_test().is_white
     assert found.weighting.is_least_squares
 
 
@@ -218,7 +220,9 @@ def test_weighing_anew_takes_little_memory(gradient: str) -> None:
     grid, everywhere = PixelGrid.centred(*image.shape, PIXEL), np.ones(image.shape, dtype=np.bool_)
     options = replace(CorrelationOptions(), gradient=gradient)
     tracemalloc.start()
-    found = correlate(f, g, grid, ANSATZ, ANSATZ.start(0.0), everywhere, everywhere, options)
+    found = correlate(
+        f, g, grid, ANSATZ, ANSATZ.initial_guess(0.0), everywhere, everywhere, options
+    )
     peak = tracemalloc.get_traced_memory()[1] / f.nbytes
     tracemalloc.stop()
     assert found.weighting.blur_px > 0.0

@@ -27,7 +27,7 @@ class Moment:
         Mean nominal compression of the cellular part, from v0 [-].
     amplitude_px
         Rms of v1 phi1 per component [px]; of several modes the root of their squares' sum.
-    leftover_px
+    model_error_px
         What the ansatz leaves over, rms per component [px].
     noise_px
         Standard deviation of v1 phi1 by the images' noise, rms per component [px]; of several
@@ -37,13 +37,13 @@ class Moment:
     name: str
     strain: float
     amplitude_px: float
-    leftover_px: float
+    model_error_px: float
     noise_px: float
 
     @property
     def has_pattern(self) -> bool:
         """Whether the pattern stands out of noise and of what the ansatz leaves over."""
-        return self.amplitude_px > OBSERVABLE * max(self.leftover_px, self.noise_px)
+        return self.amplitude_px > OBSERVABLE * max(self.model_error_px, self.noise_px)
 
 
 @dataclass(frozen=True)

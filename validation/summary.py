@@ -19,7 +19,7 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
     ``mode_best_fit``, ``iterations`` (on the full image), ``iterations_all_levels``,
     ``outcome``, ``outcome_why``,
     ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
-    ``mode_observable``, ``leftover_estimate_px`` (of w, from the images alone),
+    ``mode_observable``, ``model_error_estimate_px`` (of w, from the images alone),
     ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
     ``noise_sd`` (of the images that were correlated, rms over the material and both images
     [fraction of full scale]; null for the noise-free ones), ``chi_square`` (the residual against
@@ -227,7 +227,7 @@ def displacement_spectrum(
 
 def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
     result, how = measured.results[strain], measured.how
-    start = how.start(result.ansatz, strain)
+    start = result.ansatz.initial_guess(strain, how.start_amplitude)
     return compare(measured.images, strain, result, start, how.camera)
 
 
@@ -249,7 +249,7 @@ def snapshot_summary(
     px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
     seen = identifiability(result, mask)
     noise = _snapshot_noise(measured, comparison.strain)
-    agreement = result.agreement(noise)
+    test = result.residual_test(noise)
     return {
         "nominal_strain": comparison.strain,
         "branch": state.branch,
@@ -264,14 +264,14 @@ def snapshot_summary(
         **_mode_numbers(comparison, measured, 0 not in seen.unobservable),
         **_brightness(comparison),
         "mode_observable": not seen.unobservable,
-        "leftover_estimate_px": seen.leftover_px,
+        "model_error_estimate_px": seen.model_error_px,
         "mode_polynomial_overlap": seen.overlap[0],
         "worst_determined": [str(combination) for combination in seen.worst],
         "residual_correlation": result.residual_correlation,
         "noise_sd": None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
-        "chi_square": None if noise is None else agreement.chi_square,
+        "chi_square": None if noise is None else test.chi_square,
         "identifiability_warnings": list(seen.warnings),
-        "residual_verdict": agreement.sentence,
+        "residual_verdict": test.sentence,
         "weighting": result.weighting.sentence,
         "iterations": result.iterations,
         "iterations_all_levels": len(result.history),
@@ -321,7 +321,7 @@ def _mode_numbers(
     """The mode's parameters against the ideal ones; nothing where the mode was held."""
     result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
     phi = result.ansatz.phi_slice(0)
-    ideal = measured.how.start(result.ansatz, comparison.strain)[phi]
+    ideal = result.ansatz.initial_guess(comparison.strain, measured.how.start_amplitude)[phi]
     if not ideal.size:
         return {}
     found = result.mode_parameters()
@@ -348,7 +348,7 @@ def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> list[
     )
     masks = images.mask(), images.deformed_mask(comparison.strain)
     try:
-        found = MatchedImages.of(result, pair, masks, how.edge_px).leftover_covariance(
+        found = MatchedImages.of(result, pair, masks, how.edge_px).model_error_covariance(
             result, measured.specimen.pitch
         )
     except InputError:  # a specimen of too few cells

@@ -88,7 +88,7 @@ class _Ways:
     def __init__(self, pair: ImagePair) -> None:
         self.pair = pair
         self.edge_px = 0 if pair.deformed_mask is None else 2
-        self.best = self._best(*pair.held())
+        self.best = self._best(*pair.fixed())
         self.best_free = self._best(pair.ansatz, pair.start)
         self.pixels = pair.pixels(self.best, self.edge_px)
         self.seconds: dict[str, list[float]] = {}
@@ -104,7 +104,7 @@ class _Ways:
 
     def held(self) -> Result:
         """Ours, with the unknowns that pyxel has."""
-        return self._ours(*self.pair.held())
+        return self._ours(*self.pair.fixed())
 
     def _ours(self, ansatz: Ansatz, start: FloatArray) -> Result:
         pair = self.pair

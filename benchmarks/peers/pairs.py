@@ -84,7 +84,7 @@ class ImagePair:
     def held(self) -> tuple[Ansatz, FloatArray]:
         """Ansatz and start with the mode's parameters held at the start."""
         (mode,), n = self.ansatz.modes, self.ansatz.phi_offset(0)
-        family = replace(mode.family, start=self.start[self.ansatz.phi_slice(0)]).held()
+        family = replace(mode.family, start=self.start[self.ansatz.phi_slice(0)]).fixed()
         return replace(self.ansatz, modes=(replace(mode, family=family),)), self.start[:n]
 
 
@@ -99,7 +99,7 @@ def inside_the_ansatz(shape: tuple[int, int], seed: int) -> ImagePair:
     everywhere = Taper(Box(*(4.0 * np.array([box.x_min, box.x_max, box.y_min, box.y_max]))), 1.0)
     mode = FourierMode.scaled(square_family("junction"), 1.9, everywhere)
     ansatz = Ansatz(box, (mode,))
-    start = ansatz.start(0.05, 1.0)
+    start = ansatz.initial_guess(0.05, 1.0)
     rng = np.random.default_rng(seed)
     a = start.copy()
     for c in (0, 1):
@@ -147,7 +147,7 @@ def paper(shape: tuple[int, int] | None, pixel_size: float) -> ImagePair:
             images.mask(),
             images.deformed_mask(STRAIN),
             ansatz,
-            case.correlation.start(ansatz, STRAIN),
+            ansatz.initial_guess(STRAIN, case.correlation.start_amplitude),
             images.truth(STRAIN).displacement,
             solution.mesh,
         )

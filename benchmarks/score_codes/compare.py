@@ -76,7 +76,8 @@ def idic(task: Task, field: Path, codes: str) -> None:
     how = SquareLatticeOptions()
     ansatz = how.ansatz(Specimen())
     found = correlate(
-        task.reference, task.deformed, task.grid, ansatz, how.start(ansatz, task.strain),
+        task.reference, task.deformed, task.grid, ansatz,
+        ansatz.initial_guess(task.strain, how.start_amplitude),
         task.mask, task.deformed_mask, how.options(),
     )  # fmt: skip
     write_field(field, sampled_field(found.displacement(), task.grid, task.mask, STEP_PX))

@@ -8,21 +8,21 @@ images give by themselves.
 1. v0: through the motion of hole centres, or of outlines; not needed with a local DIC's field.
 2. A field, rough or measured, and its spectrum over each region.
 3. Modes: the square family with seven parameters, or free waves, or the pattern that the lattice of
-   holes allows, held, where the images show none.
+   holes allows, fixed, where the images show none.
 4. v0 and every v_i, together, by robust least squares through the field.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, square_family
+from modeharvest.idic.modes import ModeFamily, Taper, square_family
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_modes import (
     SAME_WAVE,
@@ -55,23 +55,6 @@ AMPLITUDE_DEGREE = 2
 """Total degree of every v_i at the start: strongest in the middle, weaker at clamped edges."""
 FIXED_AMPLITUDE = 1.0
 """v_i where no pattern is seen [mm]; as the paper's start, 40 um with max ||phi|| = 0.04."""
-
-
-@dataclass(frozen=True)
-class InitialGuessOptions:
-    """What the ansatz is to be able to say.
-
-    Parameters
-    ----------
-    v0_degree, v_degree
-        Total degrees of v0 and of every v_i; the paper's.
-    brightness
-        Whether gain and offset are unknowns.
-    """
-
-    v0_degree: int = 5
-    v_degree: int = 6
-    brightness: Brightness = field(default_factory=Brightness)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +93,8 @@ class InitialGuess:
         One or more, with their spectra.
     local
         The field that the start was read from.
-    held
-        Whether the modes are held because no pattern is seen.
+    fixed
+        Whether the modes are fixed because no pattern is seen.
     sentences
         What was found, in words.
     """
@@ -120,7 +103,7 @@ class InitialGuess:
     unknowns: FloatArray
     regions: tuple[RegionPattern, ...]
     local: LocalField
-    held: bool
+    fixed: bool
     sentences: tuple[str, ...]
 
     @property
@@ -152,7 +135,7 @@ def initial_guess(
     holes: tuple[ArrayLike, ArrayLike] | None = None,
     lattice: ArrayLike | None = None,
     domain: Box | None = None,
-    options: InitialGuessOptions | None = None,
+    options: AnsatzOptions | None = None,
 ) -> InitialGuess:
     """Find ansatz and start for a pair of images.
 
@@ -177,14 +160,14 @@ def initial_guess(
     domain
         Of the Chebyshev polynomials [mm]; by default the material's bounding box.
     options
-        Degrees, brightness.
+        Degrees; the paper's by default.
 
     Raises
     ------
     InputError
         If the holes or the spectrum contradict the cell size, or the images are no pair.
     """
-    options = options or InitialGuessOptions()
+    options = options or AnsatzOptions()
     inside = checked_mask(mask, "mask", grid)
     landing = checked_mask(deformed_mask, "deformed mask", grid)
     boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)
@@ -199,13 +182,13 @@ def initial_guess(
         share = 100 * local.valid_share
         said.append(f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid.")
     regions, modes = _read_regions(local, boxes, cells, said)
-    held = not modes
-    if held:
+    fixed = not modes
+    if fixed:
         modes = _fixed_mode(boxes[0], cells, said)
     ansatz, a = _assembled(modes, cell_size, domain, options)
-    fit = _fitted(ansatz, a, local, held)
-    said.append(_fit_words(ansatz, fit, held))
-    return InitialGuess(ansatz, fit.coefficients, regions, local, held, tuple(said))
+    fit = _fitted(ansatz, a, local, fixed)
+    said.append(_fit_words(ansatz, fit, fixed))
+    return InitialGuess(ansatz, fit.coefficients, regions, local, fixed, tuple(said))
 
 
 def _read_regions(
@@ -246,41 +229,38 @@ def _fixed_mode(box: Box, cells: Cells, said: list[str]) -> list[_Placed]:
         said.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
         return []
     said.append(
-        "The mode is held at the square pattern that the lattice of holes allows: without a "
+        "The mode is fixed at the square pattern that the lattice of holes allows: without a "
         "pattern, its parameters can't be seen."
     )
     return [(InitialMode(fixed_square(cells), 0.0), box)]
 
 
 def _assembled(
-    modes: Sequence[_Placed], cell_size: float, domain: Box, options: InitialGuessOptions
+    modes: Sequence[_Placed], cell_size: float, domain: Box, options: AnsatzOptions
 ) -> tuple[Ansatz, FloatArray]:
     """The ansatz, and unknowns in which every v_i is a constant."""
-    fourier = tuple(
-        FourierMode.scaled(mode.family, cell_size, Taper(box, 0.5 * cell_size))
-        for mode, box in modes
-    )
-    ansatz = Ansatz(domain, fourier, options.v0_degree, options.v_degree, options.brightness)
-    a = ansatz.start()
+    families = [(mode.family, box) for mode, box in modes]
+    ansatz = Ansatz.on(domain, families, cell_size, options)
+    a = ansatz.initial_guess()
     for i, (mode, _) in enumerate(modes):
-        a[ansatz.v_slice(i)][0] = mode.amplitude / fourier[i].scale or FIXED_AMPLITUDE
+        a[ansatz.v_slice(i)][0] = mode.amplitude / ansatz.modes[i].scale or FIXED_AMPLITUDE
     return ansatz, a
 
 
-def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, held: bool) -> RobustFit:
+def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, fixed: bool) -> RobustFit:
     """v0 and every v_i through the field; a mode that can't be seen isn't fitted."""
     x, y, u = local.valid_points()
     points = np.column_stack([x, y])
     slow = min(SLOW_DEGREE, ansatz.v0_degree)
-    if not held:
+    if not fixed:
         return fit_unknowns(ansatz, a, points, u, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
     alone = replace(ansatz, modes=(), brightness=Brightness())
     fit = fit_unknowns(alone, np.zeros(alone.size), points, u, slow, -1)
     return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
 
 
-def _fit_words(ansatz: Ansatz, fit: RobustFit, held: bool) -> str:
-    modes = () if held else ansatz.modes
+def _fit_words(ansatz: Ansatz, fit: RobustFit, fixed: bool) -> str:
+    modes = () if fixed else ansatz.modes
     what = " and ".join(["v0", *(f"v{i + 1}" for i in range(len(modes)))])
     return (
         f"{what} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
@@ -301,28 +281,28 @@ def _bounding_box(mask: NDArray[np.bool_] | None, grid: PixelGrid) -> Box:
 def chosen_modes(
     start: InitialGuess, geometry: Geometry, cell_size: float, how: PhotographOptions
 ) -> tuple[Ansatz, FloatArray, bool]:
-    """The start's ansatz and unknowns with the family and the holding that were asked for."""
-    ansatz, unknowns, held = start.ansatz, start.unknowns, start.held
+    """The start's ansatz and unknowns with the specified family, its modes fixed or not."""
+    ansatz, unknowns, fixed = start.ansatz, start.unknowns, start.fixed
     wants_square = how.family == "square" and geometry.lattice is not None
-    if (wants_square and "square" not in start.family) or (held and how.hold_mode is False):
+    if (wants_square and "square" not in start.family) or (fixed and how.fixed_mode is False):
         family = _square(geometry)
         ansatz, unknowns = _in_every_part(family, ansatz, unknowns, geometry, cell_size)
-        held = False
-    elif held and ansatz.modes and len(geometry.parts) > 1:
+        fixed = False
+    elif fixed and ansatz.modes and len(geometry.parts) > 1:
         family = ansatz.modes[0].family
         ansatz, unknowns = _in_every_part(family, ansatz, unknowns, geometry, cell_size)
-    if how.hold_mode is True and not held:
+    if how.fixed_mode is True and not fixed:
         ansatz, unknowns = with_fixed_modes(ansatz, unknowns)
-        held = True
-    return ansatz, unknowns, held
+        fixed = True
+    return ansatz, unknowns, fixed
 
 
 def with_fixed_modes(ansatz: Ansatz, unknowns: FloatArray) -> tuple[Ansatz, FloatArray]:
-    """The same ansatz with its modes held where the unknowns have them, and fewer unknowns."""
+    """The same ansatz with its modes fixed where the unknowns have them, and fewer unknowns."""
     modes = []
     for i, mode in enumerate(ansatz.modes):
         here = replace(mode.family, start=unknowns[ansatz.phi_slice(i)])
-        modes.append(replace(mode, family=here.held()))
+        modes.append(replace(mode, family=here.fixed()))
     first, last = ansatz.phi_offset(0), ansatz.phi_offset(len(ansatz.modes))
     return replace(ansatz, modes=tuple(modes)), np.concatenate([unknowns[:first], unknowns[last:]])
 
@@ -361,12 +341,9 @@ def _in_every_part(
     cell_size: float,
 ) -> tuple[Ansatz, FloatArray]:
     """One family in each part, with v0 as it was and every v_i where the paper starts it."""
-    modes = tuple(
-        FourierMode.scaled(family, cell_size, Taper(part.box, 0.5 * cell_size))
-        for part in geometry.parts
-    )
-    made = replace(ansatz, modes=modes)
-    a = made.start()
+    families = [(family, part.box) for part in geometry.parts]
+    made = replace(ansatz, modes=Ansatz.on(ansatz.domain, families, cell_size).modes)
+    a = made.initial_guess()
     slow = 2 * ansatz.v0_space.size
     a[:slow] = unknowns[:slow]
     return made, a

@@ -211,4 +211,4 @@ def fixed_square(cells: Cells) -> ModeFamily:
     """The square pattern that the holes allow, without parameters: for images that show none."""
     first, second = cells.cell_size * np.linalg.inv(cells.vectors).T
     start = np.array([1.0, *(first + second), *(second - first), 0.0, 0.0])
-    return replace(square_family(), start=start).moved(cells.junction).held()
+    return replace(square_family(), start=start).moved(cells.junction).fixed()

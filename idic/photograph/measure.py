@@ -23,7 +23,6 @@ from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry, confirmed_by_speckle, matched_holes
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
-    InitialGuessOptions,
     chosen_modes,
     initial_guess,
     shows_more,
@@ -89,7 +88,7 @@ def covariances(
 
     Returns
     -------
-    by_noise, by_leftover, warnings
+    by_noise, by_model_error, warnings
         (n, n) each; the second None where there are too few cells, which the warnings say.
     """
     result, blur, order = measured.result, measured.blur_px, measured.result.order
@@ -100,7 +99,7 @@ def covariances(
     soft = seen.softness(result)
     by_noise = hessian_corrected_covariance(result, noise, soft)
     try:
-        by_leftover = seen.leftover_covariance(result, cell, soft)
+        by_model_error = seen.model_error_covariance(result, cell, soft)
         if blur > 0.0:
             by_noise = noise_covariance(
                 result, seen.reference, seen.deformed, _noises(pair, blur, noise), seen.used,
@@ -108,7 +107,7 @@ def covariances(
             )  # fmt: skip
     except InputError as error:
         return by_noise, None, (f"No error bars for what the ansatz leaves over: {error}.",)
-    return by_noise, by_leftover, ()
+    return by_noise, by_model_error, ()
 
 
 _EDGE_PX = 3
@@ -146,7 +145,7 @@ def residual_test(
     """The residual of the photographs as they are against their noise, lit alike."""
     result = measured.result
     if measured.blur_px == 0.0:
-        return result.agreement(noise)
+        return result.residual_test(noise)
     back, seen = pulled_back(image, result, result.order)
     used = eroded(prepared.mask(), _EDGE_PX) & seen
     f, g = reference[used], back[used]
@@ -171,8 +170,8 @@ class MeasuredPhotograph:
         Of the correlation.
     local
         The displacement field that the start was read from, a local DIC's if there is one.
-    held
-        Whether the mode was held.
+    fixed
+        Whether the mode was fixed.
     blur_px
         Of the images that the correlation ended on [px]; 0 for the images as they are.
     sentences
@@ -181,7 +180,7 @@ class MeasuredPhotograph:
 
     result: Result
     local: LocalField
-    held: bool
+    fixed: bool
     blur_px: float
     sentences: tuple[str, ...]
 
@@ -227,26 +226,25 @@ def measure(
         holes = _moved_holes(before.result, geometry)
         said += " v0 starts from the photograph before. "
         said += confirmed_by_speckle(pair, partial(_moved_to, before.result))
-    options = InitialGuessOptions(how.v0_degree, how.v_degree, how.brightness())
     boxes = [part.box for part in geometry.parts]
     start = initial_guess(
         pair.reference, pair.deformed, geometry.grid, cell_size, boxes, pair.mask,
         pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
-        domain=geometry.region.domain, options=options,
+        domain=geometry.region.domain, options=how,
     )  # fmt: skip
-    ansatz, unknowns, held = chosen_modes(start, geometry, cell_size, how)
+    ansatz, unknowns, fixed = chosen_modes(start, geometry, cell_size, how)
     sentences = (said, *_guess_sentences(start, ansatz, geometry))
-    if before is not None and _goes_on(before, ansatz, unknowns, held):
+    if before is not None and _goes_on(before, ansatz, unknowns, fixed):
         found, finish = correlated(
             pair, geometry, *_with_brightness(before.result, how), how, progress
         )
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
             said_all = (*sentences, words, finish.sentence)
-            return MeasuredPhotograph(found, start.local, before.held, finish.blur_px, said_all)
+            return MeasuredPhotograph(found, start.local, before.fixed, finish.blur_px, said_all)
     found, finish = correlated(pair, geometry, ansatz, unknowns, how, progress)
     return MeasuredPhotograph(
-        found, start.local, held, finish.blur_px, (*sentences, finish.sentence)
+        found, start.local, fixed, finish.blur_px, (*sentences, finish.sentence)
     )
 
 
@@ -282,8 +280,8 @@ def correlated(
     images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
     rough = correlate(*images, grid, ansatz, unknowns, *masks, coarse, progress)
     binned = rough.grid.pixel_size / grid.pixel_size
-    leftover_px = binned * identifiability(rough, None).leftover_px
-    finish = final_smoothing(pair.reference, masks[0], leftover_px)
+    model_error_px = binned * identifiability(rough, None).model_error_px
+    finish = final_smoothing(pair.reference, masks[0], model_error_px)
     if finish.blur_px > 0.0:
         images = blurred_pair(*images, *masks, finish.blur_px)
         ansatz = replace(ansatz, brightness=Brightness())
@@ -295,17 +293,17 @@ def correlated(
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
     """Ansatz and unknowns of a result with the brightness that was asked for, to start from."""
-    ansatz = replace(result.ansatz, brightness=how.brightness())
+    ansatz = replace(result.ansatz, brightness=how.brightness)
     first = result.ansatz.phi_offset(len(result.ansatz.modes))
     start = np.zeros(ansatz.size)
     start[:first] = result.unknowns[:first]
     return ansatz, start
 
 
-def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, held: bool) -> bool:
+def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, fixed: bool) -> bool:
     """Whether the photograph before is a start: it was measured, and shows all that is seen now."""
     result = before.result
-    if result.outcome is not Outcome.CONVERGED or before.held != held:
+    if result.outcome is not Outcome.CONVERGED or before.fixed != fixed:
         return False
     return not shows_more(ansatz, unknowns, result.ansatz, result.unknowns)
 

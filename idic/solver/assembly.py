@@ -52,7 +52,7 @@ class NormalEquations:
         1/2 sum r^2 over the pixels used.
     pixels
         Number of pixels used; a displacement fit counts its two components as two.
-    left_image
+    outside_image
         Number of pixels whose deformed position is outside the image.
     """
 
@@ -60,7 +60,7 @@ class NormalEquations:
     gradient: FloatArray
     cost: float
     pixels: int
-    left_image: int
+    outside_image: int
 
     @property
     def mean_square(self) -> float:
@@ -73,7 +73,7 @@ class NormalEquations:
             self.gradient + other.gradient,
             self.cost + other.cost,
             self.pixels + other.pixels,
-            self.left_image + other.left_image,
+            self.outside_image + other.outside_image,
         )
 
 
@@ -259,7 +259,7 @@ def valid_pixels(
     a: FloatArray,
     reference: NDArray[Any],
     deformed: SplineImage,
-    allowed: BoolArray,
+    valid: BoolArray,
 ) -> tuple[BoolArray, int]:
     """Keep the pixels that the unknowns map onto material of the deformed image.
 
@@ -271,7 +271,7 @@ def valid_pixels(
         (size,) unknowns.
     reference, deformed
         f and g.
-    allowed
+    valid
         (rows, cols) where g may be sampled.
 
     Returns
@@ -283,7 +283,7 @@ def valid_pixels(
     """
     kept = assembly.mask.copy()
     nothing = np.zeros((0, 0, 0), dtype=np.float32)
-    outside = _run(assembly, a, reference, deformed, allowed, kept, nothing)
+    outside = _run(assembly, a, reference, deformed, valid, kept, nothing)
     return kept, outside
 
 
@@ -347,7 +347,7 @@ def _run(
     a: FloatArray,
     reference: NDArray[Any],
     deformed: SplineImage,
-    allowed: BoolArray,
+    valid: BoolArray,
     kept: BoolArray,
     left: NDArray[np.float32],
 ) -> int:
@@ -356,6 +356,6 @@ def _run(
     target = Target.images(reference, deformed, assembly.grid)
     degree = max(ansatz.v0_degree, ansatz.v_degree, *ansatz.brightness.degrees, 1)
     in_parallel(
-        warp_pass, target, assembly.runs, tables, degree, readable(allowed), kept, left, outside
+        warp_pass, target, assembly.runs, tables, degree, readable(valid), kept, left, outside
     )
     return int(outside.sum())

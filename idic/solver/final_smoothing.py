@@ -91,14 +91,14 @@ class FinalSmoothing:
     ----------
     width_px
         Full width at half maximum of the speckle's autocorrelation [px].
-    leftover_px
+    model_error_px
         What the ansatz leaves over, rms per component [px].
     blur_px
         Standard deviation of the blur [px]; 0 for none.
     """
 
     width_px: float
-    leftover_px: float
+    model_error_px: float
     blur_px: float
 
     @property
@@ -106,7 +106,7 @@ class FinalSmoothing:
         """That in words."""
         start = (
             f"The speckle's autocorrelation is {self.width_px:.1f} px wide, the ansatz leaves "
-            f"about {self.leftover_px:.2g} px over"
+            f"about {self.model_error_px:.2g} px over"
         )
         if self.blur_px == 0.0:
             return f"{start}: the correlation ends on the images as they are."
@@ -116,21 +116,21 @@ class FinalSmoothing:
         )
 
 
-def final_smoothing(image: NDArray[Any], mask: BoolArray, leftover_px: float) -> FinalSmoothing:
+def final_smoothing(image: NDArray[Any], mask: BoolArray, model_error_px: float) -> FinalSmoothing:
     """Decide how to finish.
 
     Parameters
     ----------
     image, mask
         (rows, cols) the reference and its material.
-    leftover_px
+    model_error_px
         Rms per component of w, as a coarser level tells it [px].
     """
     width = speckle_size(image, mask)
-    wanted = (WIDTHS * leftover_px) ** 2 - width**2
+    wanted = (WIDTHS * model_error_px) ** 2 - width**2
     # Widths of Gaussians add up in squares; a blur of s widens an autocorrelation by sqrt(2) s.
     blur = float(np.sqrt(max(0.0, wanted / 2.0)) / _FWHM)
-    return FinalSmoothing(width, leftover_px, blur if blur >= _LEAST_BLUR else 0.0)
+    return FinalSmoothing(width, model_error_px, blur if blur >= _LEAST_BLUR else 0.0)
 
 
 def blurred_pair(

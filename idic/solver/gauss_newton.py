@@ -34,8 +34,8 @@ class Outcome(Enum):
     MAX_ITERATIONS = "max_iterations"
     STAGNATED = "stagnated"
     SINGULAR = "singular"
-    LEFT_IMAGE = "left_image"
-    TRAPPED = "trapped"
+    OUTSIDE_IMAGE = "outside_image"
+    LOCAL_MINIMUM = "local_minimum"
     UNWEIGHTED = "unweighted"
 
     @property
@@ -57,11 +57,11 @@ _EXPLANATIONS = {
         "The images hold no information about the unknowns: no pixel was used, or the deformed "
         "image has no gradient there."
     ),
-    Outcome.LEFT_IMAGE: (
+    Outcome.OUTSIDE_IMAGE: (
         "Too many pixels are mapped outside the deformed image; check the sign of the start, "
         "the pixel size and the origin of the grid."
     ),
-    Outcome.TRAPPED: (
+    Outcome.LOCAL_MINIMUM: (
         "The iteration ended where parts of the images don't match at all: a local minimum; "
         "start closer, with other mode parameters, or with coarser speckle: fine speckle beside "
         "a large displacement that the ansatz can't describe traps it, from any start."
@@ -93,7 +93,7 @@ class GaussNewtonOptions:
         10.1080/00401706.1981.10486254.
     max_iterations
         On each level.
-    max_left
+    max_outside
         Fraction of the pixels that may be mapped outside the deformed image [-].
     """
 
@@ -101,7 +101,7 @@ class GaussNewtonOptions:
     coarse_tolerance_px: float = 1e-2
     tolerance_errors: float = 0.01
     max_iterations: int = 50
-    max_left: float = 0.2
+    max_outside: float = 0.2
 
     def __post_init__(self) -> None:
         if not (self.tolerance_px > 0 and self.coarse_tolerance_px > 0):
@@ -109,10 +109,10 @@ class GaussNewtonOptions:
                 "expected tolerances above 0 px, got "
                 f"{self.tolerance_px} and {self.coarse_tolerance_px} px"
             )
-        if self.max_iterations < 1 or not 0 <= self.max_left <= 1:
+        if self.max_iterations < 1 or not 0 <= self.max_outside <= 1:
             raise InputError(
-                "expected at least 1 iteration and max_left in [0, 1], got "
-                f"{self.max_iterations} and {self.max_left}"
+                "expected at least 1 iteration and max_outside in [0, 1], got "
+                f"{self.max_iterations} and {self.max_outside}"
             )
 
 
@@ -219,7 +219,7 @@ def minimise(
     at = _SearchPoint.of(start, evaluate(start, curvature is None), curvature)
     limits = _Limits(options, tolerance_px, _SHORT * factor, least)
     history: list[Iteration] = []
-    outcome = Outcome.LEFT_IMAGE if _left(at.equations) > options.max_left else None
+    outcome = Outcome.OUTSIDE_IMAGE if _left(at.equations) > options.max_outside else None
     while outcome is None:
         if not np.any(at.curvature):
             outcome = Outcome.SINGULAR
@@ -290,7 +290,7 @@ def _descend(
         is_assembled = not is_settling or length <= limits.tolerance_px
         found = evaluate(a, is_assembled)
         descends = found.mean_square <= at.equations.mean_square
-        accepted = descends and _left(found) <= limits.options.max_left
+        accepted = descends and _left(found) <= limits.options.max_outside
         if accepted or length <= limits.tolerance_px or damping >= _LARGEST_DAMPING:
             break
         damping = max(_FIRST_DAMPING, 10.0 * damping)
@@ -338,4 +338,4 @@ def standard_errors(step: FloatArray, curvature: FloatArray, at: NormalEquations
 
 def _left(equations: NormalEquations) -> float:
     """Fraction of the pixels that are mapped outside the image."""
-    return equations.left_image / max(1, equations.left_image + equations.pixels)
+    return equations.outside_image / max(1, equations.outside_image + equations.pixels)

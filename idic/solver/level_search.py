@@ -102,7 +102,7 @@ class LevelSearch:
             found = self._minimise(assembly, start, self.tolerance_px, curvature)
             history += found.history
             used, start, curvature = assembly, found.unknowns, found.curvature
-            if self.pair.allowed is None:
+            if self.pair.valid is None:
                 break
             assembly = self._landed(start)
             if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
@@ -137,11 +137,9 @@ class LevelSearch:
     def _landed(self, a: FloatArray) -> Assembly:
         """All pixels, less those that these unknowns map onto no material, or off the image."""
         pair = self.pair
-        if pair.allowed is None:
+        if pair.valid is None:
             return self._everything
-        kept, outside = valid_pixels(
-            self._everything, a, pair.reference, pair.deformed, pair.allowed
-        )
+        kept, outside = valid_pixels(self._everything, a, pair.reference, pair.deformed, pair.valid)
         return replace(self._everything, mask=kept, outside=outside)
 
     @property
@@ -188,8 +186,8 @@ class LevelSearch:
         """
         rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
         kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
-        most = min(1.0, self.options.max_left / kept) if kept > 0 else self.options.max_left
-        return replace(self.options, max_left=most)
+        most = min(1.0, self.options.max_outside / kept) if kept > 0 else self.options.max_outside
+        return replace(self.options, max_outside=most)
 
     def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
         return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)

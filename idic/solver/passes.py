@@ -48,6 +48,7 @@ from modeharvest.util.compiled import compiled
 
 @compiled(relaxed=True)
 def push_forward_rows(u: Any, slopes: Any, pixel_size: float, first: int, every: int) -> None:
+    """Multiply slopes (2, rows, cols) by F^-T, F by central differences of u, on some rows."""
     rows, cols = u.shape[1:]
     for i in range(first, rows, every):
         up, down = max(0, i - 1), min(rows - 1, i + 1)
@@ -68,10 +69,10 @@ def push_forward_rows(u: Any, slopes: Any, pixel_size: float, first: int, every:
 
 @compiled(relaxed=True)
 def warp_pass(
-    target: Any, runs: Any, tables: Any, degree: int, allowed: Any, kept: Any, left: Any,
+    target: Any, runs: Any, tables: Any, degree: int, valid: Any, kept: Any, left: Any,
     outside: Any, first: int, every: int,
 ) -> None:  # fmt: skip
-    """Fill ``kept`` from ``allowed``, or else ``left``: one pass, so that it is compiled once.
+    """Fill ``kept`` from ``valid``, or else ``left``: one pass, so that it is compiled once.
 
     ``left`` takes the residual alone, the displacement of whole rows, or slopes and residual.
     """
@@ -86,7 +87,7 @@ def warp_pass(
                 displace_block(row, n, tables, block)
                 if kept.size:
                     map_block(row, n, per_px, own)
-                    outside[band] += _mark_valid(n, own, allowed, kept[row])
+                    outside[band] += _mark_valid(n, own, valid, kept[row])
                 elif left.shape[0] == 2:
                     for k in range(2):
                         _place(n, own, own[U_X + k], left[k, row])
@@ -110,13 +111,13 @@ def _place(n: int, own: Any, values: Any, to: Any) -> None:
 
 
 @compiled(relaxed=True)
-def _mark_valid(n: int, own: Any, allowed: Any, kept: Any) -> int:
-    last_row, last_col, outside = allowed.shape[0] - 1, allowed.shape[1] - 1, 0
+def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
+    last_row, last_col, outside = valid.shape[0] - 1, valid.shape[1] - 1, 0
     for m in range(n):
         row, col = own[AT_ROW, m], own[AT_COL, m]
         inside = 0 <= row <= last_row and 0 <= col <= last_col
         outside += not inside
-        kept[int(own[COLUMN, m])] = inside and allowed[int(np.rint(row)), int(np.rint(col))]
+        kept[int(own[COLUMN, m])] = inside and valid[int(np.rint(row)), int(np.rint(col))]
     return outside
 
 

@@ -172,7 +172,7 @@ class LevelPair:
         g, ready to be sampled.
     mask
         (rows, cols): pixels of f that count.
-    allowed
+    valid
         (rows, cols) where g may be sampled; None for everywhere.
     """
 
@@ -180,7 +180,7 @@ class LevelPair:
     reference: Image
     deformed: SplineImage
     mask: BoolArray
-    allowed: BoolArray | None
+    valid: BoolArray | None
 
 
 def level_pair(
@@ -226,22 +226,22 @@ def level_pair(
     inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
     if is_finest:
         inside = eroded(inside, edge_px)
-        allowed = _allowed(deformed_mask, grid.shape, edge_px, order)
+        valid = _valid(deformed_mask, grid.shape, edge_px, order)
     else:
         inside = binned(reference, inside, level.factor)[1] >= 0.5
-        allowed = None
-    return LevelPair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, allowed)
+        valid = None
+    return LevelPair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, valid)
 
 
-def _allowed(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: int) -> BoolArray:
+def _valid(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: int) -> BoolArray:
     """Where g may be sampled: away from its border, and from the edges of its mask if known."""
     border = min(border_reach(order, _FELT), int(_MOST * min(shape)))
-    allowed = np.zeros(shape, dtype=np.bool_)
+    valid = np.zeros(shape, dtype=np.bool_)
     inner = (slice(border, shape[0] - border), slice(border, shape[1] - border))
     # The reference's eroded edge lands near edge_px from the edge of g, give or take the
     # local strain; one pixel less leaves those pixels in.
-    allowed[inner] = True if mask is None else eroded(mask, max(0, edge_px - 1))[inner]
-    return allowed
+    valid[inner] = True if mask is None else eroded(mask, max(0, edge_px - 1))[inner]
+    return valid
 
 
 def eroded(mask: BoolArray, distance_px: int) -> BoolArray:

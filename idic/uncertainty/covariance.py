@@ -72,7 +72,7 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
         ansatz: a coarse grid will do.
     covariance
         (n, n) of the unknowns: ``result.covariance(noise_sd)`` for the images' noise, or
-        :func:`leftover_covariance` for what the ansatz leaves over. Unknowns of infinite
+        :func:`model_error_covariance` for what the ansatz leaves over. Unknowns of infinite
         variance, about which the images say nothing, make the fields they touch infinite.
     """
     ansatz, a = result.ansatz, result.unknowns
@@ -160,7 +160,7 @@ def noise_covariance(
     Parameters
     ----------
     result, reference, deformed, mask, block, order, soft
-        As for :func:`leftover_covariance`.
+        As for :func:`model_error_covariance`.
     noises
         Examples of the noise in f and in g, (rows, cols) each, filtered as they were.
     """
@@ -196,7 +196,7 @@ def hessian_corrected_covariance(
         (n, n) of :func:`softness`.
     """
     found = result.covariance(noise)
-    if result.agreement().is_white:
+    if result.residual_test().is_white:
         return found
     kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
     M = (1.0 - result.noise_in_slope(ImageNoise.of(noise))) * np.linalg.inv(result.inverse[kept])
@@ -219,7 +219,7 @@ def inverse_hessian(
     Parameters
     ----------
     result, reference, deformed, mask, order
-        As for :func:`leftover_covariance`.
+        As for :func:`model_error_covariance`.
     """
     every = int(np.clip(mask.sum() // _ENOUGH_PX, 1, 4))
     some = np.zeros_like(mask)
@@ -348,10 +348,10 @@ class MatchedImages:
         grid, order = result.grid, result.order
         pair = level_pair(*images, grid, *masks, FULL, edge_px, order)
         used = pair.mask
-        if pair.allowed is not None:
+        if pair.valid is not None:
             every = Assembly(result.ansatz, grid, pair.mask)
             used, _ = valid_pixels(
-                every, result.unknowns, pair.reference, pair.deformed, pair.allowed
+                every, result.unknowns, pair.reference, pair.deformed, pair.valid
             )
         row, col = np.indices(grid.shape, dtype=np.float64)
         deformed = pair.deformed.sample(row, col)[0].astype(np.float32)
@@ -361,7 +361,7 @@ class MatchedImages:
         """(n, n) H⁻¹, see :func:`~modeharvest.idic.uncertainty.covariance.inverse_hessian`."""
         return inverse_hessian(result, self.reference, self.deformed, self.used, self.order)
 
-    def leftover_covariance(
+    def model_error_covariance(
         self, result: Result, block: float, soft: FloatArray | None = None
     ) -> FloatArray:
         """(n, n) by what the ansatz leaves over.

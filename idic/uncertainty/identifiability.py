@@ -16,9 +16,9 @@ _POINTS = 4000  # at which displacements are compared
 _LISTED = 3  # combinations, and terms of each
 FINE = 5.0
 """Where w is 2 px rms, IDIC is 0.25 px from the best fit with speckles of 12 px, 0.47 px with 0.7
-times that, and trapped with half of it (docs/studies.md, size of the speckle)."""
+times that, at a local minimum with half of it (docs/studies.md, size of the speckle)."""
 OBSERVABLE = 2.0
-"""A mode counts as observed if v_i phi_i is that many times what the ansatz leaves over."""
+"""A mode counts as observable if v_i phi_i is that many times the model error."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Identifiability:
     overlap
         For each mode the largest cosine between a displacement that its v_i and phi_i can make
         and one that v0 can make [-]: 1 would mean that they can't be told apart.
-    leftover_px
-        What the ansatz leaves over, rms per component: residual over grey-level gradient [px].
+    model_error_px
+        Estimate, rms per component: residual over grey-level gradient [px].
     amplitude_px
         For each mode the rms of v_i phi_i per component [px].
     speckle_px
@@ -68,39 +68,39 @@ class Identifiability:
     undetermined: tuple[str, ...]
     worst: tuple[Combination, ...]
     overlap: tuple[float, ...]
-    leftover_px: float
+    model_error_px: float
     amplitude_px: tuple[float, ...]
     speckle_px: float = np.inf
 
     @property
     def unobservable(self) -> tuple[int, ...]:
         """Numbers (from 0) of the modes that are too weak for phi_i to mean anything."""
-        least = OBSERVABLE * self.leftover_px
+        least = OBSERVABLE * self.model_error_px
         return tuple(i for i, size in enumerate(self.amplitude_px) if size < least)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know, one sentence each."""
-        said = [
+        found = [
             f"phi{i + 1} is not observable: v{i + 1} phi{i + 1} is {self.amplitude_px[i]:.2g} px "
-            f"rms, what the ansatz leaves over about {self.leftover_px:.2g} px (before buckling "
-            "there is no pattern to measure); hold the mode fixed, or don't interpret it"
+            f"rms, the model error about {self.model_error_px:.2g} px (before buckling "
+            "there is no pattern to measure); fix the mode, or don't interpret it"
             for i in self.unobservable
         ]
-        if self.speckle_px < FINE * self.leftover_px:
-            said.append(
-                f"the speckle is {self.speckle_px:.2g} px wide, the ansatz leaves about "
-                f"{self.leftover_px:.2g} px over: speckles finer than {FINE:g} times that pull the "
-                "measurement away from the best fit, and finer than twice may trap it; spray "
-                "coarser, take pictures of fewer pixels, or blur them"
+        if self.speckle_px < FINE * self.model_error_px:
+            found.append(
+                f"the speckle is {self.speckle_px:.2g} px wide, the model error about "
+                f"{self.model_error_px:.2g} px: speckles finer than {FINE:g} times that pull the "
+                "measurement away from the best fit, finer than twice possibly to a local minimum; "
+                "spray coarser, take pictures of fewer pixels, or blur them"
             )
         if self.undetermined:
             names = ", ".join(self.undetermined[:_LISTED])
             more = ", ..." if len(self.undetermined) > _LISTED else ""
-            said.append(
+            found.append(
                 f"the images say nothing about {len(self.undetermined)} unknowns: {names}{more}"
             )
-        return tuple(said)
+        return tuple(found)
 
 
 def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiability:
@@ -109,7 +109,7 @@ def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiab
     Parameters
     ----------
     result
-        Of a correlation, or of a fit to a displacement (then ``leftover_px`` is its residual).
+        Of a correlation, or of a fit to a displacement (then ``model_error_px`` is its residual).
     mask
         (rows, cols) True on material; everywhere by default.
 
@@ -132,7 +132,7 @@ def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiab
         result.undetermined,
         _worst(result),
         tuple(overlaps),
-        _leftover_px(result),
+        _model_error_px(result),
         amplitudes,
         result.weighting.width_px,
     )
@@ -184,7 +184,7 @@ def _worst(result: Result) -> tuple[Combination, ...]:
     return tuple(found)
 
 
-def _leftover_px(result: Result) -> float:
+def _model_error_px(result: Result) -> float:
     """Residual over the rms gradient."""
     gradient = np.sqrt(2.0 * result.slope_square)
     return float(result.residual_rms / gradient) if gradient else np.inf

@@ -103,11 +103,11 @@ _SPARED_PX = 3
 """The deformed image's spline correlates its noise over fewer pixels than that by more than 2 %."""
 LAGS_PX = (4, 6, 8, 10, 12)
 """What :func:`lags_for` gives for the paper's speckle, 12 px wide."""
-BLOCK_PX, MATCH = 32, 0.3
-"""Blocks of about three speckles, and the correlation below which they don't match."""
-LOCAL_MINIMUM = 0.1
-"""Share of unmatched blocks above which an iteration is called trapped. When looked at it was
-0.01 at the minimum of the paper's case, and 0.18 at a local minimum 5 px off."""
+BLOCK_PX, CORRELATED = 32, 0.3
+"""Blocks of about three speckles, and the correlation below which they are decorrelated."""
+MOST_DECORRELATED = 0.1
+"""Fraction of decorrelated blocks above which a minimum is called local: 0.01 at the minimum of the
+paper's case, 0.18 at a local minimum 5 px off."""
 _WHITE = 0.02
 """Rms autocorrelation up to which a residual counts as noise, besides its own scatter."""
 _SIGMAS, _MODEL = 4.0, 0.03
@@ -244,8 +244,8 @@ def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> fl
     """Share of the image whose two grey levels have little to do with each other [-].
 
     Over blocks of ``BLOCK_PX``: those in which the reference and the deformed image brought
-    back to it have a zero-normalised cross-correlation below ``MATCH``. Where an iteration is
-    trapped a speckle or more off, it is about 0.
+    back to it have a zero-normalised cross-correlation below ``CORRELATED``. At a local minimum a
+    speckle or more off, it is about 0.
 
     Parameters
     ----------
@@ -266,4 +266,4 @@ def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> fl
     if not judged.any():
         return 0.0
     product = np.sqrt(np.maximum(var_f * var_g, 0.0))[judged]
-    return float(np.mean(cov[judged] < MATCH * product))
+    return float(np.mean(cov[judged] < CORRELATED * product))

@@ -83,14 +83,14 @@ class ResolutionSpec:
 
     def ansatz(self, degree: int, motion: str) -> Ansatz:
         """The paper's at a degree; without a pattern its mode is held."""
-        return self.buckled.ansatz(degree, degree, hold_mode=motion == "still")
+        return self.buckled.ansatz(degree, degree, fixed_mode=motion == "still")
 
     def start(self, degree: int, motion: str) -> FloatArray:
         """The base motion, or none."""
         ansatz = self.ansatz(degree, motion)
         if motion == "still":
             return np.zeros(ansatz.size)
-        return ansatz.start(self.buckled.strain, self.buckled.pattern)
+        return ansatz.initial_guess(self.buckled.strain, self.buckled.pattern)
 
     def correlate(self, pair: AnalyticPair, degree: int, motion: str) -> Result:
         """Measure a pair from what is nearly its motion, on the full images."""
@@ -233,14 +233,14 @@ class BuckledMotion:
         """The smallest ansatz that describes the base, and its unknowns."""
         return self.ansatz(1, 0), self.start(1, 0)
 
-    def ansatz(self, v0_degree: int, v_degree: int, hold_mode: bool = False) -> Ansatz:
+    def ansatz(self, v0_degree: int, v_degree: int, fixed_mode: bool = False) -> Ansatz:
         """The paper's ansatz of these degrees; its mode held if nothing tells its parameters."""
-        how = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, hold_mode=hold_mode)
+        how = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, fixed_mode=fixed_mode)
         return how.ansatz(self.specimen)
 
     def start(self, v0_degree: int, v_degree: int) -> FloatArray:
         """The base in the unknowns of an ansatz of these degrees."""
-        return self.ansatz(v0_degree, v_degree).start(self.strain, self.pattern)
+        return self.ansatz(v0_degree, v_degree).initial_guess(self.strain, self.pattern)
 
     def material(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Whether there is material at points of the undeformed specimen [mm] that broadcast."""

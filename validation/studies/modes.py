@@ -119,7 +119,7 @@ def deviations(seen: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
 
 def standardised_errors(seen: pd.DataFrame) -> NDArray[np.float64]:
     """(specimens, 7) measured less best fit, in standard deviations by what is left over."""
-    sd = seen[[f"{name}_sd_leftover" for name in PARAMETERS]].to_numpy(np.float64)
+    sd = seen[[f"{name}_sd_model_error" for name in PARAMETERS]].to_numpy(np.float64)
     return np.asarray((deviations(seen) - deviations(seen, "best_")).to_numpy() / sd)
 
 
@@ -214,7 +214,7 @@ def _measured_row(scene: VirtualImagePair, lattice: LatticeMode, own: Path) -> d
     -------
     dict
         ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form
-        nearest to the ideal one, phases in shares of l; ``a1_sd_leftover`` and ``a1_sd_noise``
+        nearest to the ideal one, phases in shares of l; ``a1_sd_model_error`` and ``a1_sd_noise``
         ...: standard deviations by what the ansatz leaves over, and by noise of :data:`NOISE`.
         ``w_px``, ``best_px``, ``lost_px``: rms per component of truth - IDIC, truth - best fit
         and IDIC - best fit. ``overlap_lattice``: of the mode, of constant amplitude, with the
@@ -228,7 +228,7 @@ def _measured_row(scene: VirtualImagePair, lattice: LatticeMode, own: Path) -> d
     found.best.write(own / "best.json")
     pitch = scene.specimen.pitch
     sd = {
-        "leftover": _model_error_sd(scene, result),
+        "model_error": _model_error_sd(scene, result),
         "noise": _sd(result, result.covariance(NOISE), pitch),
     }
     row: dict[str, Any] = {"outcome": result.outcome.value, "iterations": len(result.history)}
@@ -287,7 +287,7 @@ def _model_error_sd(scene: VirtualImagePair, result: Result) -> FloatArray:
     """The same by what the ansatz leaves over, cell by cell."""
     pitch, how = scene.specimen.pitch, scene.how.options()
     seen = MatchedImages.of(result, scene.pair(), scene.masks(), how.edge_px)
-    return _sd(result, seen.leftover_covariance(result, pitch), pitch)
+    return _sd(result, seen.model_error_covariance(result, pitch), pitch)
 
 
 def _units(pitch: float) -> FloatArray:

@@ -298,7 +298,7 @@ class ResolutionStudy:
     def require(self, correlation: SquareLatticeOptions) -> None:
         """The mode is measured, in exact images, and brightness is none of the question."""
         require_mode(correlation)
-        if correlation.camera or correlation.brightness().size:
+        if correlation.camera or correlation.brightness.size:
             raise InputError(
                 "study: expected correlation.camera = false and neither gain nor offset, got "
                 "others: waves are measured in exact images"

@@ -256,7 +256,9 @@ def one_start(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def _perturbed_start(scene: VirtualImagePair, case: Mapping[str, Any]) -> FloatArray:
     """The start of a case; the same directions for every radius."""
     ansatz = scene.ansatz
-    start = scene.how.start(ansatz, scene.strain * (1.0 + case["strain_error"]))
+    start = ansatz.initial_guess(
+        scene.strain * (1.0 + case["strain_error"]), scene.how.start_amplitude
+    )
     rng = np.random.default_rng([case["seed"], case["start"]])
     unit = rng.uniform(-1.0, 1.0, 7)
     scale = np.array([1.0] * 5 + [scene.specimen.pitch] * 2)

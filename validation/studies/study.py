@@ -181,7 +181,7 @@ class VirtualImagePair:
 
     def start(self) -> FloatArray:
         """The standard start."""
-        return self.how.start(self.ansatz, self.strain)
+        return self.ansatz.initial_guess(self.strain, self.how.start_amplitude)
 
     def pair(self) -> Images:
         """(rows, cols) f and g, as the identification wants them: exact, or a camera's."""
@@ -275,9 +275,9 @@ class Study(Protocol):
 
 def require_mode(correlation: SquareLatticeOptions) -> None:
     """Raise InputError where the mode is held: nothing of it would be measured."""
-    if correlation.hold_mode:
+    if correlation.fixed_mode:
         raise InputError(
-            "study: expected correlation.hold_mode = false, got true: nothing of the mode would "
+            "study: expected correlation.fixed_mode = false, got true: nothing of the mode would "
             "be found"
         )
 

@@ -46,7 +46,7 @@ _NUMBERS = (
     ("… largest", "–", "gain_max"),
     ("offset between the images, smallest, as a fraction of full scale", "–", "offset_min"),
     ("… largest", "–", "offset_max"),
-    ("w, estimated from the images alone, rms", "px", "leftover_estimate_px"),
+    ("w, estimated from the images alone, rms", "px", "model_error_estimate_px"),
     ("overlap of the mode's part with v₀", "–", "mode_polynomial_overlap"),
     ("outcome", "", "outcome"),
 )

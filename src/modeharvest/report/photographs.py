@@ -102,8 +102,8 @@ def _mode_keys(frame: Frame) -> list[dict[str, str]]:
     wave = mode["waves"][0]
     xi = ", ".join(f"{value:.3f}".replace("-", "−") for value in wave["xi"])
     errors = [f"± {_micro(mode['v_max_sd_noise_mm'])} µm by noise"]
-    if mode["v_max_sd_leftover_mm"] is not None:
-        errors.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
+    if mode["v_max_sd_model_error_mm"] is not None:
+        errors.append(f"± {_micro(mode['v_max_sd_model_error_mm'])} by what is left over")
     count = len(mode["waves"])
     sd = "held fixed" if mode["held"] else f"± {_digits(max(_wave_sd(wave)), 1)}"
     return [
@@ -114,7 +114,7 @@ def _mode_keys(frame: Frame) -> list[dict[str, str]]:
 
 
 def _wave_sd(wave: Mapping[str, Any]) -> list[float]:
-    known = [*(wave["sd_noise"] or []), *(wave["sd_leftover"] or [])]
+    known = [*(wave["sd_noise"] or []), *(wave["sd_model_error"] or [])]
     return [value for value in known if value is not None] or [float("nan")]
 
 
@@ -124,12 +124,12 @@ def _model_error_key(frame: Frame) -> dict[str, str]:
         remark = f"rms of local DIC − IDIC beyond the local DIC’s {local['sd_px']:.2g} px"
         return _key("left over, w", _digits(local["w_beyond_noise_px"], 2), "px", remark)
     remark = "rms, estimated from the residual"
-    return _key("left over, w", _digits(frame["leftover_px"], 2), "px", remark)
+    return _key("left over, w", _digits(frame["model_error_px"], 2), "px", remark)
 
 
 def panel_numbers(key: str, frame: Frame) -> str:
     """One line of numbers under a picture; empty if there is nothing to add."""
-    local, left = frame["local"], frame["errors_px"]["leftover"]
+    local, left = frame["local"], frame["errors_px"]["model_error"]
     if key == "image":
         return f"{frame['name']}; compression {percent(frame['strain_x'])} along x, " + (
             f"{percent(frame['strain_y'])} along y"
@@ -161,8 +161,8 @@ def _residual(frame: Frame) -> str:
 
 def _amplitude(mode: Mapping[str, Any], n: str) -> str:
     sd = [f"{_micro(mode['v_max_sd_noise_mm'])} by noise"]
-    if mode["v_max_sd_leftover_mm"] is not None:
-        sd.append(f"± {_micro(mode['v_max_sd_leftover_mm'])} by what is left over")
+    if mode["v_max_sd_model_error_mm"] is not None:
+        sd.append(f"± {_micro(mode['v_max_sd_model_error_mm'])} by what is left over")
     subscript = n.translate(_SUBSCRIPTS)
     said = f"largest among the holes {_micro(mode['v_max_mm'], 4)} ± {' '.join(sd)} µm"
     return said if mode["observable"] else f"{said}; too weak for φ{subscript} to mean anything"
@@ -189,8 +189,8 @@ def frame_rows(summary: Summary) -> list[dict[str, Any]]:
                 _digits(max((m["amplitude_px"] for m in modes), default=None), 3),
                 _digits(max((m["largest_px"] for m in modes), default=None), 3),
                 *(_digits((errors[cause] or {}).get("fluctuation"), 2)
-                  for cause in ("noise", "leftover")),
-                _digits(frame["leftover_px"], 2),
+                  for cause in ("noise", "model_error")),
+                _digits(frame["model_error_px"], 2),
                 _digits(None if local is None else local["w_rms_px"], 2),
                 _digits(frame["residual_rms"], 3), _digits(frame["chi_square"], 3),
                 f"{frame['iterations']} of {frame['iterations_all_levels']}",
@@ -225,7 +225,7 @@ def wave_rows(frames: Sequence[Frame]) -> list[dict[str, Any]]:
     for frame in frames:
         for i, mode in enumerate(frame["modes"], start=1):
             for w, wave in enumerate(mode["waves"], start=1):
-                noise, left = wave["sd_noise"] or [None] * 2, wave["sd_leftover"] or [None] * 2
+                noise, left = wave["sd_noise"] or [None] * 2, wave["sd_model_error"] or [None] * 2
                 rows.append({
                     "frame": frame, "mode": i, "wave": w, "first": i == w == 1,
                     "held": mode["held"], "observable": mode["observable"],
@@ -249,7 +249,7 @@ def notes(summary: Summary) -> list[str]:
             ended = f"the correlation ended as “{frame['outcome']}”: {frame['outcome_why']}"
             said.append(f"{at} {ended}")
         said += [f"{at} {_sentence(warning)}" for warning in frame["warnings"]]
-        said += [f"{at} {frame['agreement']}", f"{at} {_sentence(frame['weighting'])}"]
+        said += [f"{at} {frame['residual_test']}", f"{at} {_sentence(frame['weighting'])}"]
     noise = summary["noise"]
     share = "" if noise["of_full_scale"] is None else (
         f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip

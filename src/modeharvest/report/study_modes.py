@@ -82,7 +82,9 @@ def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
 def parameters_summary(seen: pd.DataFrame) -> pd.DataFrame:
     """A row for each specimen: a₁, and how far its wave vectors and phases are from Eq. (mode)."""
     off, best = 100.0 * deviations(seen), 100.0 * deviations(seen, "best_")
-    sd = 100.0 * seen[[f"{name}_sd_leftover" for name in PARAMETERS]].set_axis(PARAMETERS, axis=1)
+    sd = 100.0 * seen[[f"{name}_sd_model_error" for name in PARAMETERS]].set_axis(
+        PARAMETERS, axis=1
+    )
     phases = list(PARAMETERS[5:])
     return pd.DataFrame({
         "varied": seen["varied"], "level": seen["level"], "a₁": seen["a1"],
@@ -102,7 +104,7 @@ def parameters_table(seen: pd.DataFrame) -> pd.DataFrame:
     rows = [
         {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
          "Eq. (mode)": ideal, "measured": row[name],
-         "± 2 sd by what is left over": 2.0 * row[f"{name}_sd_leftover"],
+         "± 2 sd by what is left over": 2.0 * row[f"{name}_sd_model_error"],
          "± 2 sd by 1 % of noise": 2.0 * row[f"{name}_sd_noise"],
          "best fit": row[f"best_{name}"],
          "infinite lattice": row["lattice_a1"] if name == "a1" else ideal}
@@ -162,7 +164,7 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
 def _limit(axes: Axes, done: pd.DataFrame, names: Iterable[str]) -> None:
     """Show all values, and error bars as far as they don't hide all else [%]."""
     off = [done[prefix + name] - _IDEAL[name] for name in names for prefix in ("", "best_")]
-    bars = 2.0 * done[[f"{name}_sd_leftover" for name in names]]
+    bars = 2.0 * done[[f"{name}_sd_model_error" for name in names]]
     end = 100.0 * max(1.2 * float(np.abs(off).max()), 2.5 * float(bars.median().max()))
     axes.set_ylim(-end, end)
 
@@ -170,7 +172,7 @@ def _limit(axes: Axes, done: pd.DataFrame, names: Iterable[str]) -> None:
 def _parameter(axes: Axes, done: pd.DataFrame, at: FloatArray, name: str, colour: str) -> None:
     """Draw one parameter's deviation from the ideal one [%]: dots measured, rings best fit."""
     measured, best = (100.0 * (done[key] - _IDEAL[name]) for key in (name, f"best_{name}"))
-    error = 200.0 * done[f"{name}_sd_leftover"]
+    error = 200.0 * done[f"{name}_sd_model_error"]
     label = "measured" if name == "a1" else f"a{'₀₁₂₃₄₅₆₇'[int(name[1])]}"
     axes.errorbar(at, measured, error, color=colour, marker="o", markersize=3, linestyle="none",
                   capsize=1.5, elinewidth=0.8, label=label)  # fmt: skip

@@ -296,7 +296,7 @@ def _rows(frames: Sequence[dict[str, Any]]) -> dict[str, Cell]:
         rows[f"largest v{n} phi{n} [px]"] = partial(_largest, i=i)
         rows[f"largest v{n} [mm]"] = partial(_amplitude, i=i)
         rows[f"wave vectors of phi{n} [1/l]"] = partial(_waves, i=i)
-    rows["left over (w), rms [px]"] = lambda frame: f"{frame['leftover_px']:.3g}"
+    rows["left over (w), rms [px]"] = lambda frame: f"{frame['model_error_px']:.3g}"
     rows["iterations, all levels"] = lambda frame: str(frame["iterations_all_levels"])
     rows["outcome"] = lambda frame: str(frame["outcome"])
     return rows
@@ -329,7 +329,7 @@ def _amplitude(frame: dict[str, Any], i: int) -> str:
     mode = _mode(frame, i)
     if not mode:
         return "–"
-    parts = [mode["v_max_mm"], mode["v_max_sd_noise_mm"], mode["v_max_sd_leftover_mm"]]
+    parts = [mode["v_max_mm"], mode["v_max_sd_noise_mm"], mode["v_max_sd_model_error_mm"]]
     value, noise, leftover = ("–" if p is None else f"{p:.3g}" for p in parts)
     return f"{value} ± {noise} / {leftover}"
 

@@ -369,7 +369,7 @@ class Run:
             images.deformed(strain, camera=how.camera),
             images.grid,
             ansatz,
-            how.start(ansatz, strain),
+            ansatz.initial_guess(strain, how.start_amplitude),
             images.mask(),
             images.deformed_mask(strain),
             how.options(),

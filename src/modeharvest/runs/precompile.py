@@ -47,7 +47,7 @@ def _correlation() -> None:
     case, rng = read_case(_CASE), np.random.default_rng(0)
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
     ansatz = case.correlation.ansatz(case.experiment.specimen)
-    start = case.correlation.start(ansatz, strain)
+    start = ansatz.initial_guess(strain, case.correlation.start_amplitude)
     f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
     options = replace(
         case.correlation.options(),

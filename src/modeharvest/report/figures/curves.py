@@ -263,7 +263,9 @@ def draw_onset(moments: Sequence[Moment], buckling: Buckling | None) -> Figure:
         When the pattern appeared.
     """
     strain = 100 * np.array([m.strain for m in moments])
-    size, left, noise = np.array([(m.amplitude_px, m.leftover_px, m.noise_px) for m in moments]).T
+    size, left, noise = np.array(
+        [(m.amplitude_px, m.model_error_px, m.noise_px) for m in moments]
+    ).T
     has = np.array([m.has_pattern for m in moments])
     with style():
         drawn, axes = curve("nominal strain [%]", "pattern v₁φ₁, rms [px]")
@@ -330,7 +332,7 @@ def _components(frames: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float,
                     label = f"{name} of wave {w}" + (f", φ{i}" if len(frame["modes"]) > 1 else "")
                     found.setdefault(label, []).append((
                         100 * frame["strain"], abs(wave["xi"][c]),
-                        max(_known_or_zero(wave[sd], c) for sd in ("sd_noise", "sd_leftover")),
+                        max(_known_or_zero(wave[sd], c) for sd in ("sd_noise", "sd_model_error")),
                         float(not mode["held"] and mode["observable"]),
                     ))  # fmt: skip
     return found

@@ -295,7 +295,7 @@ def _has_mode(i: int) -> Shows:
 
 
 def _has_model_error(i: int | None) -> Shows:
-    return lambda atlas, frame: frame.by_leftover is not None and (i is None or i in frame.modes)
+    return lambda atlas, frame: frame.by_model_error is not None and (i is None or i in frame.modes)
 
 
 _IMAGES = (
@@ -431,7 +431,7 @@ def _errors(field: str, symbol: str, title: str, more: str, i: int | None = None
             "sure", f"{field}-leftover", f"sd({symbol})", f"{title}, by what is left over", "",
             "One standard deviation by what the ansatz can’t describe, which pushes its unknowns "
             "about from cell to cell; noise included.",
-            partial(maps.draw_error, field=field, cause="leftover"), _has_model_error(i),
+            partial(maps.draw_error, field=field, cause="model_error"), _has_model_error(i),
         ),
     ]  # fmt: skip
 

@@ -112,7 +112,7 @@ class PhotographReportData:
 
 
 UM = 1e3  # micrometres in a millimetre
-Cause = Literal["noise", "leftover"]
+Cause = Literal["noise", "model_error"]
 _NO_PATTERN = WavePattern((), None, "none", None, 0.0, ())
 _REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
 
@@ -224,7 +224,7 @@ def draw_error(
     That of a vector is the root of the sum of both components' variances.
     """
     sheet = atlas.sheet(COARSE)
-    errors = frame.by_noise if cause == "noise" else frame.by_leftover
+    errors = frame.by_noise if cause == "noise" else frame.by_model_error
     assert errors is not None
     sd = UM * _resampled(frame, _sd(errors, field), sheet)
     if field != "v0":

@@ -207,7 +207,11 @@ class HarvestRun:
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            told = {"held": measured.held, "blur_px": measured.blur_px, "said": measured.sentences}
+            told = {
+                "fixed": measured.fixed,
+                "blur_px": measured.blur_px,
+                "said": measured.sentences,
+            }
             write_json(start, {"failed": "", **told})
             return result, field, start
 
@@ -237,7 +241,7 @@ class HarvestRun:
         return MeasuredPhotograph(
             Result.read(result),
             read_field(field),
-            bool(told["held"]),
+            bool(told["fixed"]),
             float(told["blur_px"]),
             tuple(told["said"]),
         )

@@ -73,14 +73,14 @@ class HarvestedFrame:
         (rows, cols) the photograph, free from distortion [grey levels]; may be memory-mapped.
     mask
         (rows, cols) True on its material; None if not known.
-    result, identifiability, agreement
+    result, identifiability, residual_test
         Of its correlation.
     error_x, error_y
         (p,) and (q,) axes [mm] of the error bars.
-    by_noise, by_leftover
+    by_noise, by_model_error
         Error bars on these axes, arrays (q, p, ...), by the images' noise and by what the ansatz
         leaves over; the latter None if they can't be had.
-    noise_covariance, leftover_covariance
+    noise_covariance, model_error_covariance
         (n, n) of the unknowns by the images' noise and by what the ansatz leaves over: those
         that the error bars are made of.
     spectrum, pattern
@@ -100,13 +100,13 @@ class HarvestedFrame:
     mask: BoolArray | None
     result: Result
     identifiability: Identifiability
-    agreement: ResidualTest
+    residual_test: ResidualTest
     error_x: FloatArray
     error_y: FloatArray
     by_noise: FieldErrors
     noise_covariance: FloatArray
-    by_leftover: FieldErrors | None = None
-    leftover_covariance: FloatArray | None = None
+    by_model_error: FieldErrors | None = None
+    model_error_covariance: FloatArray | None = None
     spectrum: Spectrum | None = None
     pattern: WavePattern | None = None
     parts: tuple[PartSpectrum, ...] = ()
@@ -116,7 +116,7 @@ class HarvestedFrame:
 
     def __post_init__(self) -> None:
         expected = (len(self.error_y), len(self.error_x), 2)
-        for errors in (self.by_noise, self.by_leftover):
+        for errors in (self.by_noise, self.by_model_error):
             if errors is not None and errors.v0.shape != expected:
                 raise InputError(
                     f"harvest {self.name}: expected error bars of shape {expected} like their "
@@ -369,7 +369,7 @@ def _frame(
     cell = experiment.specimen.cell_size
     x, y = _axes(geometry.region.domain)
     noise = noise_of(prepared, name)
-    by_noise, by_leftover, warnings = covariances(
+    by_noise, by_model_error, warnings = covariances(
         measured, prepared_pair(prepared, name), noise, cell
     )
     seen = identifiability(result, prepared.mask())
@@ -384,13 +384,15 @@ def _frame(
         mask=prepared.mask(name),
         result=result,
         identifiability=seen,
-        agreement=residual_test(measured, prepared.image(), image, prepared, noise),
+        residual_test=residual_test(measured, prepared.image(), image, prepared, noise),
         error_x=x,
         error_y=y,
         by_noise=field_errors(result, x, y, by_noise),
-        by_leftover=None if by_leftover is None else field_errors(result, x, y, by_leftover),
+        by_model_error=None
+        if by_model_error is None
+        else field_errors(result, x, y, by_model_error),
         noise_covariance=by_noise,
-        leftover_covariance=by_leftover,
+        model_error_covariance=by_model_error,
         spectrum=spectrum,
         pattern=pattern,
         parts=_parts(measured, geometry, cell),
@@ -421,7 +423,7 @@ def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
         name=frame.name,
         strain=frame.strain_x,
         amplitude_px=float(np.linalg.norm(seen.amplitude_px)),
-        leftover_px=seen.leftover_px,
+        model_error_px=seen.model_error_px,
         noise_px=_inside(frame.by_noise, frame.error_x, frame.error_y, cellular) / px,
     )
 

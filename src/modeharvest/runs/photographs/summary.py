@@ -15,7 +15,7 @@ images are in px, positions and fields in mm. rms is per component.
     line) [-, compression positive], ``has_pattern``, ``outcome``, ``outcome_why``,
     ``iterations`` (on the full image), ``iterations_all_levels``, ``pixels``,
     ``residual_rms`` [grey levels], ``residual_of_full_scale``, ``residual_correlation``,
-    ``chi_square``, ``agreement`` and ``weighting`` (sentences), ``leftover_px`` (of what the
+    ``chi_square``, ``residual_test`` and ``weighting`` (sentences), ``model_error_px`` (of what the
     ansatz can't describe, estimated from the images), ``condition_number``, ``undetermined``,
     ``errors_px`` (``noise`` and ``leftover``: rms standard deviation of ``v0``, ``fluctuation``
     and ``displacement`` over the part with holes), ``local`` (``source``, ``points``, ``lost``,
@@ -24,12 +24,12 @@ images are in px, positions and fields in mm. rms is per component.
 ``frames[].modes``
     One for each mode: ``family``, ``held``, ``observable``, ``amplitude_px`` (rms of v phi),
     ``largest_px`` (its largest length), ``v_max_mm`` with ``v_max_sd_noise_mm`` and
-    ``v_max_sd_leftover_mm`` (largest |v| over the part with holes), ``overlap`` (with v0, the
+    ``v_max_sd_model_error_mm`` (largest |v| over the part with holes), ``overlap`` (with v0, the
     largest cosine), ``parameters`` (``name``, ``unit``, ``value``, ``sd_noise``,
-    ``sd_leftover``), ``waves`` (``xi``, the wave vector [1/l], with ``sd_noise`` and
-    ``sd_leftover``; null where the mode was held).
+    ``sd_model_error``), ``waves`` (``xi``, the wave vector [1/l], with ``sd_noise`` and
+    ``sd_model_error``; null where the mode was held).
 ``timeline``
-    For each frame ``name``, ``strain``, ``amplitude_px``, ``leftover_px``, ``noise_px``,
+    For each frame ``name``, ``strain``, ``amplitude_px``, ``model_error_px``, ``noise_px``,
     ``has_pattern``.
 ``buckling``
     ``before``, ``after``, ``estimate`` [-], ``sentence``.
@@ -71,7 +71,9 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
     result, seen = frame.result, frame.identifiability
     family, part = result.ansatz.modes[i].family, result.ansatz.phi_slice(i)
     noise = frame.noise_covariance[part, part]
-    left = None if frame.leftover_covariance is None else frame.leftover_covariance[part, part]
+    left = (
+        None if frame.model_error_covariance is None else frame.model_error_covariance[part, part]
+    )
     sd_noise, sd_left = _sd(np.eye(family.size), noise), _sd(np.eye(family.size), left)
     return {
         "family": family.name,
@@ -82,7 +84,7 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
         "overlap": seen.overlap[i],
         "parameters": [
             {"name": name, "unit": unit, "value": value, "sd_noise": _item(sd_noise, k),
-             "sd_leftover": _item(sd_left, k)}
+             "sd_model_error": _item(sd_left, k)}
             for k, (name, unit, value) in enumerate(
                 zip(family.names, family.units, result.mode_parameters(i), strict=True))
         ],
@@ -104,7 +106,7 @@ def _wave_vectors(
         found.append({
             "xi": to_xi * wave[2:4],
             "sd_noise": None if held else _sd(rows, noise),
-            "sd_leftover": None if held else _sd(rows, left),
+            "sd_model_error": None if held else _sd(rows, left),
         })  # fmt: skip
     return found
 
@@ -124,12 +126,12 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
         int(np.abs(frame.error_y - y[row]).argmin()),
         int(np.abs(frame.error_x - x[col]).argmin()),
     )
-    by_leftover = frame.by_leftover
+    by_model_error = frame.by_model_error
     return {
         "largest_px": float(length.max(initial=0.0, where=inside)) / grid.pixel_size,
         "v_max_mm": v[row, col],
         "v_max_sd_noise_mm": frame.by_noise.v[i][at],
-        "v_max_sd_leftover_mm": None if by_leftover is None else by_leftover.v[i][at],
+        "v_max_sd_model_error_mm": None if by_model_error is None else by_model_error.v[i][at],
     }
 
 
@@ -165,7 +167,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         },
         "frames": [_frame(harvest, frame) for frame in harvest.frames],
         "timeline": [
-            {k: getattr(m, k) for k in ("name", "strain", "amplitude_px", "leftover_px",
+            {k: getattr(m, k) for k in ("name", "strain", "amplitude_px", "model_error_px",
                                         "noise_px", "has_pattern")}
             for m in harvest.timeline
         ],
@@ -199,16 +201,16 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "pixels": result.pixels,
         "residual_rms": result.residual_rms,
         "residual_of_full_scale": _share(result.residual_rms, harvest.full_scale),
-        "residual_correlation": frame.agreement.correlation,
-        "chi_square": frame.agreement.chi_square,
-        "agreement": frame.agreement.sentence,
+        "residual_correlation": frame.residual_test.correlation,
+        "chi_square": frame.residual_test.chi_square,
+        "residual_test": frame.residual_test.sentence,
         "weighting": result.weighting.sentence,
-        "leftover_px": seen.leftover_px,
+        "model_error_px": seen.model_error_px,
         "condition_number": seen.condition_number,
         "undetermined": seen.undetermined,
         "errors_px": {
             "noise": _rms_errors(harvest, frame, frame.by_noise),
-            "leftover": _rms_errors(harvest, frame, frame.by_leftover),
+            "model_error": _rms_errors(harvest, frame, frame.by_model_error),
         },
         "local": _local(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
