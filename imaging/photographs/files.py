@@ -3,6 +3,9 @@
 TIFF is read by tifffile, which keeps 16-bit colour; its compressions that tifffile leaves to
 another package (LZW, JPEG, ...) are read by Pillow where that loses nothing. PNG and JPEG are
 read by Pillow. Files are checked on the way in, and whole or absent on the way out.
+
+Colour becomes grey by luma, 0.2125 R + 0.7154 G + 0.0721 B (ITU-R BT.709, the weights of
+scikit-image).
 """
 
 from __future__ import annotations
@@ -15,8 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import skimage.color
-import skimage.io
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
@@ -34,7 +35,9 @@ def require_contrast(grey: NDArray[Any], what: str) -> None:
         )
 
 
-TIFF = {".tif", ".tiff"}
+LUMA = (0.2125, 0.7154, 0.0721)
+"""Weights of red, green and blue in a grey level."""
+_TIFF = {".tif", ".tiff"}
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it would print beside our line
 _ORIENTATION = 274
 """The tag of TIFF and of Exif."""
@@ -47,7 +50,7 @@ class StoredImage:
     Parameters
     ----------
     levels
-        (rows, cols) or (rows, cols, channels) uint8, uint16, float32 or float64.
+        (rows, cols), or (rows, cols, 3) colour.
     notes
         Sentences about pages left out and turns made.
     """
@@ -55,43 +58,79 @@ class StoredImage:
     levels: NDArray[Any]
     notes: tuple[str, ...]
 
+    @property
+    def grey(self) -> NDArray[Any]:
+        """(rows, cols) floating-point levels; integers as fractions of full scale."""
+        whole = self.levels.dtype.kind == "u"
+        return luma(self.levels / (float(np.iinfo(self.levels.dtype).max) if whole else 1.0))
 
-def read_stored(path: Path) -> StoredImage:
-    """Read a TIFF, PNG or JPEG.
+
+def luma(levels: NDArray[Any]) -> NDArray[Any]:
+    """(rows, cols) grey levels of floating-point grey or colour ones."""
+    if levels.ndim == 2:
+        return levels
+    return np.asarray(levels @ np.asarray(LUMA, dtype=levels.dtype))
+
+
+def read_stored(path: Path, *, single: bool = False) -> StoredImage:
+    """Read a TIFF, PNG or JPEG; an alpha channel is dropped.
+
+    Of a file with several pages the first is taken, unless it has to be the ``single`` one.
 
     Raises
     ------
     InputError
         One line: the file is missing, empty, damaged, or its numbers can't be read unchanged.
     """
-    remedy = "if it is a damaged file, copy it or take it again"
-    with reading(path, "a photograph (TIFF, PNG or JPEG)", remedy), warnings.catch_warnings():
+    remedy = "if it is a damaged file, or cut short, copy it or make it again"
+    with reading(path, "a TIFF, PNG or JPEG image", remedy), warnings.catch_warnings():
         warnings.simplefilter("error")  # how Pillow tells of files cut short
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its size is looked at
-        is_tiff = path.suffix.lower() in TIFF
-        return _checked(_read_tiff(path) if is_tiff else _read_other(path), path)
+        is_tiff = path.suffix.lower() in _TIFF
+        stored = _read_tiff(path, single) if is_tiff else _read_other(path, single)
+        levels = stored.levels
+        if not (levels.ndim == 2 or (levels.ndim == 3 and levels.shape[2] <= 4)) or not levels.size:
+            raise _not_plane(levels.shape, path)
+        if levels.ndim == 3:
+            levels = levels[..., 0] if levels.shape[2] < 3 else levels[..., :3]
+        return StoredImage(levels, stored.notes)
 
 
-def _checked(stored: StoredImage, path: Path) -> StoredImage:
-    levels = stored.levels
-    plane = levels.ndim == 2 or (levels.ndim == 3 and levels.shape[2] in (1, 2, 3, 4))
-    if not plane or levels.size == 0:
-        raise InputError(
-            f"expected one picture of rows x columns at {path}, got an array of shape "
-            f"{levels.shape}; split it into single files"
-        )
+def _not_plane(shape: tuple[int, ...], path: Path) -> InputError:
+    return InputError(
+        f"expected one plane image (rows x cols) at {path}, got an array of shape {shape}; "
+        "split stacks into single files"
+    )
+
+
+def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
+    """Raise InputError for numbers of a type that has no full scale, or is no camera's."""
     if levels.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise InputError(
             f"expected 8-bit, 16-bit or float grey levels at {path}, got {levels.dtype}; convert "
             "it to one of them"
         )
-    return stored
 
 
-def _read_tiff(path: Path) -> StoredImage:
+def require_visible(image: NDArray[Any], path: Path | str) -> None:
+    """Raise InputError for an image (rows, cols) with NaN or infinity, or of one level."""
+    if not np.isfinite(image).all():
+        count = int((~np.isfinite(image)).sum())
+        raise InputError(
+            f"expected finite grey levels at {path}, got {count} NaN or infinite px; "
+            "replace them and exclude them by a mask"
+        )
+    if image.min() == image.max():
+        raise InputError(
+            f"expected an image with contrast at {path}, got {image.flat[0]:g} in every pixel"
+        )
+
+
+def _read_tiff(path: Path, single: bool) -> StoredImage:
     with tifffile.TiffFile(path) as file:
-        page, count = file.pages.first, len(file.pages)
-        notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
+        page, notes = file.pages.first, _page_notes(len(file.pages))
+        if single and len(file.series[0].pages) > 1:
+            raise _not_plane(file.series[0].shape, path)
         require_plausible(path, page.nbytes)
         try:
             levels = np.asarray(page.asarray())
@@ -109,8 +148,12 @@ def _read_tiff(path: Path) -> StoredImage:
         if levels.dtype == np.bool_:
             levels = np.where(levels, np.uint8(255), np.uint8(0))
         tag = page.tags.get(_ORIENTATION)
-        turned, said = _upright(levels, int(tag.value) if tag is not None else 1)
-        return StoredImage(turned, (*notes, *said))
+        turned, more = _upright(levels, int(tag.value) if tag is not None else 1)
+        return StoredImage(turned, (*notes, *more))
+
+
+def _page_notes(count: int) -> list[str]:
+    return [f"Of its {count} pages the first was taken."] if count > 1 else []
 
 
 def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> StoredImage:
@@ -126,7 +169,7 @@ def _by_pillow(path: Path, page: tifffile.TiffPage, notes: list[str]) -> StoredI
         return _from_pillow(picture, notes)
 
 
-def _read_other(path: Path) -> StoredImage:
+def _read_other(path: Path, single: bool) -> StoredImage:
     with Image.open(path) as picture:
         require_plausible(path, float(picture.width) * picture.height)
         if picture.format == "PNG" and _png_is_deep_colour(path):
@@ -135,8 +178,9 @@ def _read_other(path: Path) -> StoredImage:
                 "colour, which can't be read unchanged; save it as TIFF or as grey PNG"
             )
         count = int(getattr(picture, "n_frames", 1))
-        notes = [f"Of its {count} pages the first was taken."] if count > 1 else []
-        return _from_pillow(picture, notes)
+        if single and count > 1:
+            raise _not_plane((count, picture.height, picture.width), path)
+        return _from_pillow(picture, _page_notes(count))
 
 
 def _from_pillow(picture: Image.Image, notes: list[str]) -> StoredImage:
@@ -186,15 +230,11 @@ def _upright(levels: NDArray[Any], orientation: int) -> tuple[NDArray[Any], tupl
     return np.ascontiguousarray(levels), (_turn_note(orientation),)
 
 
-_TIFF = {".tif", ".tiff"}
-
-
 def read_image(path: Path | str) -> NDArray[np.float32]:
     """Read a grey image.
 
     Whole-number images are scaled to fractions of their type's full scale (uint8: /255,
-    uint16: /65535); floating-point images are taken as they are; colour becomes grey by luma
-    (0.2125 R + 0.7154 G + 0.0721 B), an alpha channel is dropped.
+    uint16: /65535); floating-point images are taken as they are.
 
     Returns
     -------
@@ -203,27 +243,13 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
     Raises
     ------
     InputError
-        If the file is missing, cut short, not one plane image, holds NaN or infinity, or all
-        its pixels are equal.
+        If the file is missing, cut short, not one plane image of 8 or 16 bits or floats, holds
+        NaN or infinity, or all its pixels are equal.
     """
-    raw = _read(Path(path))
-    if raw.dtype == np.bool_ or raw.dtype.kind not in "uf":
-        raise InputError(
-            f"expected an image of unsigned integers or floats at {path}, got {raw.dtype}; "
-            "convert it to 8-bit, 16-bit or float TIFF"
-        )
-    grey = _grey(raw, path)
-    image = np.asarray(grey, dtype=np.float32)
-    if not np.isfinite(image).all():
-        count = int((~np.isfinite(image)).sum())
-        raise InputError(
-            f"expected finite grey values at {path}, got {count} NaN or infinite px; "
-            "replace them and exclude them by a mask"
-        )
-    if image.min() == image.max():
-        raise InputError(
-            f"expected an image with contrast at {path}, got {image.flat[0]:g} in every pixel"
-        )
+    stored = read_stored(Path(path), single=True)
+    require_grey_levels(stored.levels, path)
+    image = np.asarray(stored.grey, dtype=np.float32)
+    require_visible(image, path)
     return image
 
 
@@ -235,10 +261,8 @@ def read_mask(path: Path | str) -> BoolArray:
     InputError
         If the file is missing, cut short, not one plane image, or zero everywhere.
     """
-    raw = _read(Path(path))
-    if raw.ndim == 3:
-        raw = raw[..., :3].max(axis=2) if raw.shape[2] > 2 else raw[..., 0]
-    mask = _require_plane(raw, path) != 0
+    levels = read_stored(Path(path), single=True).levels
+    mask = (levels if levels.ndim == 2 else levels.max(axis=2)) != 0
     if not mask.any():
         raise InputError(
             f"expected a mask with material (values above 0) at {path}, got black everywhere"
@@ -288,38 +312,6 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
     with atomic(path) as temporary:
         # Not its buffer: memory that is lent to a failed write can't be freed.
         temporary.write_bytes(memory.getvalue())
-
-
-def _read(path: Path) -> NDArray[Any]:
-    remedy = "the file may be cut short, make or copy it again"
-    with reading(path, "a whole TIFF, PNG or JPEG image", remedy):
-        if path.suffix.lower() in _TIFF:
-            with tifffile.TiffFile(path) as file:
-                require_plausible(path, file.series[0].nbytes)
-                return np.asarray(file.asarray())
-        with Image.open(path) as picture:
-            require_plausible(path, float(picture.width) * picture.height)
-        return np.asarray(skimage.io.imread(path))
-
-
-def _grey(raw: NDArray[Any], path: Path | str) -> NDArray[Any]:
-    scale = float(np.iinfo(raw.dtype).max) if raw.dtype.kind == "u" else 1.0
-    if raw.ndim == 3 and raw.shape[2] in (3, 4):
-        return np.asarray(skimage.color.rgb2gray(raw[..., :3] / scale))
-    if raw.ndim == 3 and raw.shape[2] == 2:
-        raw = raw[..., 0]
-    return np.asarray(_require_plane(raw, path) / scale)
-
-
-def _require_plane(raw: NDArray[Any], path: Path | str) -> NDArray[Any]:
-    if raw.ndim == 3 and raw.shape[2] == 1:
-        raw = raw[..., 0]
-    if raw.ndim != 2 or raw.size == 0:
-        raise InputError(
-            f"expected one plane image (rows x cols) at {path}, got an array of shape {raw.shape}; "
-            "split stacks into single files"
-        )
-    return raw
 
 
 def _size(image: NDArray[Any]) -> str:

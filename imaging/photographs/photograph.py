@@ -1,10 +1,7 @@
-"""Photographs as a camera leaves them: read, turned to grey, and checked one by one.
+"""Photographs as a camera leaves them: read, turned to grey, checked alone and as a series.
 
 Grey levels stay counts. Whole-number TIFF (8 and 16 bit, 10 to 14 bits stored in 16 included),
-float TIFF, PNG and JPEG are read; what was changed on the way is said in ``Photograph.notes``.
-Colour becomes grey by luma, 0.2125 R + 0.7154 G + 0.0721 B (ITU-R BT.709, the weights of
-scikit-image). What is wrong with a series as a whole is found by
-:mod:`modeharvest.imaging.photographs.series`.
+float TIFF, PNG and JPEG are read; what was changed on the way is in ``Photograph.notes``.
 """
 
 from __future__ import annotations
@@ -18,22 +15,29 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from modeharvest.imaging.photographs.files import StoredImage, read_stored
+from modeharvest.imaging.photographs.files import (
+    LUMA,
+    luma,
+    read_stored,
+    require_grey_levels,
+    require_same_shape,
+    require_visible,
+)
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 
-LUMA = (0.2125, 0.7154, 0.0721)
-"""Weights of red, green and blue in a grey level."""
 MOSTLY = 0.5
 """Share of saturated or of black material above which a photograph is refused."""
 MANY = 0.01
-"""Share of saturated or of black material above which that is said."""
+"""Share of saturated or of black material above which that is noted."""
 _BITS = (8, 10, 12, 14, 16)
 _NOISE_ONLY = 0.1
 """Correlation of neighbouring pixels below which there is no speckle: speckles of 3 px have
 about 0.6, and n px of white noise have 1/sqrt(n)."""
 _SHADE_PX = 31
 """Lighting that is uneven over more than this is no pattern."""
+_OTHER_SCALE = 4.0
+"""Ratio of two frames' bright levels from which on they can't be of one bit depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +92,7 @@ class Photograph:
         return float(self.image.std(dtype=np.float64) / self.full_scale)
 
     def rescaled(self, bits: int) -> Photograph:
-        """The same grey levels, said to fill ``bits`` bits (a darker frame of a series)."""
+        """The same grey levels on the scale of ``bits`` bits (a darker frame of a series)."""
         if bits == self.bits:
             return self
         return replace(self, bits=bits, full_scale=float(2**bits - 1))
@@ -97,8 +101,8 @@ class Photograph:
 def read_photograph(path: Path | str) -> Photograph:
     """Read a photograph.
 
-    Of a file with several pages the first is taken, the orientation tag is obeyed, an alpha
-    channel is dropped, and all of it is said in ``notes``.
+    Of a file with several pages the first is taken, and the orientation tag is obeyed; ``notes``
+    tell of it.
 
     Raises
     ------
@@ -107,18 +111,10 @@ def read_photograph(path: Path | str) -> Photograph:
         levels, holds NaN or infinity, or every pixel has the same level.
     """
     stored = read_stored(Path(path))
-    levels = _without_alpha(stored)
-    if levels.dtype.kind == "f" and not np.isfinite(levels).all():
-        count = int((~np.isfinite(levels)).sum())
-        raise InputError(
-            f"expected finite grey levels in {path}, got {count} NaN or infinite ones; replace "
-            "them and exclude them by a mask"
-        )
-    if levels.min() == levels.max():
-        raise InputError(
-            f"expected a photograph with contrast in {path}, got the level {levels.flat[0]:g} in "
-            "100 % of its pixels; take it again"
-        )
+    require_grey_levels(stored.levels, path)
+    levels = _without_equal_channels(stored.levels)
+    image = np.ascontiguousarray(luma(levels.astype(np.float32)))
+    require_visible(image, path)
     was_colour = levels.ndim == 3
     bits, full_scale = _scale(levels)
     saturated, black = _cut_off(levels, full_scale)
@@ -129,7 +125,7 @@ def read_photograph(path: Path | str) -> Photograph:
         notes.append(f"Its 16-bit numbers fill {bits} bits.")
     return Photograph(
         path=Path(path),
-        image=_grey(levels),
+        image=image,
         bits=bits,
         stored_bits=8 * levels.dtype.itemsize,
         full_scale=full_scale,
@@ -141,12 +137,12 @@ def read_photograph(path: Path | str) -> Photograph:
 
 
 def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tuple[str, ...]:
-    """Judge whether a photograph shows a pattern at all.
+    """Check whether a photograph shows a pattern at all.
 
     Parameters
     ----------
     photograph
-        To be judged.
+        To be checked.
     mask
         (rows, cols) True on material, if that is known; a background may be as white or black
         as it likes.
@@ -161,20 +157,20 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
         If more than half of the material (without a mask: more than 95 % of the image) is
         saturated or black, or if there is nothing but noise.
     """
-    said = []
+    notes = []
     for name, where, remedy in (
         ("saturated", photograph.saturated, "a shorter exposure"),
         ("black", photograph.black, "a longer exposure, or the right mask"),
     ):
         share = float((where if mask is None else where[mask]).mean())
-        seen = "image" if mask is None else "material"
+        area = "image" if mask is None else "material"
         if share > (MOSTLY if mask is not None else 0.95):
             raise InputError(
                 f"expected grey levels between black and white in {photograph.path}, got "
-                f"{100 * share:.1f} % of the {seen} {name}; take it again with {remedy}"
+                f"{100 * share:.1f} % of the {area} {name}; take it again with {remedy}"
             )
         if share > MANY:
-            said.append(f"{photograph.path.name}: {100 * share:.1f} % of the {seen} is {name}.")
+            notes.append(f"{photograph.path.name}: {100 * share:.1f} % of the {area} is {name}.")
     alike = neighbour_correlation(photograph.image, mask)
     if alike < _NOISE_ONLY:
         raise InputError(
@@ -182,7 +178,46 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
             f"pixels have nothing in common (correlation {alike:.2f}), contrast "
             f"{100 * photograph.contrast:.2g} % of full scale; take it again"
         )
-    return tuple(said)
+    return tuple(notes)
+
+
+def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
+    """The frame, its grey levels on the reference's scale.
+
+    Raises
+    ------
+    InputError
+        If its size or its bit depth is another one.
+    """
+    require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
+    other = _other_depth(reference, frame)
+    if other:
+        raise InputError(
+            f"expected photographs of one bit depth, got {_depth(reference)} in {reference.path} "
+            f"and {_depth(frame)} in {frame.path}{other}; export them alike"
+        )
+    if 0 in (reference.bits, frame.bits):
+        return frame
+    return frame.rescaled(max(reference.bits, frame.bits))
+
+
+def read_reference(path: Path | str, mask: BoolArray | None = None) -> Photograph:
+    """Read the reference and refuse it if it shows no pattern; see ``require_usable``."""
+    reference = read_photograph(path)
+    return _with_notes(reference, require_usable(reference, mask))
+
+
+def read_frame(path: Path | str, reference: Photograph) -> Photograph:
+    """Read one frame and compare it with the reference.
+
+    Raises
+    ------
+    InputError
+        One line that names the file, if it is damaged, blank, or of another size or bit depth.
+        A sequence catches it, skips the frame, reports the line and goes on.
+    """
+    frame = require_alike(reference, read_photograph(path))
+    return _with_notes(frame, require_usable(frame))
 
 
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:
@@ -203,40 +238,34 @@ def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> f
     return float(pairs / power)
 
 
-def pixel_size(first: tuple[float, float], second: tuple[float, float], length_mm: float) -> float:
-    """Size of a pixel [mm/px] from a scale in the image: two points and their distance.
-
-    Parameters
-    ----------
-    first, second
-        (row, col) [px].
-    length_mm
-        Their distance [mm].
-
-    Raises
-    ------
-    InputError
-        If the length isn't positive or the points are less than 1 px apart.
-    """
-    distance = float(np.hypot(second[0] - first[0], second[1] - first[1]))
-    if not (length_mm > 0 and np.isfinite(length_mm)) or not distance >= 1.0:
-        raise InputError(
-            "expected a scale of more than 0 mm between two points at least 1 px apart, got "
-            f"{length_mm} mm between {tuple(first)} and {tuple(second)} (row, col)"
-        )
-    return length_mm / distance
+def _with_notes(photograph: Photograph, notes: tuple[str, ...]) -> Photograph:
+    return replace(photograph, notes=(*photograph.notes, *notes)) if notes else photograph
 
 
-def _without_alpha(stored: StoredImage) -> NDArray[Any]:
-    """(rows, cols) grey or (rows, cols, 3) colour."""
-    levels = stored.levels
-    if levels.ndim == 3 and levels.shape[2] in (1, 2):
+def _other_depth(reference: Photograph, frame: Photograph) -> str:
+    """Why the two have different depths; empty if they don't."""
+    if frame.stored_bits != reference.stored_bits or (frame.bits == 0) != (reference.bits == 0):
+        return " (as stored)"
+    if frame.bits == reference.bits:
+        return ""
+    # A dark frame fills fewer bits than its camera has: that alone says nothing.
+    bright = [float(np.percentile(p.image[::4, ::4], 99)) for p in (reference, frame)]
+    ratio = max(bright) / max(min(bright), 1e-30)
+    return f" (bright levels differ by a factor of {ratio:.3g})" if ratio >= _OTHER_SCALE else ""
+
+
+def _depth(photograph: Photograph) -> str:
+    if photograph.bits == 0:
+        return f"{photograph.stored_bits}-bit floats"
+    if photograph.bits == photograph.stored_bits:
+        return f"{photograph.bits} bits"
+    return f"{photograph.bits} bits in {photograph.stored_bits}"
+
+
+def _without_equal_channels(levels: NDArray[Any]) -> NDArray[Any]:
+    """Grey that was stored as colour as (rows, cols)."""
+    if levels.ndim == 3 and (levels == levels[..., :1]).all():
         return np.asarray(levels[..., 0])
-    if levels.ndim == 3:
-        colour = levels[..., :3]
-        if all(np.array_equal(colour[..., 0], colour[..., k]) for k in (1, 2)):
-            return np.asarray(colour[..., 0])  # grey that was stored as colour
-        return np.asarray(colour)
     return levels
 
 
@@ -271,9 +300,3 @@ def _piles_up(levels: NDArray[Any], top: float) -> bool:
     step = int(np.gcd.reduce(np.unique(levels).astype(np.int64)))  # 16 for 12 bits shifted up
     below = int((levels >= top - 8 * step).sum()) - (at_top := int((levels == top).sum()))
     return bool(at_top >= 100 and at_top > below)
-
-
-def _grey(levels: NDArray[Any]) -> FloatImage:
-    if levels.ndim == 2:
-        return np.ascontiguousarray(levels, dtype=np.float32)
-    return np.asarray(levels.astype(np.float32) @ np.asarray(LUMA, dtype=np.float32))

@@ -33,8 +33,12 @@ from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
 from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
-from modeharvest.imaging.photographs.photograph import Photograph, read_photograph
-from modeharvest.imaging.photographs.series import read_frame, read_reference
+from modeharvest.imaging.photographs.photograph import (
+    Photograph,
+    read_frame,
+    read_photograph,
+    read_reference,
+)
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.util.arrays import BoolArray
 from modeharvest.util.errors import InputError
