@@ -76,7 +76,7 @@ class Experiment:
         Loaded edges "clamped" or "sliding".
     branches
         What to keep above the critical strain, out of "primary" (unstable there), "buckled+"
-        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern``).
+        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
     imperfection
         Scatter of the holes; with any, there is no bifurcation to find and the one natural
         path is followed.
@@ -88,7 +88,8 @@ class Experiment:
         not quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
     guided
         Hold u_y at the solid junctions on the line of mid-height, as pins in a straight rail
-        would; ``holes_y`` has to be even. Keeps a long specimen from bowing sideways.
+        would; ``holes_y`` has to be even, rows not staggered. Keeps a long specimen from bowing
+        sideways.
     """
 
     specimen: Specimen = field(default_factory=Specimen)
@@ -124,10 +125,11 @@ class Experiment:
                 f"tilt: expected at most {_LARGEST_TILT} rad per nominal strain (0.0137 is 0.1 "
                 f"degrees at 12.7 %), got {self.tilt}"
             )
-        if self.guided and self.specimen.holes_y % 2:
+        if self.guided and (self.specimen.holes_y % 2 or self.specimen.is_staggered):
             raise InputError(
-                "guided: expected an even holes_y, so that there are solid junctions at "
-                f"mid-height, got {self.specimen.holes_y}"
+                "guided: expected square or rectangular stacking and an even holes_y, so that "
+                "there are solid junctions at mid-height, got "
+                f"{self.specimen.stacking} stacking and {self.specimen.holes_y}"
             )
 
     @property
@@ -142,7 +144,7 @@ class Experiment:
         """
         material: Any = self.material
         tables = {
-            "specimen": asdict(self.specimen),
+            "specimen": self.specimen.plain(),
             "material": {"kind": type(material).__name__, **vars(material)},
             "loading": {
                 "edges": self.edges,

@@ -3,7 +3,7 @@
 A mesh without the mirror symmetries turns the bifurcation into an imperfect one, and Newton
 slips onto a branch unnoticed. So gmsh meshes only a few small blocks (a quarter of a unit
 cell for each diameter, a piece of each bulk strip, a corner), whose shared sides are divided
-alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on the circle.
+alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on the ellipse.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.special import ellipe
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Imperfection, Specimen
@@ -29,8 +30,8 @@ from modeharvest.util.machine import require_memory
 def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     """Move the mesh so that every hole has its own centre and diameter.
 
-    Hole edges stay circles; the motion fades out towards the cell's boundary, so cells do
-    not disturb each other and the outer edges stay straight.
+    Hole edges stay ellipses of the same aspect; the motion fades out towards the cell's boundary,
+    so cells do not disturb each other and the outer edges stay straight.
 
     Raises
     ------
@@ -38,7 +39,9 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
         If the scatter could close the thinnest ligament: four standard deviations beyond half of
         it.
     """
-    ligament = specimen.pitch - specimen.diameters.max()
+    # Where y is scaled so that holes are circles.
+    scale, limit = np.array([1.0, specimen.aspect]), specimen.largest_diameter
+    ligament = (limit - specimen.diameters.max()) * scale.min()
     reach = 4.0 * (imperfection.position_sd + 0.5 * imperfection.diameter_sd)
     if reach > 0.5 * ligament:
         raise InputError(
@@ -53,14 +56,14 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     growth = random.normal(0.0, 1.0, len(centres)) * 0.5 * imperfection.diameter_sd
 
     nodes = mesh.nodes.copy()
-    radii, outer = 0.5 * specimen.diameters, 0.5 * specimen.pitch
+    radii, outer = 0.5 * specimen.diameters, 0.5 * limit
     for centre, radius, move, grow in zip(centres, radii, shift, growth, strict=True):
-        arm = mesh.nodes - centre
+        arm = (mesh.nodes - centre) / scale
         distance = np.linalg.norm(arm, axis=1)
         near = distance < outer
         fade = np.clip((distance[near] - radius) / (outer - radius), 0.0, 1.0)
         weight = np.cos(0.5 * np.pi * fade)[:, None] ** 2
-        outwards = arm[near] / distance[near][:, None]
+        outwards = scale * (arm[near] / distance[near][:, None])
         nodes[near] += weight * (move + grow * outwards)
     return Mesh(nodes, mesh.cells, mesh.element)
 
@@ -99,16 +102,42 @@ def quarter_cell(pitch: float, diameter: float, size: float) -> MeshBlock:
         If ``size`` leaves fewer than two elements on a quarter of the hole's edge.
     """
     half, radius = 0.5 * pitch, 0.5 * diameter
-    coarsest = 0.25 * math.pi * radius
+    return quarter_polygon((half, half), half, (radius, radius), size)
+
+
+def quarter_polygon(
+    heights: tuple[float, float], width: float, radii: tuple[float, float], size: float
+) -> MeshBlock:
+    """A quarter of a unit cell about an elliptical hole, the hole's centre at the origin.
+
+    Parameters
+    ----------
+    heights
+        Of the cell's upper side at x = width and at x = 0 [mm]; the same for a rectangle.
+    width
+        Half the cell's width [mm].
+    radii
+        The hole's, along x and y [mm].
+    size
+        Target edge length of the elements [mm].
+
+    Raises
+    ------
+    InputError
+        If ``size`` leaves fewer than two elements on a quarter of the hole's edge.
+    """
+    low, high = heights
+    a, b = radii
+    arc = float(max(a, b) * ellipe(1.0 - (min(a, b) / max(a, b)) ** 2))
+    coarsest = 0.5 * arc
     if size > coarsest:
         raise InputError(
             f"mesh size: expected at most {coarsest:.3g} mm (two elements on a quarter of the "
             f"hole's edge), got {size} mm; give a smaller mesh size"
         )
-    on_arc = divisions_of(0.5 * math.pi * radius, size)
-    side, ligament = divisions_of(half, size), divisions_of(half - radius, size)
-    corners = [(radius, 0.0), (half, 0.0), (half, half), (0.0, half), (0.0, radius)]
-    return mesh_block(corners, [ligament, side, side, ligament, on_arc], arcs=[4])
+    corners = [(a, 0.0), (width, 0.0), (width, low), (0.0, high), (0.0, b)]
+    lengths = [width - a, low, math.hypot(width, high - low), high - b, arc]
+    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[4])
 
 
 def rectangle(width: float, height: float, n_width: int, n_height: int) -> MeshBlock:
@@ -194,28 +223,63 @@ def divisions_of(length: float, size: float) -> int:
 
 
 def _tiles(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
-    half = 0.5 * specimen.pitch
+    half, aspect = 0.5 * specimen.pitch, specimen.aspect
     a, b = specimen.cellular_half_size
-    n_half = divisions_of(half, size)
+    low, high = heights = specimen.cell_heights
     diameters, which = np.unique(specimen.diameters, return_inverse=True)
-    cells = [quarter_cell(specimen.pitch, float(d), size) for d in diameters]
+    radii = [(0.5 * float(d), 0.5 * float(aspect * d)) for d in diameters]
+    cells = [quarter_polygon(heights, half, radius, size) for radius in radii]
     for (x, y), k in zip(specimen.hole_centres, which, strict=True):
         yield from (cells[k].placed(sign, (x, y)) for sign in _SIGNS)
+    if specimen.is_staggered:
+        yield from _fillers(specimen, size)
 
-    centres_x = (np.arange(specimen.holes_x) - 0.5 * (specimen.holes_x - 1)) * specimen.pitch
-    centres_y = (np.arange(specimen.holes_y) - 0.5 * (specimen.holes_y - 1)) * specimen.pitch
+    n_half = divisions_of(half, size)
     n_x, n_y = divisions_of(specimen.bulk_x, size), divisions_of(specimen.bulk_y, size)
     if specimen.bulk_x > 0:
-        strip = rectangle(specimen.bulk_x, half, n_x, n_half)
-        for y in centres_y:
+        sides = {h: rectangle(specimen.bulk_x, h, n_x, divisions_of(h, size)) for h in heights}
+        is_full = specimen.row_counts == specimen.holes_x
+        for y, full in zip(specimen.row_heights, is_full, strict=True):
+            strip = sides[low if full else high]
             yield from (strip.placed(s, (s[0] * a, y)) for s in _SIGNS)
     if specimen.bulk_y > 0:
         strip = rectangle(half, specimen.bulk_y, n_half, n_y)
+        centres_x = (np.arange(specimen.holes_x) - 0.5 * (specimen.holes_x - 1)) * specimen.pitch
         for x in centres_x:
             yield from (strip.placed(s, (x, s[1] * b)) for s in _SIGNS)
     if specimen.bulk_x > 0 and specimen.bulk_y > 0:
         corner = rectangle(specimen.bulk_x, specimen.bulk_y, n_x, n_y)
         yield from (corner.placed(s, (s[0] * a, s[1] * b)) for s in _SIGNS)
+
+
+def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
+    """What the hexagonal cells of staggered rows leave of a rectangle.
+
+    Half a cell without a hole at either end of a shorter row; triangles between the corners of
+    the cells at top and bottom, and the bulk beside the last of these.
+    """
+    half, (low, high) = 0.5 * specimen.pitch, specimen.cell_heights
+    a, _ = specimen.cellular_half_size
+    n_half, n_low, n_high, n_gap = (divisions_of(d, size) for d in (half, low, high, high - low))
+    slant = divisions_of(math.hypot(half, high - low), size)
+    end = mesh_block(
+        [(0.0, 0.0), (half, 0.0), (half, low), (0.0, high)], [n_half, n_low, slant, n_high]
+    )
+    gap = mesh_block([(0.0, high), (half, low), (half, high)], [slant, n_gap, n_half])
+    last = specimen.holes_y - 1
+    rows = zip(specimen.row_heights, specimen.row_counts, strict=True)
+    for row, (y, count) in enumerate(rows):
+        is_full = count == specimen.holes_x
+        halves = [] if is_full else [(-a, 1.0), (a, -1.0)]  # and the side that is inwards
+        for x, sign in halves:
+            yield from (end.placed((sign, up), (x, y)) for up in (1.0, -1.0))
+        centres = (np.arange(count) - 0.5 * (count - 1)) * specimen.pitch
+        for up in (side for side, at in ((-1.0, 0), (1.0, last)) if at == row):
+            corners = [*halves, *((x, sign) for x in centres for sign in (1.0, -1.0))]
+            yield from (gap.placed((sign, up), (x, y)) for x, sign in corners)
+            if is_full and (width := specimen.bulk_x) > 0:
+                beside = rectangle(width, high - low, divisions_of(width, size), n_gap)
+                yield from (beside.placed((s, up), (s * a, y + up * low)) for s in (1.0, -1.0))
 
 
 def mesh_block(
@@ -230,7 +294,8 @@ def mesh_block(
     divisions
         Number of elements on each side, the first from the first corner to the second.
     arcs
-        Numbers of those sides that are arcs of circles about the origin.
+        Numbers of those sides that are arcs about the origin: of a circle, or, where they end on
+        both axes, of an ellipse.
     """
     with quiet_gmsh():
         geo = gmsh.model.geo
@@ -238,7 +303,14 @@ def mesh_block(
         centre = geo.addPoint(0.0, 0.0, 0.0) if arcs else 0
         curves = []
         for k, (p, q) in enumerate(zip(points, points[1:] + points[:1], strict=True)):
-            curves.append(geo.addCircleArc(p, centre, q) if k in arcs else geo.addLine(p, q))
+            if k not in arcs:
+                curves.append(geo.addLine(p, q))
+                continue
+            ends = math.hypot(*corners[k]), math.hypot(*corners[(k + 1) % len(corners)])
+            if math.isclose(*ends, rel_tol=1e-9):
+                curves.append(geo.addCircleArc(p, centre, q))
+            else:
+                curves.append(geo.addEllipseArc(p, centre, p if ends[0] > ends[1] else q, q))
         for curve, n in zip(curves, divisions, strict=True):
             geo.mesh.setTransfiniteCurve(curve, n + 1)
         geo.addPlaneSurface([geo.addCurveLoop(curves)])

@@ -104,11 +104,12 @@ class _Run:
     def _oriented(self, critical: Critical) -> Critical:
         """The critical point with its mode turned to a positive overlap with the pattern.
 
-        A mode of another symmetry has none; there a field without symmetries decides, so
-        that the sign isn't left to rounding.
+        A mode of another symmetry has none, nor has one of staggered rows; there a field without
+        symmetries decides, so that the sign isn't left to rounding.
         """
         mode = critical.modes[0]
-        overlap = self._pattern_overlap(mode)
+        is_staggered = self.experiment.specimen.is_staggered
+        overlap = 0.0 if is_staggered else self._pattern_overlap(mode)
         if abs(overlap) < 1e-6:
             overlap = mode.overlap(self._lopsided())
         if overlap < 0:
@@ -200,14 +201,18 @@ class _Run:
         }
 
     def _critical_info(self, critical: Critical) -> dict[str, Any]:
-        mode = critical.modes[0]
+        mode, overlaps = critical.modes[0], {}
+        if not self.experiment.specimen.is_staggered:
+            overlaps = {
+                "pattern_overlap": self._pattern_overlap(mode),
+                "pattern_overlap_by_cell": self._pattern_share(mode),
+            }
         return {
             "strain": critical.strain,
             "tolerance": self.experiment.path.critical_tolerance,
             "negative_pivots_below": critical.below,
             "negative_pivots_above": critical.above,
-            "pattern_overlap": self._pattern_overlap(mode),
-            "pattern_overlap_by_cell": self._pattern_share(mode),
+            **overlaps,
             "eigenvalues_N_per_mm4": [list(pair) for pair in sorted(critical.eigenvalues)],
             "nearest_eigenvalues_N_per_mm4": [m.eigenvalue for m in critical.modes],
         }
@@ -268,7 +273,7 @@ def _cell_of(nodes: NDArray[np.float64], specimen: Specimen) -> NDArray[np.int64
     """(n,) number of the unit cell that each node lies in, -1 in the bulk edges."""
     a, b = specimen.cellular_half_size
     column = np.floor((nodes[:, 0] + a) / specimen.pitch).astype(np.int64)
-    row = np.floor((nodes[:, 1] + b) / specimen.pitch).astype(np.int64)
+    row = np.floor((nodes[:, 1] + b) / specimen.row_distance).astype(np.int64)
     inside = (column >= 0) & (column < specimen.holes_x) & (row >= 0) & (row < specimen.holes_y)
     return np.where(inside, column * specimen.holes_y + row, -1)
 

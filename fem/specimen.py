@@ -1,12 +1,15 @@
-"""The finite specimen: holes on a square lattice in a rectangle with bulk edges; their scatter."""
+"""The finite specimen: a lattice of holes in a rectangle with bulk edges; their scatter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 MOST_HOLES = 1000
@@ -14,27 +17,65 @@ MOST_HOLES = 1000
 
 
 @dataclass(frozen=True)
+class Stacking:
+    """How rows of holes along x are stacked along y.
+
+    Parameters
+    ----------
+    shift
+        By how much a row is moved along x against the one below: 0, or 0.5 [pitch].
+    rise
+        Distance of the rows [pitch]; None where ``pitch_y`` gives it.
+    """
+
+    shift: float
+    rise: float | None
+
+
+STACKINGS = {
+    "square": Stacking(0.0, 1.0),
+    "rectangular": Stacking(0.0, None),
+    "triangular": Stacking(0.5, math.sqrt(0.75)),
+}
+"""The hole lattices that a specimen can have, by name."""
+
+
+@dataclass(frozen=True)
 class Specimen:
-    """A rectangular specimen with ``holes_x`` x ``holes_y`` circular holes.
+    """A rectangular specimen with ``holes_y`` rows of ``holes_x`` round or elliptical holes.
 
     The origin is the specimen's centre; x is the loading direction. Defaults are the
     virtual experiment of the paper (section "Virtual Experiments").
 
+    In triangular stacking every second row, counted from below, has one hole less: no hole is
+    cut, the specimen is symmetric about the y axis, and with an odd number of rows about the x
+    axis too. The cellular part is the bounding box of the holes' cells; what is left of it at
+    the ends of the shorter rows, and between the cells at top and bottom, is solid.
+
     Parameters
     ----------
     holes_x, holes_y
-        Number of holes in the loading and in the transverse direction [-].
+        Number of holes in a row, along the loading direction, and number of rows [-].
     diameter
-        Hole diameter d [mm]; of a graded specimen, the one at its centre.
+        Hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at its
+        centre.
     pitch
-        Centre-to-centre distance l, the unit cell size [mm].
+        Centre-to-centre distance l along a row, the unit cell size [mm].
     bulk_x, bulk_y
         Width of the solid strips beside the cellular part, at the loaded edges and at the
         free edges [mm]; 0 leaves them out.
     grading_x, grading_y
         Change of the diameter from hole to hole, per distance of their centres in the loading and
         in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A
-        specimen graded in one direction keeps its mirror symmetry in the other.
+        specimen graded in one direction keeps its mirror symmetry in the other. Ellipses keep
+        their aspect.
+    stacking
+        "square", "rectangular" or "triangular" (equilateral, rows along x); see ``STACKINGS``.
+    pitch_y
+        Distance of the rows [mm], of rectangular stacking; that of the others follows from
+        ``pitch``.
+    diameter_y
+        Diameter of elliptical holes along y [mm]; None for round ones.
     """
 
     holes_x: int = 6
@@ -45,12 +86,29 @@ class Specimen:
     bulk_y: float = 0.9
     grading_x: float = 0.0
     grading_y: float = 0.0
+    stacking: str = "square"
+    pitch_y: float | None = None
+    diameter_y: float | None = None
 
     def __post_init__(self) -> None:
         if not (1 <= self.holes_x <= MOST_HOLES and 1 <= self.holes_y <= MOST_HOLES):
             raise InputError(
                 f"specimen: expected 1 x 1 to {MOST_HOLES} x {MOST_HOLES} holes, got "
                 f"{self.holes_x} x {self.holes_y}; set holes_x and holes_y"
+            )
+        if self.stacking not in STACKINGS:
+            raise InputError(
+                f"specimen: expected a stacking among {list(STACKINGS)}, got {self.stacking!r}"
+            )
+        if (self.pitch_y is None) == (STACKINGS[self.stacking].rise is None):
+            raise InputError(
+                f"specimen: expected {'a' if self.pitch_y is None else 'no'} pitch_y for "
+                f"{self.stacking} stacking, got {self.pitch_y}"
+            )
+        if self.is_staggered and self.holes_x == 1 < self.holes_y:
+            raise InputError(
+                f"specimen: expected 2 or more holes_x in {self.stacking} stacking (every second "
+                "row has one less), got 1"
             )
         if not 0 < self.diameter < self.pitch:
             raise InputError(
@@ -64,12 +122,103 @@ class Specimen:
                 "specimen: expected bulk edges of 0 mm or more, got "
                 f"bulk_x = {self.bulk_x} mm, bulk_y = {self.bulk_y} mm"
             )
+        self._check_rows()
         smallest, largest = self.diameters.min(), self.diameters.max()
-        if not 0 < smallest <= largest < self.pitch:
+        if not 0 < smallest <= largest < self.largest_diameter:
+            limit = self.largest_diameter
+            said = f"{limit:.5g} mm" + (", the pitch" if limit == self.pitch else "")
             raise InputError(
-                f"specimen: expected 0 < d < {self.pitch} mm, the pitch, of every hole, got d from "
-                f"{smallest:.5g} to {largest:.5g} mm; make grading_x and grading_y smaller"
+                f"specimen: expected 0 < d < {said}, of every hole, got d from "
+                f"{smallest:.5g} to {largest:.5g} mm; make diameters or gradings smaller"
             )
+
+    def _check_rows(self) -> None:
+        """The rows' distance and the ellipses' aspect leave every hole its own cell."""
+        aspect, row = self.aspect, self.row_distance
+        if not (0 < aspect < np.inf and 0 < row < np.inf):
+            raise InputError(
+                "specimen: expected a positive pitch_y and diameter_y, got "
+                f"{self.pitch_y} mm and {self.diameter_y} mm"
+            )
+        if self.is_staggered and not row / aspect > 0.5 * self.pitch:
+            raise InputError(
+                f"specimen: expected diameter_y < {2.0 * row / self.pitch:.4g} diameter in "
+                f"{self.stacking} stacking (a hole must stay in its row), got {self.diameter_y} mm "
+                f"and {self.diameter} mm"
+            )
+
+    def plain(self) -> dict[str, Any]:
+        """As files have it: what was added to the square lattice of circles only where used."""
+        usual = {field.name: field.default for field in fields(self)}
+        added = ("stacking", "pitch_y", "diameter_y")
+        values = asdict(self)
+        return {n: v for n, v in values.items() if n not in added or v != usual[n]}
+
+    @property
+    def is_staggered(self) -> bool:
+        """Whether every second row is moved by half a pitch."""
+        return STACKINGS[self.stacking].shift != 0.0
+
+    @property
+    def row_distance(self) -> float:
+        """Distance of neighbouring rows of holes [mm]."""
+        rise = STACKINGS[self.stacking].rise
+        return self.pitch * rise if rise is not None else float(self.pitch_y or 0.0)
+
+    @property
+    def vectors(self) -> FloatArray:
+        """(2, 2) the hole lattice's vectors as rows [mm]: along a row, and to the next row."""
+        shift = STACKINGS[self.stacking].shift * self.pitch
+        return np.array([[self.pitch, 0.0], [shift, self.row_distance]])
+
+    @property
+    def aspect(self) -> float:
+        """The holes' diameter along y over that along x [-]."""
+        return 1.0 if self.diameter_y is None else self.diameter_y / self.diameter
+
+    @property
+    def largest_diameter(self) -> float:
+        """At which holes of this aspect would touch [mm]."""
+        row = self.row_distance / self.aspect  # where y is scaled so that holes are circles
+        return min(self.pitch, math.hypot(0.5 * self.pitch, row) if self.is_staggered else row)
+
+    @property
+    def cell_heights(self) -> tuple[float, float]:
+        """y of the upper corners of a hole's cell at x = l/2 and at x = 0 [mm].
+
+        The cell is what is nearest to a hole where y is scaled so that holes are circles: a
+        rectangle, and in staggered rows a hexagon with two sides along y.
+        """
+        half = 0.5 * self.row_distance
+        if not self.is_staggered:
+            return half, half
+        off = 0.125 * (self.aspect * self.pitch) ** 2 / self.row_distance
+        return half - off, half + off
+
+    @property
+    def quarter_places(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) middles of ligaments and (m, 2) of junctions around a hole, from its centre [mm].
+
+        Of the quarter of its cell where x and y are positive.
+        """
+        half, (low, high) = 0.5 * self.pitch, self.cell_heights
+        if not self.is_staggered:
+            return np.array([[half, 0.0], [0.0, high]]), np.array([[half, high]])
+        ligaments = np.array([[half, 0.0], [0.5 * half, 0.5 * self.row_distance]])
+        return ligaments, np.array([[half, low], [0.0, high]])
+
+    @property
+    def row_counts(self) -> NDArray[np.int64]:
+        """(holes_y,) number of holes in each row, from below."""
+        counts = np.full(self.holes_y, self.holes_x)
+        counts[1::2] -= self.is_staggered
+        return counts
+
+    @property
+    def row_heights(self) -> FloatArray:
+        """(holes_y,) y of each row [mm]."""
+        at = (np.arange(self.holes_y) - 0.5 * (self.holes_y - 1)) * self.row_distance
+        return np.asarray(at)
 
     @property
     def length(self) -> float:
@@ -79,7 +228,10 @@ class Specimen:
     @property
     def cellular_half_size(self) -> tuple[float, float]:
         """Half the width and height of the cellular part [mm]."""
-        return 0.5 * self.holes_x * self.pitch, 0.5 * self.holes_y * self.pitch
+        b = 0.5 * self.holes_y * self.row_distance
+        if self.is_staggered:
+            b = 0.5 * (self.holes_y - 1) * self.row_distance + self.cell_heights[1]
+        return 0.5 * self.holes_x * self.pitch, b
 
     @property
     def half_size(self) -> tuple[float, float]:
@@ -88,16 +240,21 @@ class Specimen:
         return a + self.bulk_x, b + self.bulk_y
 
     @property
-    def hole_centres(self) -> NDArray[np.float64]:
-        """(holes_x * holes_y, 2) positions of the hole centres [mm], exactly symmetric."""
-        x = (np.arange(self.holes_x) - 0.5 * (self.holes_x - 1)) * self.pitch
-        y = (np.arange(self.holes_y) - 0.5 * (self.holes_y - 1)) * self.pitch
-        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    def hole_centres(self) -> FloatArray:
+        """(holes, 2) positions of the hole centres [mm], exactly symmetric; from left to right."""
+        centres = np.array(
+            [
+                (x, y)
+                for y, count in zip(self.row_heights, self.row_counts, strict=True)
+                for x in (np.arange(count) - 0.5 * (count - 1)) * self.pitch
+            ]
+        )
+        return np.asarray(centres[np.lexsort((centres[:, 1], centres[:, 0]))])
 
     @property
-    def diameters(self) -> NDArray[np.float64]:
-        """(holes_x * holes_y,) diameters of the holes [mm], in the order of ``hole_centres``."""
-        return self.diameter + self.hole_centres @ [self.grading_x, self.grading_y]
+    def diameters(self) -> FloatArray:
+        """(holes,) diameters of the holes along x [mm], in the order of ``hole_centres``."""
+        return np.asarray(self.diameter + self.hole_centres @ [self.grading_x, self.grading_y])
 
     @property
     def mid_junctions(self) -> tuple[tuple[float, float], ...]:
@@ -105,16 +262,40 @@ class Specimen:
         x = (np.arange(1, self.holes_x) - 0.5 * self.holes_x) * self.pitch
         return tuple((float(at), 0.0) for at in x)
 
-    def pattern(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The square lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
+    def nearest_hole(self, points: FloatArray) -> NDArray[np.int64]:
+        """(n,) number of the hole whose unit cell each of ``points`` (n, 2) [mm] is in, or nearest.
+
+        Nearest where y is scaled so that holes are circles, as in ``cell_heights``.
+        """
+        counts, heights = self.row_counts, self.row_heights
+        rows = np.repeat(np.arange(self.holes_y), counts)
+        columns = np.concatenate([np.arange(count) for count in counts])
+        order = np.lexsort((rows, columns - 0.5 * counts[rows]))  # as in hole_centres
+        number = np.zeros((self.holes_y, self.holes_x), np.int64)
+        number[rows[order], columns[order]] = np.arange(len(order))
+        below = np.floor((points[:, 1] - heights[0]) / self.row_distance)
+        found, least = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+        for step in (0, 1):
+            row = np.clip(below + step, 0, self.holes_y - 1).astype(np.int64)
+            first = -0.5 * (counts[row] - 1)
+            column = np.clip(np.rint(points[:, 0] / self.pitch - first), 0, counts[row] - 1)
+            dx = points[:, 0] - (column + first) * self.pitch
+            distance = np.hypot(dx, (points[:, 1] - heights[row]) / self.aspect)
+            is_nearer = distance < least
+            found[is_nearer] = number[row, column.astype(np.int64)][is_nearer]
+            least = np.minimum(distance, least)
+        return found
+
+    def pattern(self, points: FloatArray) -> FloatArray:
+        """The rectangular lattice's buckling pattern at ``points`` (n, 2), amplitude 1 [-].
 
         u_x = -cos(pi x/l) sin(pi y/l), u_y = sin(pi x/l) cos(pi y/l) with the origin at a
         solid junction between four holes (Eq. (mode) of the paper); holes rotate into
-        ellipses, neighbours in opposite senses.
+        ellipses, neighbours in opposite senses. Along y, l is the distance of the rows.
         """
         a, b = self.cellular_half_size
         x = np.pi * (points[:, 0] + a) / self.pitch
-        y = np.pi * (points[:, 1] + b) / self.pitch
+        y = np.pi * (points[:, 1] + b) / self.row_distance
         return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
 
 

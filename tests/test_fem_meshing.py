@@ -23,6 +23,11 @@ CASES = [
     (Specimen(2, 2, bulk_x=0.0, bulk_y=0.0), 0.2),
     (Specimen(1, 3, diameter=0.5, pitch=2.0, bulk_x=0.7, bulk_y=0.0), 0.15),
     (Specimen(5, 4, diameter=1.1, pitch=1.386, bulk_x=0.31), 0.2),
+    (Specimen(2, 3, stacking="rectangular", pitch_y=2.3, bulk_x=0.4), 0.25),
+    (Specimen(3, 2, diameter=1.6, diameter_y=1.0), 0.2),
+    (Specimen(3, 3, diameter=1.28, pitch=1.386, stacking="triangular", bulk_x=0.5), 0.2),
+    (Specimen(2, 5, stacking="triangular", bulk_x=0.0, bulk_y=0.0), 0.25),
+    (Specimen(4, 1, diameter=1.3, diameter_y=1.8, stacking="triangular"), 0.25),
 ]
 cases = pytest.mark.parametrize(("specimen", "size"), CASES)
 GRADED = Specimen(4, 3, diameter=1.4, grading_x=0.08, bulk_x=0.5)
@@ -87,7 +92,7 @@ def on_outer_edge(points: NDArray[np.float64], specimen: Specimen) -> NDArray[np
 
 
 def on_hole(points: NDArray[np.float64], specimen: Specimen) -> NDArray[np.bool_]:
-    arms = points[:, None] - specimen.hole_centres
+    arms = (points[:, None] - specimen.hole_centres) / [1.0, specimen.aspect]
     off = np.abs(np.linalg.norm(arms, axis=-1) - 0.5 * specimen.diameters)
     return np.asarray(np.min(off, axis=1) < 1e-12)
 
@@ -117,7 +122,33 @@ def test_mesh_is_conforming_without_doubled_nodes(specimen: Specimen, size: floa
     assert np.all(outer ^ hole)
     # Euler: corners - edges + cells = 1 - holes, in one piece.
     corners = len(np.unique(mesh.cells[:, :3]))
-    assert corners - len(shared) + len(mesh.cells) == 1 - specimen.holes_x * specimen.holes_y
+    assert corners - len(shared) + len(mesh.cells) == 1 - len(specimen.hole_centres)
+
+
+@cases
+def test_material_is_the_rectangle_without_the_holes(specimen: Specimen, size: float) -> None:
+    a, b = specimen.half_size
+    exact = 4 * a * b - 0.25 * np.pi * specimen.aspect * np.sum(specimen.diameters**2)
+    # Parabolas through three points of a circle: h^4 / 720 r^3 a length, with h up to 0.25.
+    assert area(mesh_specimen(specimen, size)) == pytest.approx(exact, rel=1e-4)
+
+
+def test_an_even_number_of_triangular_rows_is_symmetric_about_the_y_axis_only() -> None:
+    specimen = Specimen(3, 4, stacking="triangular")
+    assert specimen.row_counts.tolist() == [3, 2, 3, 2]
+    places = set(rows(mesh_specimen(specimen, 0.25).nodes))
+    assert {(-x + 0.0, y) for x, y in places} == places
+    assert {(x, -y + 0.0) for x, y in places} != places
+
+
+@pytest.mark.parametrize("specimen", [case[0] for case in CASES])
+def test_every_point_of_a_cell_is_nearest_to_its_hole(specimen: Specimen) -> None:
+    a, b = specimen.cellular_half_size
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (2000, 2)) * (a, b)
+    arms = (points[:, None] - specimen.hole_centres) / [1.0, specimen.aspect]
+    distance = np.linalg.norm(arms, axis=-1)
+    found = distance[np.arange(len(points)), specimen.nearest_hole(points)]
+    np.testing.assert_allclose(found, distance.min(axis=1), rtol=1e-12)
 
 
 @cases
@@ -288,6 +319,17 @@ def test_scatter_has_the_stated_deviation_and_seed() -> None:
             r"0 < d < 1.9 mm.*got d from 1.025 to 1.975 mm",
         ),
         (lambda: Specimen(grading_y=-0.2), "0 < d < 1.9 mm"),
+        (lambda: Specimen(stacking="rectangular"), "a pitch_y for rectangular stacking, got None"),
+        (lambda: Specimen(pitch_y=2.0), "no pitch_y for square stacking, got 2.0"),
+        (lambda: Specimen(stacking="hexagonal"), "a stacking among .*'triangular'.*'hexagonal'"),
+        (lambda: Specimen(stacking="rectangular", pitch_y=1.4), "0 < d < 1.4 mm, of every hole"),
+        (lambda: Specimen(diameter_y=2.0), "0 < d < 1.425 mm, of every hole"),
+        (lambda: Specimen(diameter_y=-1.0), "positive pitch_y and diameter_y"),
+        (lambda: Specimen(1, 2, stacking="triangular"), "2 or more holes_x"),
+        (
+            lambda: Specimen(diameter=1.0, diameter_y=1.8, stacking="triangular"),
+            "diameter_y < 1.732 diameter in triangular stacking",
+        ),
         (lambda: Specimen(grading_x=float("nan")), "got d from nan"),
         (
             lambda: perturb(mesh_specimen(GRADED, 0.25), GRADED, Imperfection(0.05)),

@@ -232,7 +232,8 @@ def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
     a, b = specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]
     length = lengths(comparison.result.fluctuation()) / grid.pixel_size
-    outer_x, outer_y = x > a - specimen.pitch, y > b - specimen.pitch
+    outermost = 0.5 * specimen.row_distance + specimen.cell_heights[1]
+    outer_x, outer_y = x > a - specimen.pitch, y > b - outermost
 
     def largest(where: BoolArray) -> float:
         return float(np.max(length, initial=0.0, where=where))

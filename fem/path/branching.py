@@ -9,7 +9,7 @@ unstable primary path up to given strains, which costs most where ligaments are 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -299,7 +299,7 @@ def _solution(
         branch="primary" if info["critical"] is None else "buckled+",
     )
     made = {
-        "specimen": asdict(spec),
+        "specimen": spec.plain(),
         "material": {"kind": type(experiment.material).__name__, **vars(experiment.material)},
         "loading": {"edges": experiment.edges, "length_mm": spec.length},
         "mesh_size_mm": experiment.mesh_size,

@@ -57,6 +57,7 @@ class ResolutionSpec:
     def write(self, folder: Path) -> str:
         """Leave it for workers; returns its name."""
         content = asdict(self)
+        content["buckled"]["specimen"] = self.buckled.specimen.plain()
         name = digest(content)[:16]
         write_json(folder / "subjects" / f"{name}.json", content)
         return name
@@ -246,13 +247,8 @@ class BuckledMotion:
         """Whether there is material at points of the undeformed specimen [mm] that broadcast."""
         s = self.specimen
         x, y = np.broadcast_arrays(x, y)
-        (left, bottom), counts = s.hole_centres[0], (s.holes_x, s.holes_y)
-        i, j = (
-            np.clip(np.rint((at - first) / s.pitch), 0, count - 1).astype(int)
-            for at, first, count in zip((x, y), (left, bottom), counts, strict=True)
-        )
-        hole = i * s.holes_y + j
-        dx, dy = x - s.hole_centres[hole, 0], y - s.hole_centres[hole, 1]
+        hole = s.nearest_hole(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+        dx, dy = x - s.hole_centres[hole, 0], (y - s.hole_centres[hole, 1]) / s.aspect
         width, height = s.half_size
         inside = (np.abs(x) <= width) & (np.abs(y) <= height)
         return np.asarray(inside & (np.hypot(dx, dy) > 0.5 * s.diameters[hole]))

@@ -304,7 +304,7 @@ def publish(
             "key": images.info["key"],
             "strains": list(images.strains),
             "grid": asdict(images.grid),
-            "specimen": asdict(specimen),
+            "specimen": specimen.plain(),
             "solution_sha256": sha256_of(truth / SOLUTION),
         }
         write_json(public / SIDECAR, info)

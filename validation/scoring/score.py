@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -54,24 +54,23 @@ def regions(
     cellular = (np.abs(grid.y)[:, None] <= b) & (np.abs(grid.x)[None, :] <= a)
     labels[mask & ~cellular] = REGIONS.index(BULK)
     row, col = np.nonzero(mask & cellular)
-    labels[row, col] = _nearest(specimen, grid.x[col], grid.y[row])
+    labels[row, col] = _nearest(specimen, np.stack([grid.x[col], grid.y[row]], axis=1))
     padded = np.pad(mask, 1)
     near = ndimage.distance_transform_edt(padded)[1:-1, 1:-1] <= edge_px
     labels[mask & near] = REGIONS.index(EDGES)
     return labels
 
 
-def _nearest(specimen: Specimen, x: ArrayLike, y: ArrayLike) -> NDArray[np.int8]:
-    """Whether the middle of a ligament or of a junction is nearest to positions [mm]."""
-    pitch, half = specimen.pitch, 0.5 * specimen.pitch
+def _nearest(specimen: Specimen, points: FloatArray) -> NDArray[np.int8]:
+    """Whether the middle of a ligament or of a junction is nearest to points (n, 2) [mm]."""
     # From the nearest hole's centre, in the quarter of its cell where both are positive.
-    dx, dy = (
-        np.abs(np.mod(np.asarray(at) - centre + half, pitch) - half)
-        for at, centre in zip((x, y), specimen.hole_centres[0], strict=True)
+    quarter = np.abs(points - specimen.hole_centres[specimen.nearest_hole(points)])
+    ligament, junction = (
+        np.min([np.hypot(*(quarter - place).T) for place in places], axis=0)
+        for places in specimen.quarter_places
     )
-    ligament = np.minimum(np.hypot(dx - half, dy), np.hypot(dx, dy - half))
-    is_junction = np.hypot(dx - half, dy - half) < ligament - 1e-9 * pitch
     kinds = REGIONS.index(LIGAMENTS), REGIONS.index(JUNCTIONS)
+    is_junction = junction < ligament - 1e-9 * specimen.pitch
     return np.where(is_junction, kinds[1], kinds[0]).astype(np.int8)
 
 

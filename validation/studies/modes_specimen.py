@@ -88,7 +88,8 @@ class PatternCells:
         self._rule = rule = MeshQuadrature(mesh, _QUADRATURE)
         half = np.array(specimen.cellular_half_size)
         self._shape = specimen.holes_x, specimen.holes_y
-        place = np.floor((rule.positions + half) / specimen.pitch).astype(np.int64)
+        cell = specimen.pitch, specimen.row_distance
+        place = np.floor((rule.positions + half) / cell).astype(np.int64)
         self._inside = np.all((place >= 0) & (place < self._shape), axis=1)
         self._cell = np.ravel_multi_index(tuple(place[self._inside].T), self._shape)
         self._pattern = specimen.pattern(rule.positions)
@@ -249,7 +250,8 @@ class SpecimenSpec:
         """As plain JSON values."""
         material = {"kind": type(self.material).__name__, **vars(self.material)}
         imaging = _SPEC.dump_python(self.imaging, mode="json")
-        return {**asdict(self), "material": material, "imaging": imaging}
+        specimen = self.specimen.plain()
+        return {**asdict(self), "specimen": specimen, "material": material, "imaging": imaging}
 
     @classmethod
     def read(cls, path: Path) -> SpecimenSpec:

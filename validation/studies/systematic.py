@@ -452,7 +452,7 @@ def one_level(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def _errors_of(scene: VirtualImagePair) -> dict[str, Any]:
     result = scene.correlate()
     specimen = scene.specimen
-    ligament = specimen.pitch - specimen.diameter
+    ligament = specimen.largest_diameter - specimen.diameter
     return {
         **error_parts(scene, result),
         "outcome": result.outcome.value,
@@ -468,7 +468,10 @@ def _at_junctions(scene: VirtualImagePair, result: Result) -> FloatArray:
     """(junctions, 2) displacement between four holes each, whatever the pixels [mm]."""
     specimen = scene.specimen
     x, y = (
-        specimen.pitch * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
-        for count in (specimen.holes_x, specimen.holes_y)
+        distance * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
+        for distance, count in (
+            (specimen.pitch, specimen.holes_x),
+            (specimen.row_distance, specimen.holes_y),
+        )
     )
     return scene.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)

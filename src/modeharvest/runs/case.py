@@ -195,6 +195,7 @@ class Case(CaseModel):
         """The case as plain JSON values, materials by their kind."""
         content = {name: plain(getattr(self, name)) for name in type(self).model_fields}
         content["experiment"]["material"] = kind_of(self.experiment.material, MATERIALS)
+        content["experiment"]["specimen"] = self.experiment.specimen.plain()
         for name in ("tilt", "guided"):  # as before there were any: what is finished stays so
             if not content["experiment"][name]:
                 del content["experiment"][name]

@@ -19,12 +19,13 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
@@ -383,8 +384,9 @@ def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, whe
     That of another solver, read from its mesh, says nothing of it and is believed.
     """
     usual = Experiment().described()
+    usual["specimen"] = asdict(Specimen())
     for table, values in experiment.described().items():
-        for name, value in values.items() if table in info else ():
+        for name, value in {**usual[table], **values}.items() if table in info else ():
             # What an older solution does not say was not to be chosen when it was made.
             got = info[table].get(name, usual[table].get(name))
             if got != value:
