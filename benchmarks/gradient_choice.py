@@ -22,7 +22,7 @@ from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.pyramid import FULL, eroded
 from modeharvest.imaging.imageset import ImageSet, make_images
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.errors import InputError
 
 STRAIN, PIXEL = 0.128, 0.04
@@ -41,14 +41,14 @@ def images(folder: Path) -> ImageSet:
     path = shipped_solution("paper-virtual")
     if path is None:
         raise InputError("expected the shipped solution of paper-virtual, found none")
-    spec = replace(read_case("paper-virtual").imaging, pixel_size=PIXEL)
+    spec = replace(Case.read("paper-virtual").imaging, pixel_size=PIXEL)
     make_images(Solution.read(path), spec, folder, [STRAIN])
     return ImageSet.read(folder)
 
 
 def distances(pair: ImageSet, seeds: int) -> Iterator[tuple[float, str, float]]:
     """Noise, what weighs, and the mean distance from the best fit over the seeds [px]."""
-    case = read_case("paper-virtual")
+    case = Case.read("paper-virtual")
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     start, grid = ansatz.initial_guess(STRAIN, case.correlation.start_amplitude), pair.grid
     f, g = pair.reference(), pair.deformed(STRAIN)

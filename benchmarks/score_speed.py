@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 
 STRAIN, NOISE_PX = 0.128, 0.05
@@ -41,7 +41,7 @@ def dense_field(truth: BenchmarkTruth, spacing: float, path: Path) -> int:
 
 
 def measure(folder: Path, pixel: float, spacing: float) -> None:
-    case = read_case("paper-virtual")
+    case = Case.read("paper-virtual")
     case = case.model_copy(update={"imaging": replace(case.imaging, pixel_size=pixel)})
     make_benchmark(case, folder / "set", solution=shipped_solution("paper-virtual"))
     truth = BenchmarkTruth.read(truth_folder(folder / "set"))

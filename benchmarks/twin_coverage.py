@@ -1,5 +1,8 @@
 """Coverage of the twin's 95 % intervals over many seeds of the camera's noise.
 
+Each seed photographs the twin again: a 95 % interval of a field, 1.96 standard deviations by noise
+about what one photograph shows, should hold the noise-free result in 95 of 100 of them.
+
 Needs the twin's photographs and harvest (minutes), which it makes in out/twin unless they are
 there: modeharvest run paper-real-twin --out out/twin. Goes on where it was stopped.
 
@@ -9,14 +12,138 @@ Run: scripts/env python benchmarks/twin_coverage.py [--seeds 100] [--workers 2] 
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
-from modeharvest.runs.case import TwinCase, read_case, shipped_solution
-from modeharvest.runs.twin import TwinRun
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.idic.correlate import correlate
+from modeharvest.idic.photograph.measure import covariances, noise_of, prepared_pair
+from modeharvest.idic.result import Result
+from modeharvest.idic.solver.final_smoothing import blurred_pair
+from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors
+from modeharvest.imaging.distortion.undistort import undistorted
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.pipeline import HarvestRun
+from modeharvest.runs.twin import Twin, TwinRun
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.validation.campaign import Campaign, grid
 from modeharvest.validation.workers import Workers
 
-FUNCTION = "modeharvest.runs.twin:one_seed"
+FUNCTION = "twin_coverage:one_seed"
+INTERVAL = 1.96
+"""Standard deviations of a 95 % interval."""
+_POINTS = 25
+"""Points along each side of the cellular part at which intervals are counted."""
+
+
+def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
+    """Photograph and measure once more; the share of intervals that hold the noise-free result.
+
+    Parameters
+    ----------
+    case
+        ``name`` of the deformed photograph and ``seed``.
+    folder
+        Of a finished twin run (``twin/`` and ``harvest/``).
+
+    Returns
+    -------
+    dict
+        For v0, v1 and v1 phi1 the share of points covered, and the rms of the deviation over its
+        standard deviation, which should be 1.
+    """
+    setup = _setup(folder, case["name"])
+    found = setup.measured(setup.photographs(case["seed"]))
+    clean, sd = setup.clean, setup.errors
+    ansatz, at = found.ansatz, (setup.x, setup.y)
+    pairs = {
+        "v0": (ansatz.v0(found.unknowns, *at) - ansatz.v0(clean.unknowns, *at), sd.v0),
+        "v1": (ansatz.v(0, found.unknowns, *at) - ansatz.v(0, clean.unknowns, *at), sd.v[0]),
+        "v1phi1": (
+            ansatz.fluctuation(0, found.unknowns, *at) - ansatz.fluctuation(0, clean.unknowns, *at),
+            sd.fluctuation[0],
+        ),
+    }
+    shares = {}
+    for name, (deviation, error) in pairs.items():
+        ratio = deviation[error > 0] / error[error > 0]
+        shares[f"covered {name}"] = float(np.mean(np.abs(ratio) <= INTERVAL))
+        shares[f"deviation {name}"] = float(np.sqrt(np.mean(ratio**2)))
+    return shares
+
+
+@dataclass(frozen=True, eq=False)
+class _CoverageSetup:
+    """All that does not depend on the seed: what a worker keeps."""
+
+    twin: Twin
+    harvesting: HarvestRun
+    pair: ImagePair
+    name: str
+    blur_px: float
+    start: Result
+    clean: Result
+    errors: FieldErrors
+    x: FloatArray
+    y: FloatArray
+
+    def photographs(self, seed: int | None) -> tuple[FloatImage, FloatImage]:
+        """Reference and deformed photograph with the noise of a seed, or none; undistorted."""
+        spec, images = self.twin.images.spec, self.twin.images
+        strain = min(images.strains, key=lambda e: abs(e - int(self.name.rsplit("_", 1)[1]) / 1e4))
+        white = 2**spec.bits - 1
+        taken = []
+        for grey, label in (
+            (images.reference(), "reference"),
+            (images.deformed(strain), "deformed"),
+        ):
+            levels: NDArray[Any] = white * grey
+            if seed is not None:
+                sensor = replace(spec.sensor, shot_seed=1000 + seed, read_seed=2000 + seed)
+                irradiance = ((grey - sensor.offset) / sensor.gain).astype(np.float32)
+                levels = sensor.expose(irradiance, spec.bits, label)
+            distortion = self.harvesting.optics.distortion
+            image = levels.astype(np.float32)
+            taken.append(image if distortion is None else undistorted(image, distortion))
+        return taken[0], taken[1]
+
+    def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
+        """Correlate as the harvest finished, from the harvest's result on."""
+        masks = self.pair.masks
+        if self.blur_px > 0.0:
+            images = blurred_pair(*images, *masks, self.blur_px)
+        options = self.harvesting.case.correlation.options()
+        fine = replace(options, levels=options.levels[-1:])
+        start = self.start
+        return correlate(*images, start.grid, start.ansatz, start.unknowns, *masks, fine)
+
+
+@lru_cache(maxsize=1)
+def _setup(folder: Path, name: str) -> _CoverageSetup:
+    twin = Twin(folder / "twin")
+    case = PhotographCase.read(twin.experiment)
+    harvesting = HarvestRun(case, folder / "harvest")
+    prepared, measured = harvesting.prepared(), harvesting.results()[name]
+    pair = prepared_pair(prepared, name)
+    box = harvesting.geometry.region.cellular
+    x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)
+    y = np.linspace(box.y_min, box.y_max, _POINTS, dtype=np.float64)
+    noise, cell = noise_of(prepared, name), case.specimen.cell_size
+    by_noise, _, _ = covariances(measured, pair, noise, cell)
+    errors = field_errors(measured.result, x, y, by_noise)
+    blank = measured.result
+    setup = _CoverageSetup(
+        twin, harvesting, pair, name, measured.blur_px, blank, blank, errors, x, y
+    )  # fmt: skip
+    return replace(setup, clean=setup.measured(setup.photographs(None)))
 
 
 def main() -> None:
@@ -26,9 +153,10 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/twin"))
     parser.add_argument("--name", default="deformed_1270")
     options = parser.parse_args()
-    case = read_case("paper-real-twin")
-    assert isinstance(case, TwinCase), "the shipped twin"
-    TwinRun(case, options.folder, solution=shipped_solution("paper-real-twin")).all()
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # where workers find FUNCTION
+    TwinRun(
+        Case.read("paper-real-twin"), options.folder, solution=shipped_solution("paper-real-twin")
+    ).all()
     cases = grid({"name": options.name, "seed": 0}, seed=range(options.seeds))
     campaign = Campaign(FUNCTION, cases, options.folder.resolve())
     table = campaign.run(Workers(options.workers), lambda d, n, what: print(f"{d}/{n}", end="\r"))

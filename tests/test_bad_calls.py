@@ -15,8 +15,8 @@ from test_cli import called, error_line
 
 from modeharvest.cli import messages
 from modeharvest.fem.field import Mesh, Snapshot, Solution
-from modeharvest.runs.case import Case, checked, read_case
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.case import Case, checked
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.machine import available_bytes, require_memory
 
@@ -85,7 +85,7 @@ def test_a_value_that_means_nothing_is_refused(
     path = tmp_path / "case.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError) as caught:
-        read_case(path)
+        Case.read(path)
     assert said in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -94,7 +94,7 @@ def test_a_value_that_means_nothing_is_refused(
 def test_the_mark_of_an_editor_is_no_fault(tmp_path: Path) -> None:
     path = tmp_path / "case.toml"
     path.write_bytes(b"\xef\xbb\xbftitle = 'x'\n")
-    assert read_case(path).title == "x"
+    assert Case.read(path).title == "x"
 
 
 def test_whole_numbers_count_as_numbers() -> None:
@@ -328,7 +328,7 @@ def test_a_polygon_has_an_area(table: str, polygon: str, said: str, tmp_path: Pa
     path = tmp_path / "experiment.toml"
     path.write_text(f"{HARVEST}{table} = {polygon}\n")
     with pytest.raises(InputError, match="polygon") as caught:
-        read_photograph_case(path)
+        PhotographCase.read(path)
     assert said in str(caught.value)
 
 
@@ -337,7 +337,7 @@ def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
 
     path = tmp_path / "experiment.toml"
     path.write_text(HARVEST.replace('"deformed', f'"{place}/def*').replace('"ref', f'"{place}/ref'))
-    require_inputs(read_photograph_case(path), tmp_path)
+    require_inputs(PhotographCase.read(path))
 
 
 # --- what is printed ----------------------------------------------------------------------
@@ -348,7 +348,7 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
 
     summary = {
         "title": "[/bold] [red]", "snapshots": [], "critical_strain": None,
-        "warnings": ["[/x]"], "expected": [], "case": read_case("paper-virtual").plain(),
+        "warnings": ["[/x]"], "expected": [], "case": Case.read("paper-virtual").plain(),
     }  # fmt: skip
     print_experiment(summary, Path("out[/bold]"))
     text = capsys.readouterr().out
@@ -442,8 +442,9 @@ def test_a_full_or_closed_terminal_is_no_fault(tail: str, code: int, said: str) 
 
 INTERRUPTED = """
 import signal, sys
-from modeharvest import case_file, cli
+from modeharvest.cli import root
 from modeharvest.cli.messages import bars
+from modeharvest.runs import case
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
 
@@ -457,9 +458,9 @@ def work(name):
         progress(1, 2, "work")
         print("it went on")
 
-case_file.case_text = work
+case.case_text = work
 sys.argv = ["modeharvest", "cases", "paper-virtual"]
-cli.main()
+root.main()
 """
 
 
@@ -501,7 +502,7 @@ READ_ONLY = """
 import io, sys
 from numba.core import caching
 from rich.console import Console
-from modeharvest.console import compilation_announced
+from modeharvest.cli.messages import compilation_announced
 
 def refused(self):  # as where neither the package's folder nor the home can be written to
     raise PermissionError(self.get_cache_path())

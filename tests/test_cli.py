@@ -10,7 +10,7 @@ import pytest
 
 from modeharvest import __version__
 from modeharvest.cli.root import main
-from modeharvest.runs.case import read_case
+from modeharvest.runs.case import Case
 
 COMMANDS = (
     ("run",),
@@ -83,7 +83,7 @@ def test_cases_prints_a_case_that_can_be_run(
     assert called(monkeypatch, "cases", "paper-virtual") == 0
     mine = tmp_path / "mine.toml"
     mine.write_text(capsys.readouterr().out, "utf-8")
-    assert read_case(mine) == read_case("paper-virtual")
+    assert Case.read(mine) == Case.read("paper-virtual")
 
 
 @pytest.mark.parametrize("arguments", [("bogus",), ("run",), ("run", "paper-virtual")])

@@ -30,6 +30,7 @@ from scipy.io import savemat
 from test_mode_file import sample
 from test_result import some_result
 
+import modeharvest
 from modeharvest.fem import field
 from modeharvest.fem.bloch.modes import read_modes, write_modes
 from modeharvest.fem.field import Solution, read_any_mesh, read_meshio
@@ -54,10 +55,10 @@ from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.photographs.photograph import read_photograph
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
-from modeharvest.runs.case import read_case
-from modeharvest.runs.lattice.case import read_lattice_case
-from modeharvest.runs.photographs.case import EXAMPLE, read_photograph_case
-from modeharvest.runs.study import read_study
+from modeharvest.runs.case import Case, case_text
+from modeharvest.runs.lattice.case import LatticeCase
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
 from modeharvest.validation.resolution.star import Star, StarSet, StarSpec, make_star_set
@@ -94,16 +95,16 @@ def subjects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Subject]:
 
 
 def _cases(folder: Path) -> dict[str, Subject]:
-    root = Path(read_case.__code__.co_filename).parent
+    root = Path(str(modeharvest.__file__)).parent
     harvest = folder / "experiment.toml"
-    options = re.sub(r"^# (?=\w+ = (?!.*e\.g\.))", "", EXAMPLE, flags=re.MULTILINE)
+    options = re.sub(r"^# (?=\w+ = (?!.*e\.g\.))", "", case_text("photographs"), flags=re.MULTILINE)
     harvest.write_text(options, "utf-8")
     return {
-        "case": Subject(root / "cases" / "paper-virtual.toml", read_case),
-        "twin": Subject(root / "cases" / "paper-real-twin.toml", read_case),
-        "lattice": Subject(root / "cases" / "square-lattice.toml", read_lattice_case),
-        "study": Subject(root / "cases" / "studies" / "noise.toml", read_study),
-        "experiment": Subject(harvest, read_photograph_case),
+        "case": Subject(root / "cases" / "paper-virtual.toml", Case.read),
+        "twin": Subject(root / "cases" / "paper-real-twin.toml", Case.read),
+        "lattice": Subject(root / "cases" / "square-lattice.toml", LatticeCase.read),
+        "study": Subject(root / "cases" / "studies" / "noise.toml", StudyCase.read),
+        "experiment": Subject(harvest, PhotographCase.read),
     }
 
 

@@ -12,7 +12,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.simulate import simulate
 from modeharvest.fem.specimen import Specimen
-from modeharvest.runs.case import read_case
+from modeharvest.runs.case import Case
 
 STRAINS = (0.05, 0.082, 0.09)
 
@@ -57,6 +57,6 @@ def test_without_any_symmetry_the_pattern_grows_from_the_first_load_on() -> None
 def test_a_case_file_can_say_it(tmp_path: Path) -> None:
     path = tmp_path / "graded.toml"
     path.write_text("[experiment.specimen]\ngrading_x = 0.02\n")
-    case = read_case(path)
+    case = Case.read(path)
     assert case.experiment.specimen == Specimen(grading_x=0.02)
     assert case.plain()["experiment"]["specimen"]["grading_x"] == 0.02

@@ -10,7 +10,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.meshing import mesh_specimen, perturb
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.simulate import simulate
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 
 FloatArray = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
     """Other versions of MUMPS and BLAS round differently; equilibrium is met to 1e-11 of strain."""
     path = shipped_solution("paper-virtual")
     assert path is not None
-    shipped, fresh = Solution.read(path), simulate(read_case("paper-virtual").experiment)
+    shipped, fresh = Solution.read(path), simulate(Case.read("paper-virtual").experiment)
     np.testing.assert_array_equal(shipped.mesh.cells, fresh.mesh.cells)
     np.testing.assert_allclose(shipped.mesh.nodes, fresh.mesh.nodes, rtol=0, atol=1e-12)
     assert abs(shipped.info["critical"]["strain"] - fresh.info["critical"]["strain"]) < 1e-8
@@ -35,7 +35,7 @@ def test_shipped_solution_of_the_paper_case_against_a_fresh_one() -> None:
 
 def test_shipped_twin_is_in_stable_equilibrium_under_its_tilted_and_guided_loading() -> None:
     """Without walking its path again: residual and inertia at what is shipped."""
-    case, path = read_case("paper-real-twin"), shipped_solution("paper-real-twin")
+    case, path = Case.read("paper-real-twin"), shipped_solution("paper-real-twin")
     assert path is not None
     shipped, experiment = Solution.read(path), case.experiment
     spec = experiment.specimen

@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from modeharvest.cli.root import app
 from modeharvest.idic.photograph.geometry import RegionTable
-from modeharvest.runs.case import checked
-from modeharvest.runs.photographs.case import EXAMPLE, PhotographCase
+from modeharvest.runs.case import case_text, checked
+from modeharvest.runs.photographs.case import PhotographCase
 
+EXAMPLE = case_text("photographs")
 OPTION = re.compile(r"^# (?P<key>\w+) = (?P<value>.*?)\s+# (?P<words>.*)$")
 
 

@@ -18,7 +18,7 @@ from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.uncertainty.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 
 PITCH, PIXEL = 1.9, 0.035
@@ -169,7 +169,7 @@ def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
         whole = SMALL if path.stem == "frame_2a" else np.full(shape, 255, dtype=np.uint8)
         tifffile.imwrite(folder / f"mask_{path.name}", whole)
     text(f"= {PITCH}", f'= {PITCH}\ndeformed_material = ["mask_*.tif"]')(folder)
-    run = HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
+    run = HarvestRun(PhotographCase.read(folder / "experiment.toml"), folder / "out")
     prepared = run.prepared()
     assert prepared.names == ("frame_1", "frame_2", "frame_3")
     reasons = dict(prepared.skipped)
@@ -190,7 +190,7 @@ def test_fields_stay_with_their_photographs_when_one_is_skipped(folder: Path) ->
         header = "x [px],y [px],u [px],v [px]"
         np.savetxt(folder / f"f{n}.csv", rows, delimiter=",", header=header, comments="")
     tables('[local]\ncode = "file"\nfiles = ["f*.csv"]\ny_axis = "down"')(folder)
-    run = HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
+    run = HarvestRun(PhotographCase.read(folder / "experiment.toml"), folder / "out")
     results = run.results()
     assert list(results) == ["frame_1", "frame_3"]
     for n in (1, 3):

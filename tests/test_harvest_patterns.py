@@ -15,7 +15,7 @@ from modeharvest.idic.photograph.measure import MeasuredPhotograph
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.util.errors import InputError
 
@@ -37,7 +37,7 @@ def harvesting(folder: Path, specimen: str = "", correlation: str = "") -> Harve
         f"[scale]\npixel_size = {PIXEL}\n[correlation]\nv0_degree = 3\nv_degree = 1\n{correlation}"
         f"\n[specimen]\ncell_size = {PITCH}\n{specimen}"
     )
-    return HarvestRun(read_photograph_case(folder / "experiment.toml"), folder, folder / "out")
+    return HarvestRun(PhotographCase.read(folder / "experiment.toml"), folder / "out")
 
 
 def error_px(measured: MeasuredPhotograph, scene: Photographed, truth: Displacement) -> float:

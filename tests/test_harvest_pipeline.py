@@ -22,7 +22,7 @@ from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.runs.case import shipped_solution
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.errors import InputError
@@ -88,7 +88,7 @@ def experiment(photographs: Path, folder: Path, **changes: str) -> Path:
 def test_the_pattern_is_found_with_no_number_typed(harvested: Path, images: ImageSet) -> None:
     before, after = summary(harvested)["frames"]
     assert (before["has_pattern"], after["has_pattern"]) == (False, True)
-    assert before["modes"][0]["held"]
+    assert before["modes"][0]["fixed"]
     (mode,) = after["modes"]
     # Asked of the identified wave vectors: within 1 %.
     for wave, ideal in zip(mode["waves"], ((0.5, 0.5), (-0.5, 0.5)), strict=True):
@@ -110,8 +110,8 @@ def test_the_noise_is_measured(harvested: Path) -> None:
 def test_again_repeats_nothing(harvested: Path, photographs: Path) -> None:
     files = [*harvested.glob("results/*"), *harvested.glob("prepared/*")]
     before = {path: path.stat().st_mtime_ns for path in files}
-    experiment = read_photograph_case(photographs / "experiment.toml")
-    results = HarvestRun(experiment, photographs, harvested).results()
+    experiment = PhotographCase.read(photographs / "experiment.toml")
+    results = HarvestRun(experiment, harvested).results()
     assert list(results) == ["frame_1", "frame_2"]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
 
@@ -121,8 +121,8 @@ def test_an_interrupted_harvest_goes_on(harvested: Path, photographs: Path, tmp_
     shutil.copytree(harvested, out)
     (out / "results" / "frame_2_start.json").unlink()  # written last
     kept = (out / "results" / "frame_1.json").stat().st_mtime_ns
-    experiment = read_photograph_case(photographs / "experiment.toml")
-    HarvestRun(experiment, photographs, out).results()
+    experiment = PhotographCase.read(photographs / "experiment.toml")
+    HarvestRun(experiment, out).results()
     assert (out / "results" / "frame_1.json").stat().st_mtime_ns == kept
     again, first = (Result.read(f / "results" / "frame_2.json") for f in (out, harvested))
     assert np.array_equal(again.unknowns, first.unknowns)
@@ -138,7 +138,7 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
     other = Speckle(SpeckleSpec(seed=99), mask.shape).image()
     for name, shown in (("frame_1b.tif", other * mask), ("frame_1c.tif", other)):
         tifffile.imwrite(tmp_path / name, np.rint(255 * shown).astype(np.uint8))
-    harvesting = HarvestRun(read_photograph_case(path), tmp_path, tmp_path / "out")
+    harvesting = HarvestRun(PhotographCase.read(path), tmp_path / "out")
     assert list(harvesting.results()) == ["frame_1", "frame_2"]
     ((damaged, why),) = harvesting.prepared().skipped
     assert damaged == "frame_1a.tif"
@@ -153,11 +153,11 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
 def test_the_updated_formulation_agrees_with_the_total_one(
     photographs: Path, harvested: Path, tmp_path: Path
 ) -> None:
-    experiment = read_photograph_case(photographs / "experiment.toml")
+    experiment = PhotographCase.read(photographs / "experiment.toml")
     updated = experiment.model_copy(
         update={"correlation": replace(experiment.correlation, formulation="updated")}
     )
-    results = HarvestRun(updated, photographs, tmp_path).results()
+    results = HarvestRun(updated, tmp_path).results()
     first = Result.read(harvested / "results" / "frame_2.json")
     apart = (results["frame_2"].result.displacement() - first.displacement()) / PIXEL
     # It inherits what the frame before couldn't describe: w of 0.26 px rms there.

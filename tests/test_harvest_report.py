@@ -226,7 +226,7 @@ def test_the_summary_tells_the_measured_numbers(harvest: Harvest, summary: dict[
     at = made_up.wave()[3::6, 3::6][made_up.MASK[3::6, 3::6]] / made_up.GRID.pixel_size
     assert told["local"]["w_beyond_noise_px"] == pytest.approx(np.sqrt((at**2).mean()), rel=1e-2)
     held = summary["frames"][0]["modes"][0]
-    assert held["held"]
+    assert held["fixed"]
     assert held["waves"][0]["sd_noise"] is None
     assert summary["lattice"]["pitch_px"] == pytest.approx(40.0, abs=0.1)
     assert summary["buckling"]["before"] == 0.04

@@ -14,7 +14,7 @@ from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 
 PITCH, PIXEL = 1.9, 0.035
@@ -57,7 +57,7 @@ def harvesting(
         f'[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = "{request.param}"\n'
     )
     folder = tmp_path_factory.mktemp(request.param)
-    return HarvestRun(read_photograph_case(path), photographs, folder)
+    return HarvestRun(PhotographCase.read(path), folder)
 
 
 def test_buckling_is_bracketed_and_estimated(harvesting: HarvestRun) -> None:

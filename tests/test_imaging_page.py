@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from modeharvest.imaging.sensor import Sensor
-from modeharvest.runs.case import read_case
+from modeharvest.runs.case import Case
 
 PAGE = (Path(__file__).parents[1] / "docs" / "imaging.md").read_text("utf-8")
 
@@ -25,6 +25,6 @@ def test_the_printed_options_are_all_there_are(tmp_path: Path) -> None:
     (block,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     path = tmp_path / "case.toml"
     path.write_text(block, "utf-8")
-    sensor = read_case(path).imaging.sensor
+    sensor = Case.read(path).imaging.sensor
     assert sensor == Sensor(0.8, 0.5, 0.9, 0.02, 10_000.0, 0.004, 0.98)
     assert all(f"\n{name} = " in block for name in Sensor.__dataclass_fields__)

@@ -10,17 +10,18 @@ import pytest
 from modeharvest.fem.bloch.dispersion import ZONES
 from modeharvest.fem.lattice.options import equibiaxial, simple_shear, uniaxial, uniaxial_strain
 from modeharvest.fem.materials import Ogden, TwoTermI1
-from modeharvest.runs.case import lattice_cases, read_case
-from modeharvest.runs.lattice.case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.runs.lattice.options import (
+from modeharvest.runs.case import Case, shipped_cases
+from modeharvest.runs.lattice.case import (
     ChiralLattice,
     DispersionPlan,
     FileLattice,
     HexachiralLattice,
     HexagonalLattice,
+    LatticeCase,
     Loading,
     ModesPlan,
     SquareLattice,
+    StudyPlan,
 )
 from modeharvest.util.errors import InputError
 
@@ -34,23 +35,23 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_shipped_lattices_can_be_read() -> None:
-    assert tuple(sorted(lattice_cases())) == SHIPPED
+    assert tuple(sorted(shipped_cases("lattice"))) == SHIPPED
     for name in SHIPPED:
-        case = read_lattice_case(name)
+        case = LatticeCase.read(name)
         assert case.title
         assert LatticeCase.model_validate(case.plain()) == case
 
 
 def test_the_square_case_spells_out_the_defaults_of_its_tables() -> None:
     """So that the file is a complete list of options but for [study]."""
-    case = read_lattice_case("square-lattice")
+    case = LatticeCase.read("square-lattice")
     assert case == LatticeCase(
         title=case.title, lattice=SquareLattice(mesh_size=0.12), material=TwoTermI1()
     )
 
 
 def test_the_study_case_studies_what_the_paper_and_the_defaults_do() -> None:
-    case = read_lattice_case("mode-study")
+    case = LatticeCase.read("mode-study")
     plan, default = case.study, StudyPlan()
     assert plan is not None
     assert (plan.ratios, plan.loadings, plan.overlays) == (
@@ -84,13 +85,13 @@ def test_a_free_component_is_read_from_toml(tmp_path: Path) -> None:
     gradient = [[-1.0, 0.0], [0, "free"]]
     stress = [[0.0, 0.0], [0.0, -0.1]]
     """
-    macro = read_lattice_case(written(tmp_path, text)).loading.macro()
+    macro = LatticeCase.read(written(tmp_path, text)).loading.macro()
     assert macro.gradient == ((-1.0, 0.0), (0.0, None))
     assert macro.dead.tolist() == [0.0, 0.0, 0.0, -0.1]
 
 
 def test_a_file_s_path_is_relative_to_the_case(tmp_path: Path) -> None:
-    case = read_lattice_case(
+    case = LatticeCase.read(
         written(tmp_path, '[lattice]\nkind = "file"\npath = "cell.msh"\npitch = 2.0')
     )
     assert case.lattice == FileLattice(str(tmp_path / "cell.msh"), 2.0)
@@ -136,15 +137,15 @@ def test_the_tour_suits_the_lattice_and_its_load() -> None:
         ("[dispersion]\nloads = [-0.1]", "loads of 0 or more"),
         ("[modes]\nwaves = [[1]]", "in the lattice's plane"),
         ("[modes]\ncombinations = [[0, 0]]", "not all 0"),
-        ('[study]\nloadings = ["equi"]', "did you mean 'equibiaxial'?"),
-        ("[study]\nratio = [0.5]", "did you mean 'ratios'?"),
-        ("[study]\nratios = [1.5]", "0 < d/l < 1"),
+        ('[lattice]\n[study]\nloadings = ["equi"]', "did you mean 'equibiaxial'?"),
+        ("[lattice]\n[study]\nratio = [0.5]", "did you mean 'ratios'?"),
+        ("[lattice]\n[study]\nratios = [1.5]", "0 < d/l < 1"),
         ('[lattice]\nkind = "hexagonal"\n[study]', "expected a square lattice"),
     ],
 )
 def test_a_wrong_case_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
-        read_lattice_case(written(tmp_path, text))
+        LatticeCase.read(written(tmp_path, text))
     message = str(caught.value)
     assert said in message
     assert "\n" not in message
@@ -153,9 +154,9 @@ def test_a_wrong_case_is_told_in_one_line(tmp_path: Path, text: str, said: str) 
 
 def test_each_kind_of_case_says_what_to_run_for_the_other() -> None:
     with pytest.raises(InputError, match="run 'modeharvest modes square-lattice"):
-        read_case("square-lattice")
+        Case.read("square-lattice")
     with pytest.raises(InputError, match="run 'modeharvest run paper-virtual"):
-        read_lattice_case("paper-virtual")
+        LatticeCase.read("paper-virtual")
 
 
 def test_the_material_is_ogden_s_unless_named() -> None:

@@ -20,14 +20,15 @@ from modeharvest.fem.bloch.modes import read_modes
 from modeharvest.fem.materials import TwoTermI1
 from modeharvest.report.terminal import print_lattice
 from modeharvest.runs import run
-from modeharvest.runs.lattice.case import LatticeCase, StudyPlan, read_lattice_case
-from modeharvest.runs.lattice.options import (
+from modeharvest.runs.lattice.case import (
     DispersionPlan,
     HexagonalLattice,
+    LatticeCase,
     Loading,
     ModesPlan,
     Search,
     SquareLattice,
+    StudyPlan,
 )
 from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 from modeharvest.util.files import read_json
@@ -197,7 +198,7 @@ def test_an_interrupted_analysis_continues_to_the_same_end(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        LatticeAnalysis(read_lattice_case(case), folder, interrupt, str(case)).all()
+        LatticeAnalysis(LatticeCase.read(case), folder, interrupt, str(case)).all()
     assert not list(folder.glob("*.part*"))
     assert set(read_json(folder / "stages.json")) == set(order[:first])
     ours, theirs = run(case, folder), read_json(finished / "summary.json")

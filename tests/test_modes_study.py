@@ -19,7 +19,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import square_family
 from modeharvest.report.study_modes import modes_findings, report_modes
 from modeharvest.runs.case import shipped_solution
-from modeharvest.runs.study import StudyCase, read_study
+from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies import modes as modes_specimen
@@ -251,7 +251,7 @@ def test_a_specimen_is_compressed_to_the_pattern_asked_for() -> None:
 
 
 def test_the_shipped_study_spells_out_the_defaults() -> None:
-    assert read_study("modes").study == MeasuredModesStudy()
+    assert StudyCase.read("modes").study == MeasuredModesStudy()
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.runs import run
-from modeharvest.runs.case import Case, read_case
+from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
@@ -161,7 +161,7 @@ def test_an_interrupted_run_continues_to_the_same_end(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Run(read_case(case), folder, interrupt).all()
+        Run(Case.read(case), folder, interrupt).all()
     assert not (folder / "summary.json").exists()
     assert not list(folder.rglob("*.part*"))
     assert run(case, folder) == read_json(finished / "summary.json")
@@ -211,10 +211,10 @@ def test_results_and_images_of_another_case_are_not_taken(case: Path, folder: Pa
     text = case.read_text("utf-8")
     other.write_text(text + "[correlation]\nstart_amplitude = 2.0\n", "utf-8")
     with pytest.raises(InputError, match="results of this case"):
-        Run(read_case(other), folder).validate()
+        Run(Case.read(other), folder).validate()
     other.write_text(text.replace("seed = 3", "seed = 4"), "utf-8")
     with pytest.raises(InputError, match="images made with this case's options"):
-        Run(read_case(other), folder).correlate()
+        Run(Case.read(other), folder).correlate()
 
 
 def test_a_stage_that_fails_leaves_no_older_result(case: Path, folder: Path) -> None:
@@ -222,12 +222,12 @@ def test_a_stage_that_fails_leaves_no_older_result(case: Path, folder: Path) -> 
     other = case.with_name("other_order.toml")
     other.write_text(case.read_text("utf-8") + "[correlation]\norder = 3\n", "utf-8")
     with pytest.raises(InputError, match="deformed_1500"):
-        Run(read_case(other), folder).correlate()
+        Run(Case.read(other), folder).correlate()
     assert not (folder / "correlation" / "result_1500.json").exists()
 
 
 def changed_experiment(case: Path, **options: Any) -> Case:
-    read = read_case(case)
+    read = Case.read(case)
     return read.model_copy(update={"experiment": replace(read.experiment, **options)})
 
 
@@ -308,7 +308,7 @@ def test_a_full_disk_leaves_nothing_that_looks_finished(case: Path, tmp_path: Pa
         "import resource, signal, sys\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
-        "from modeharvest.cli import main\n"
+        "from modeharvest.cli.root import main\n"
         f"sys.argv = ['modeharvest', 'run', {str(case)!r}, '--out', {str(tmp_path / 'out')!r}]\n"
         "main()\n"
     )

@@ -17,7 +17,9 @@ from modeharvest.util.errors import MissingDependencyError
 NUMBERS = {"numpy", "scipy", "h5py", "numba", "pydantic"}
 DRAWING = {"matplotlib", "jinja2", "typer"}  # rich comes with meshio
 EXPERIMENTS = ("Experiment", "Ogden", "Specimen")
-MEASURED = ("Ansatz", "ImagingSpec", "Result", "Solution", "correlate", "make_images")
+MEASURED = (
+    "Ansatz", "ImagePair", "ImagingSpec", "Result", "Solution", "correlate", "make_images", "run",
+)  # fmt: skip
 
 
 def loaded_by(*names: str) -> set[str]:

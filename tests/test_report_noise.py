@@ -10,7 +10,7 @@ import pytest
 import synthetic_report as made_up
 
 from modeharvest.report import experiment as words
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.experiment import Run
 from modeharvest.util.files import read_json
 
@@ -30,7 +30,7 @@ def finished(folder: Path, correlation: str) -> Run:
     """A run of the shipped solution, correlated."""
     path = folder / "case.toml"
     path.write_text(f"{CASE}\n[correlation]\n{correlation}\n", "utf-8")
-    run = Run(read_case(path), folder / "out", solution=shipped_solution("paper-virtual"))
+    run = Run(Case.read(path), folder / "out", solution=shipped_solution("paper-virtual"))
     run.image()
     run.correlate()
     return run

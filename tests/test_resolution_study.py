@@ -18,7 +18,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.report import study_resolution as told
-from modeharvest.runs.study import StudyCase, read_study
+from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.validation.resolution.buckled import (
     LARGEST,
@@ -237,7 +237,7 @@ def test_studies_that_can_t_be_asked(options: dict[str, Any], message: str) -> N
 
 
 def test_the_shipped_study_spells_out_the_defaults() -> None:
-    case = read_study("resolution")
+    case = StudyCase.read("resolution")
     assert case.study == ResolutionStudy()
     assert case.imaging.pixel_size == 0.02
     quick = case.quick()

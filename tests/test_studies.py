@@ -21,8 +21,8 @@ from modeharvest.fem.field import Solution
 from modeharvest.report import study_robustness as told
 from modeharvest.report.study_noise import report_noise
 from modeharvest.report.study_systematic import report_systematic
-from modeharvest.runs.case import shipped_solution
-from modeharvest.runs.study import StudyAnalysis, StudyCase, read_study, shipped_studies
+from modeharvest.runs.case import shipped_cases, shipped_solution
+from modeharvest.runs.study import StudyAnalysis, StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.stages import source_digest
@@ -296,16 +296,16 @@ def test_every_factor_has_levels_that_can_be_set() -> None:
 
 @pytest.mark.parametrize("name", ["robustness", "noise", "systematic"])
 def test_shipped_studies_spell_out_the_defaults(name: str) -> None:
-    case = read_study(name)
+    case = StudyCase.read(name)
     assert case.kind == name
     assert case.study == type(case.study)()
-    assert case == StudyCase(title=shipped_studies()[name], study=case.study)
+    assert case == StudyCase(title=shipped_cases("study")[name], study=case.study)
     assert len(json.dumps(case.plain())) > 100
 
 
 def test_a_quick_study_is_smaller() -> None:
-    for name in shipped_studies():
-        case = read_study(name)
+    for name in shipped_cases("study"):
+        case = StudyCase.read(name)
         assert case.quick().imaging.pixel_size == 2.0 * case.imaging.pixel_size
     assert RobustnessStudy().quick().starts == 20
     assert NoiseStudy().quick().pairs == 5
@@ -340,7 +340,7 @@ def test_a_wrong_study_is_told_in_one_line(tmp_path: Path, text: str, said: str)
     path = tmp_path / "study.toml"
     path.write_text(text, "utf-8")
     with pytest.raises(InputError) as caught:
-        read_study(path)
+        StudyCase.read(path)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 

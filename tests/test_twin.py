@@ -18,14 +18,14 @@ from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
-from modeharvest.runs.case import Case, TwinCase, read_case, shipped_solution
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.case import Case, shipped_solution
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.twin import Twin, make_twin
 from modeharvest.util.errors import InputError
 
 LENS = CameraDistortion(200.0, 200.0, 60.0, 55.0, k1=-0.1, p1=0.005)
 STRAINS = (0.082, 0.127)
-CASE = TwinCase(
+CASE = Case(
     experiment=Experiment(strains=STRAINS),
     imaging=ImagingSpec(
         pixel_size=0.05,
@@ -60,7 +60,7 @@ def test_a_user_has_photographs_and_what_a_user_knows(twin: Twin) -> None:
     names |= {"deformed_0820.tif", "deformed_1270.tif"}
     names |= {f"calibration_{k:02d}.tif" for k in range(3)}
     assert {path.name for path in folder.iterdir()} == names
-    found = read_photograph_case(twin.experiment)
+    found = PhotographCase.read(twin.experiment)
     assert found.scale.pixel_size == CASE.imaging.pixel_size
     assert found.specimen.cell_size == CASE.experiment.specimen.pitch
     assert found.images.deformed == ("deformed_0820.tif", "deformed_1270.tif")
@@ -123,9 +123,8 @@ def test_without_a_lens_there_is_nothing_to_calibrate(tmp_path: Path) -> None:
 # The shipped twin ------------------------------------------------------------------------------
 
 
-def shipped() -> tuple[TwinCase, Solution]:
-    case, path = read_case("paper-real-twin"), shipped_solution("paper-real-twin")
-    assert isinstance(case, TwinCase)
+def shipped() -> tuple[Case, Solution]:
+    case, path = Case.read("paper-real-twin"), shipped_solution("paper-real-twin")
     assert path is not None
     assert path.stat().st_size < 5e6
     return case, Solution.read(path)
@@ -134,8 +133,8 @@ def shipped() -> tuple[TwinCase, Solution]:
 def test_shipped_twin_is_the_papers_specimen_before_and_after_buckling() -> None:
     case, found = shipped()
     experiment = case.experiment
-    assert not isinstance(read_case("paper-virtual"), TwinCase)
-    assert type(read_case("paper-virtual")) is Case
+    assert case.calibration is not None
+    assert Case.read("paper-virtual").calibration is None
     assert found.info["outcome"] == "complete"
     assert not found.info["warnings"]
     assert [s.negative_pivots for s in found.snapshots] == [0, 0]  # stable, so on the branch

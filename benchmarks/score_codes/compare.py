@@ -30,7 +30,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.report.terminal import print_grading
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.errors import InputError, MissingDependencyError
 
 HERE = Path(__file__).resolve().parent
@@ -127,7 +127,7 @@ CODES: dict[str, Callable[[Task, Path, str], None]] = {
 
 def main() -> None:
     arguments = _arguments()
-    case = read_case("paper-virtual")
+    case = Case.read("paper-virtual")
     case = case.model_copy(
         update={"imaging": replace(case.imaging, pixel_size=arguments.pixel_size)}
     )

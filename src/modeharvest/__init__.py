@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.idic.correlate import correlate
     from modeharvest.idic.result import Result
     from modeharvest.imaging.imageset import make_images
+    from modeharvest.imaging.pair import ImagePair
     from modeharvest.imaging.spec import ImagingSpec
     from modeharvest.runs import run
     from modeharvest.runs.benchmark import score
@@ -36,6 +37,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
 __all__ = [
     "Ansatz",
     "Experiment",
+    "ImagePair",
     "ImagingSpec",
     "Ogden",
     "Result",
@@ -53,6 +55,7 @@ __all__ = [
 _HOMES = {
     "Ansatz": "idic.ansatz",
     "Experiment": "fem.experiment",
+    "ImagePair": "imaging.pair",
     "ImagingSpec": "imaging.spec",
     "Ogden": "fem.materials",
     "Result": "idic.result",

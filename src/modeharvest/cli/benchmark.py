@@ -34,9 +34,9 @@ def make(
     The public folder holds reference.tif, deformed_*.tif, mask.tif, benchmark.json and README.md,
     and nothing that gives the displacements away.
     """
-    from modeharvest.runs.case import read_case
+    from modeharvest.runs.case import Case
 
-    checked = read_case(case)
+    checked = Case.read(case)
     from modeharvest.runs.benchmark import make_benchmark, truth_folder
 
     with bars() as progress:

@@ -16,7 +16,6 @@ from modeharvest.cli.messages import CaseName, OutFolder, SolutionFile, bars, fo
 from modeharvest.util.errors import InputError
 
 if TYPE_CHECKING:
-    from modeharvest.runs.case import TwinCase
     from modeharvest.runs.experiment import Run
     from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
@@ -28,15 +27,15 @@ def cases(
 
     For example: modeharvest cases paper-virtual > mine.toml
     """
-    from modeharvest.runs.case import case_text, lattice_cases, shipped_cases
+    from modeharvest.runs.case import case_text, shipped_cases
 
     if name is not None:
         print(case_text(name), end="")
         return
-    lattices = lattice_cases()
-    for shipped, title in shipped_cases().items():
-        commands = "bloch, modes" if shipped in lattices else "run"
-        print(f"{shipped:18}{commands:14}{title}")
+    commands = {"experiment": "run", "lattice": "bloch, modes", "images": "harvest"}
+    for kind, command in {**commands, "study": "study"}.items():
+        for shipped, title in shipped_cases(kind).items():
+            print(f"{shipped:18}{command:14}{title}")
 
 
 def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
@@ -46,12 +45,16 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     same command again after an interruption: finished stages are not repeated. The twin of a real
     experiment is photographed, harvested from its photographs alone, and set against its truth.
     """
-    from modeharvest.report.terminal import print_experiment
-    from modeharvest.runs.case import TwinCase, read_case
+    from modeharvest.report.terminal import print_experiment, print_harvest
+    from modeharvest.runs.case import Case
 
-    checked = read_case(case)
-    if isinstance(checked, TwinCase):
-        _run_twin(checked, out, solution)
+    checked = Case.read(case)  # before the heavy imports, so that a typo is reported at once
+    if checked.calibration is not None:
+        from modeharvest.runs.twin import TwinRun
+
+        with bars() as progress:
+            summary = TwinRun(checked, out, progress, solution).all()
+        print_harvest(summary, out / "harvest")
         return
     with _stages(case, out, solution) as stages:
         summary = stages.all()
@@ -111,23 +114,13 @@ def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> N
 @contextmanager
 def _stages(case: str, out: Path, solution: Path | None = None) -> Iterator[Run]:
     """The stages of a case, under progress bars."""
-    from modeharvest.runs.case import read_case
+    from modeharvest.runs.case import Case
 
-    checked = read_case(case)  # before the heavy imports, so that a typo is told at once
+    checked = Case.read(case)
     from modeharvest.runs.experiment import Run
 
     with bars() as progress:
         yield Run(checked, out, progress, solution)
-
-
-def _run_twin(case: TwinCase, out: Path, solution: Path | None) -> None:
-    """Make a twin's photographs, harvest them, and compare with the truth."""
-    from modeharvest.report.terminal import print_harvest
-    from modeharvest.runs.twin import TwinRun
-
-    with bars() as progress:
-        summary = TwinRun(case, out, progress, solution).all()
-    print_harvest(summary, out / "harvest")
 
 
 def bloch(case: CaseName, out: OutFolder) -> None:
@@ -159,9 +152,9 @@ def modes(case: CaseName, out: OutFolder) -> None:
 @contextmanager
 def _analysis(case: str, out: Path) -> Iterator[LatticeAnalysis]:
     """The analysis of a lattice's case, under progress bars."""
-    from modeharvest.runs.lattice.case import read_lattice_case
+    from modeharvest.runs.lattice.case import LatticeCase
 
-    checked = read_lattice_case(case)  # before the heavy imports, so that a typo is told at once
+    checked = LatticeCase.read(case)
     from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
     with bars() as progress:
@@ -170,9 +163,9 @@ def _analysis(case: str, out: Path) -> Iterator[LatticeAnalysis]:
 
 def _example(wanted: bool) -> None:
     if wanted:
-        from modeharvest.runs.photographs.case import EXAMPLE
+        from modeharvest.runs.case import case_text
 
-        print(EXAMPLE, end="")
+        print(case_text("photographs"), end="")
         raise typer.Exit
 
 

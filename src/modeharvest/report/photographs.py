@@ -105,7 +105,7 @@ def _mode_keys(frame: Frame) -> list[dict[str, str]]:
     if mode["v_max_sd_model_error_mm"] is not None:
         errors.append(f"± {_micro(mode['v_max_sd_model_error_mm'])} by what is left over")
     count = len(mode["waves"])
-    sd = "held fixed" if mode["held"] else f"± {_digits(max(_wave_sd(wave)), 1)}"
+    sd = "fixed" if mode["fixed"] else f"± {_digits(max(_wave_sd(wave)), 1)}"
     return [
         _key("pattern", _digits(mode["largest_px"], 3), "px", f"largest v₁φ₁ {at}"),
         _key("largest v₁", _micro(mode["v_max_mm"], 4), "µm", ", ".join(errors)),
@@ -205,14 +205,14 @@ def mode_tables(frames: Sequence[Frame]) -> list[dict[str, Any]]:
     tables = []
     for i in range(max((len(frame["modes"]) for frame in frames), default=0)):
         of = [frame for frame in frames if i < len(frame["modes"])]
-        free = [frame for frame in of if not frame["modes"][i]["held"]]
+        free = [frame for frame in of if not frame["modes"][i]["fixed"]]
         found = [{p["name"]: p for p in frame["modes"][i]["parameters"]} for frame in free]
         units = {name: p["unit"] for column in found for name, p in column.items()}
         tables.append({
             "number": i + 1,
             "families": list(dict.fromkeys(frame["modes"][i]["family"] for frame in free)),
             "frames": free,
-            "held": [frame for frame in of if frame["modes"][i]["held"]],
+            "fixed": [frame for frame in of if frame["modes"][i]["fixed"]],
             "rows": [{"name": name, "unit": unit, "cells": [c.get(name) for c in found]}
                      for name, unit in units.items()],
         })  # fmt: skip
@@ -228,7 +228,7 @@ def wave_rows(frames: Sequence[Frame]) -> list[dict[str, Any]]:
                 noise, left = wave["sd_noise"] or [None] * 2, wave["sd_model_error"] or [None] * 2
                 rows.append({
                     "frame": frame, "mode": i, "wave": w, "first": i == w == 1,
-                    "held": mode["held"], "observable": mode["observable"],
+                    "fixed": mode["fixed"], "observable": mode["observable"],
                     "cells": list(zip(wave["xi"], noise, left, strict=True)),
                 })  # fmt: skip
     return rows

@@ -317,7 +317,7 @@ def _pattern(frame: dict[str, Any], i: int) -> str:
     if not mode:
         return "no mode"
     seen = "seen" if mode["observable"] else "not seen"
-    return f"{seen}, held" if mode["held"] else seen
+    return f"{seen}, fixed" if mode["fixed"] else seen
 
 
 def _largest(frame: dict[str, Any], i: int) -> str:

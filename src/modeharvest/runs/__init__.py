@@ -12,20 +12,19 @@ from typing import TYPE_CHECKING, Any
 from modeharvest.util.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from modeharvest.runs.case import Case
-    from modeharvest.runs.lattice.case import LatticeCase
+    from modeharvest.runs.case import CaseModel
 
 
 def run(
-    case: str | Path | Case | LatticeCase, folder: Path | str, progress: Progress = silent
+    case: str | Path | CaseModel, folder: Path | str, progress: Progress = silent
 ) -> dict[str, Any]:
     """Run a case of any kind, from its options to its report; what is finished is not done again.
 
     Parameters
     ----------
     case
-        A shipped case's or study's name, the path of a TOML file, or the case itself: a virtual
-        experiment, the twin of a real one, an infinite lattice, or a study.
+        A shipped case's name, the path of a TOML file, or the case itself: a virtual experiment,
+        the twin of a real one, an infinite lattice, a study, or photographs of a test.
     folder
         Where to leave the files.
     progress
@@ -36,28 +35,29 @@ def run(
     dict
         The content of ``summary.json``.
     """
-    from modeharvest.runs.case import Case, TwinCase, read_case, read_tables
-    from modeharvest.runs.lattice.case import LatticeCase, read_lattice_case
-    from modeharvest.runs.study import StudyAnalysis, StudyCase, read_study, shipped_studies
+    from modeharvest.runs.case import Case, CaseModel, read_tables, table_of_kind
 
-    folder, source = Path(folder), "CASE"
-    if not isinstance(case, (Case, LatticeCase)):
-        source, study = str(case), str(case) in shipped_studies()
-        tables = {"study": {}} if study else read_tables(case)
-        if "lattice" in tables:
-            case = read_lattice_case(case)
-        else:
-            case = read_study(case) if "study" in tables else read_case(case)
-    if isinstance(case, LatticeCase):
+    known = isinstance(case, CaseModel)
+    kind = case.table if isinstance(case, CaseModel) else table_of_kind(read_tables(case))
+    source, folder = "CASE" if known else str(case), Path(folder)
+    if kind == "lattice":
+        from modeharvest.runs.lattice.case import LatticeCase
         from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
-        return LatticeAnalysis(case, folder, progress, source).all()
-    if isinstance(case, StudyCase):
-        return StudyAnalysis(case, folder, progress=progress).all()
-    if isinstance(case, TwinCase):
+        return LatticeAnalysis(LatticeCase.of(case), folder, progress, source).all()
+    if kind == "study":
+        from modeharvest.runs.study import StudyAnalysis, StudyCase
+
+        return StudyAnalysis(StudyCase.of(case), folder, progress).all()
+    if kind == "images":
+        from modeharvest.runs.photographs.pipeline import harvest
+
+        return harvest(case, folder, progress)
+    experiment = Case.of(case)
+    if experiment.calibration is not None:
         from modeharvest.runs.twin import TwinRun
 
-        return TwinRun(case, folder, progress).all()
+        return TwinRun(experiment, folder, progress).all()
     from modeharvest.runs.experiment import Run
 
-    return Run(case, folder, progress).all()
+    return Run(experiment, folder, progress).all()

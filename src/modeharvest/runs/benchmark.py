@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.tables import ALL_ROLES
 from modeharvest.report.grades import write_grading, write_star_grading
-from modeharvest.runs.case import Case, read_case
+from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import copy_whole, require_writable
@@ -162,7 +162,7 @@ def make_benchmark(
         If the case's images are distorted, the truth would be in the public folder, the solution
         is of another case, or another process works in one of the folders.
     """
-    case, public = case if isinstance(case, Case) else read_case(case), Path(public)
+    case, public = Case.of(case), Path(public)
     require_no_lens(case.imaging)
     truth = truth_folder(public) if truth is None else Path(truth)
     require_apart(public, truth)

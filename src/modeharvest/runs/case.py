@@ -1,7 +1,7 @@
-"""A virtual experiment as a case: a TOML file turned into checked objects, faults told in one line.
+"""Cases: a TOML file turned into checked objects, faults told in one line.
 
 A case is a pydantic model whose fields are the project's frozen dataclasses, so a case file,
-``--help`` and the Python objects use the same names and units::
+``--help`` and the Python objects use the same names and units. A virtual experiment::
 
     title = "..."
     [experiment]              # fem.experiment.Experiment
@@ -11,9 +11,9 @@ A case is a pydantic model whose fields are the project's frozen dataclasses, so
     [imaging]                 # imaging.spec.ImagingSpec
     [imaging.speckle]         # imaging.speckle.SpeckleSpec
     [imaging.distortion]      # imaging.distortion.CameraDistortion
-    [correlation]             # idic.setup.Identification
+    [correlation]             # idic.setup.SquareLatticeOptions
 
-A table ``[calibration]`` (imaging.calibration_target.CalibrationTarget) makes it the twin of a
+A table ``[calibration]`` (imaging.distortion.target.CalibrationTarget) makes it the twin of a
 real experiment: photographs through a lens that has to be calibrated first, to be harvested.
 What all kinds of cases share is here too; infinite lattices, photographs and studies have modules
 of their own.
@@ -26,9 +26,9 @@ from collections.abc import Mapping
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, ValidationError, field_validator
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.materials import MATERIALS
@@ -38,25 +38,72 @@ from modeharvest.imaging.distortion.target import CalibrationTarget
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
-from modeharvest.util.typed import CHECKS, made, nearest, plain, require_types, sentence
+from modeharvest.util.typed import CHECKS, made, nearest, require_types, sentence, to_plain
 
 _SHIPPED = resources.files("modeharvest") / "cases"
+_KINDS = {
+    "lattice": ("an infinite lattice", "modeharvest modes {} --out DIR', or 'modeharvest bloch {}"),
+    "study": ("a study", "modeharvest study {}"),
+    "images": ("photographs of a test", "modeharvest harvest {}"),
+    "experiment": ("a virtual experiment", "modeharvest run {}"),
+}
+"""By the table that only such a case has, looked for in this order: what it is, who runs it."""
 
 
 class CaseModel(BaseModel):
     """What all kinds of cases have in common: no unknown keys, unchangeable, a title."""
 
     model_config = CHECKS
+    table: ClassVar[str]
+    """The table by which such a case is known, see ``_KINDS``."""
 
     title: str = ""
+
+    @classmethod
+    def read(cls, name: str | Path) -> Self:
+        """Read a case by the name of a shipped one or by the path of a TOML file.
+
+        Raises
+        ------
+        InputError
+            If there is no such case, it is of another kind, it is not TOML, a key is unknown (the
+            nearest known one is suggested) or a value is out of its range.
+        """
+        tables = read_tables(name)
+        got = table_of_kind(tables)
+        if got not in ("", cls.table):
+            (wanted, _), (found, command) = _KINDS[cls.table], _KINDS[got]
+            raise InputError(
+                f"{name}: expected {wanted}, got {found}; run '{command} --out DIR'".replace(
+                    "{}", str(name)
+                )
+            )
+        return checked(cls, tables, name)
+
+    @classmethod
+    def of(cls, case: CaseModel | str | Path) -> Self:
+        """The case itself, or the one of that name; InputError if it is of another kind."""
+        if isinstance(case, CaseModel) and not isinstance(case, cls):
+            raise InputError(f"expected {_KINDS[cls.table][0]}, got {_KINDS[case.table][0]}")
+        return case if isinstance(case, cls) else cls.read(str(case))
+
+    def plain(self) -> dict[str, Any]:
+        """The case as plain JSON values."""
+        return {name: to_plain(getattr(self, name)) for name in type(self).model_fields}
 
 
 CaseType = TypeVar("CaseType", bound=CaseModel)
 
 
-def shipped_cases() -> dict[str, str]:
-    """Names and titles of the cases that come with the package."""
-    return {name: str(tables["title"]) for name, tables in _shipped_tables().items()}
+def table_of_kind(tables: Mapping[str, Any]) -> str:
+    """The table that tells a case's kind: "lattice", "study", "images", "experiment" or ""."""
+    return next((name for name in _KINDS if name in tables), "")
+
+
+def shipped_cases(kind: str = "") -> dict[str, str]:
+    """Names and titles of the cases that come with the package: all, or those with a table."""
+    found = {name: tomllib.loads(path.read_text("utf-8")) for name, path in _shipped().items()}
+    return {n: str(t["title"]) for n, t in found.items() if kind in ("", table_of_kind(t))}
 
 
 def case_text(name: str) -> str:
@@ -67,9 +114,10 @@ def case_text(name: str) -> str:
     InputError
         If no case of that name is shipped; the nearest name is suggested.
     """
-    if name not in shipped_cases():
-        raise InputError(f"unknown case {name!r}{nearest(name, list(shipped_cases()))}")
-    return (_SHIPPED / f"{name}.toml").read_text("utf-8")
+    known = _shipped()
+    if name not in known:
+        raise InputError(f"unknown case {name!r}{nearest(name, list(known))}")
+    return known[name].read_text("utf-8")
 
 
 def shipped_solution(name: str) -> Path | None:
@@ -78,19 +126,10 @@ def shipped_solution(name: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def is_lattice(tables: Mapping[str, Any]) -> bool:
-    """Whether tables describe an infinite lattice rather than a virtual experiment."""
-    return "lattice" in tables
-
-
-def lattice_cases() -> list[str]:
-    """Names of the shipped cases that are infinite lattices."""
-    return [name for name, tables in _shipped_tables().items() if is_lattice(tables)]
-
-
-def _shipped_tables() -> dict[str, dict[str, Any]]:
-    paths = sorted(Path(str(p)) for p in _SHIPPED.iterdir() if p.name.endswith(".toml"))
-    return {path.stem: tomllib.loads(path.read_text("utf-8")) for path in paths}
+def _shipped() -> dict[str, Path]:
+    """The files of shipped cases by their names, studies last."""
+    folder = Path(str(_SHIPPED))
+    return {p.stem: p for where in ("", "studies") for p in sorted((folder / where).glob("*.toml"))}
 
 
 def read_tables(name: str | Path) -> dict[str, Any]:
@@ -141,93 +180,66 @@ def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) 
     return case
 
 
-def of_kind(table: Mapping[str, Any], kinds: Mapping[str, type[Any]], where: str) -> Any:
-    """The dataclass that a table's ``kind`` names (by default the first), made of its other keys.
+def of_kind(kinds: Mapping[str, type[Any]], where: str, key: str = "") -> BeforeValidator:
+    """Turn a table, or its own table ``key``, into the dataclass that its ``kind`` names.
 
-    Raises
-    ------
-    InputError
-        If there is no such kind, a key is unknown, or a value out of its range.
+    The first of ``kinds`` without one. An InputError names an unknown kind or key by ``where``.
     """
-    constants = dict(table)
-    kind = constants.pop("kind", next(iter(kinds)))
-    if not isinstance(kind, str) or kind not in kinds:
-        raise InputError(f"expected a {where} kind among {list(kinds)}, got {kind!r}")
-    known = [f.name for f in fields(kinds[kind])]
-    for name in constants:
-        if name not in known:
-            raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
-    return made(kinds[kind], constants)
+
+    def choose(table: Any) -> Any:
+        if not isinstance(table, Mapping):
+            return table
+        if key:
+            return {**table, key: choose_kind(table[key])} if key in table else table
+        return choose_kind(table)
+
+    def choose_kind(table: Any) -> Any:
+        if not isinstance(table, Mapping):
+            return table
+        constants = dict(table)
+        kind = constants.pop("kind", next(iter(kinds)))
+        if not isinstance(kind, str) or kind not in kinds:
+            raise InputError(f"expected a {where} kind among {list(kinds)}, got {kind!r}")
+        known = [f.name for f in fields(kinds[kind])]
+        for name in constants:
+            if name not in known:
+                raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
+        return made(kinds[kind], constants)
+
+    return BeforeValidator(choose)
 
 
-def kind_of(thing: object, kinds: Mapping[str, type[Any]]) -> dict[str, Any]:
+def with_kind(thing: object, kinds: Mapping[str, type[Any]]) -> dict[str, Any]:
     """The table of which ``of_kind`` makes this thing again."""
     names = {cls: kind for kind, cls in kinds.items()}
-    return {"kind": names.get(type(thing), type(thing).__name__), **plain(thing)}
-
-
-_LENSES = {"camera": CameraDistortion}
+    return {"kind": names.get(type(thing), type(thing).__name__), **to_plain(thing)}
 
 
 class Case(CaseModel):
-    """A virtual experiment: what is simulated, how it is imaged, how it is correlated."""
+    """A virtual experiment: what is simulated, how it is imaged, how it is correlated.
 
-    experiment: Experiment = Experiment()
-    imaging: ImagingSpec = ImagingSpec()
+    With a ``calibration`` it is the twin of a real experiment: photographs of it, and of a target.
+    """
+
+    table = "experiment"
+
+    experiment: Annotated[Experiment, of_kind(MATERIALS, "experiment.material", "material")] = (
+        Experiment()
+    )
+    imaging: Annotated[
+        ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
+    ] = ImagingSpec()
     correlation: SquareLatticeOptions = SquareLatticeOptions()
-
-    @field_validator("experiment", mode="before")
-    @classmethod
-    def _with_material(cls, table: Any) -> Any:
-        if not isinstance(table, dict) or not isinstance(table.get("material"), dict):
-            return table
-        return {**table, "material": of_kind(table["material"], MATERIALS, "experiment.material")}
-
-    @field_validator("imaging", mode="before")
-    @classmethod
-    def _with_lens(cls, table: Any) -> Any:
-        if not isinstance(table, dict) or not isinstance(table.get("distortion"), dict):
-            return table
-        lens = of_kind(table["distortion"], _LENSES, "imaging.distortion")
-        return {**table, "distortion": lens}
+    calibration: CalibrationTarget | None = None
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, materials by their kind."""
-        content = {name: plain(getattr(self, name)) for name in type(self).model_fields}
-        content["experiment"]["material"] = kind_of(self.experiment.material, MATERIALS)
+        content = super().plain()
+        content["experiment"]["material"] = with_kind(self.experiment.material, MATERIALS)
         content["experiment"]["specimen"] = self.experiment.specimen.plain()
         for name in ("tilt", "guided"):  # as before there were any: what is finished stays so
             if not content["experiment"][name]:
                 del content["experiment"][name]
+        if self.calibration is None:
+            del content["calibration"]
         return content
-
-
-class TwinCase(Case):
-    """The twin of a real experiment: its specimen, its photographs, those of the calibration."""
-
-    calibration: CalibrationTarget = CalibrationTarget()
-
-
-def is_twin(tables: Mapping[str, Any]) -> bool:
-    """Whether tables describe the twin of a real experiment."""
-    return "calibration" in tables
-
-
-def read_case(name: str | Path) -> Case:
-    """Read a case by the name of a shipped one or by the path of a TOML file.
-
-    The twin of a real experiment is a :class:`TwinCase`.
-
-    Raises
-    ------
-    InputError
-        If there is no such case, it is an infinite lattice, it is not TOML, a key is unknown (the
-        nearest known one is suggested) or a value is out of its range.
-    """
-    tables = read_tables(name)
-    if is_lattice(tables):
-        raise InputError(
-            f"{name}: expected a virtual experiment, got an infinite lattice; run 'modeharvest "
-            f"modes {name} --out DIR', or 'modeharvest bloch {name} --out DIR' for its stability"
-        )
-    return checked(TwinCase if is_twin(tables) else Case, tables, name)

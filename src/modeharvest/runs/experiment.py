@@ -21,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
@@ -29,129 +29,37 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
-from modeharvest.report.experiment import draw, write_experiment_report
-from modeharvest.report.figures.experiment import ExperimentReportData
-from modeharvest.runs.case import Case, read_case, shipped_cases, shipped_solution
+from modeharvest.runs.case import Case, shipped_cases, shipped_solution
 from modeharvest.runs.precompile import precompiling
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.machine import on_first
-from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import Stages, exclusive, stage_key
+from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.validation.summary import (
     MeasuredExperiment,
-    T,
     compare_snapshot,
     displacement_spectrum,
     experiment_summary,
     snapshot_summary,
 )
 
-
-def validate(
-    measured: MeasuredExperiment,
-    case: Mapping[str, Any],
-    folder: Path,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Compare the results of an image set with its truth and write the summary and the report.
-
-    Parameters
-    ----------
-    measured
-        What is to be judged.
-    case
-        What was run, as plain values, for the record; its ``title`` heads the report.
-    folder
-        Where ``summary.json`` and ``report.html`` go.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
-    """
-    strains = sorted(measured.results)
-    results = [measured.results[strain] for strain in strains]
-    # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
-    with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
-        comparisons = _Awaited([threads.submit(compare_snapshot, measured, e) for e in strains])
-        spectra = _Awaited(
-            [
-                threads.submit(displacement_spectrum, comparisons, k, measured)
-                for k in range(len(strains))
-            ]
-        )
-        snapshots = _Awaited(
-            [
-                threads.submit(snapshot_summary, comparisons, spectra, k, measured)
-                for k in range(len(strains))
-            ]
-        )
-        atlas = ExperimentReportData(
-            measured.solution, measured.images, strains, results, comparisons, spectra,
-            measured.specimen.pitch,
-        )  # fmt: skip
-        drawings = draw(atlas, progress)
-        summary = experiment_summary(measured, case, list(snapshots))
-    write_experiment_report(folder / "report.html", case, drawings, summary)
-    write_json(folder / "summary.json", summary)
-    return summary
-
-
-@contextmanager
-def _brief_turns() -> Iterator[None]:
-    """Let no thread keep the GIL for long: by default each of many short kernels waits 5 ms."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-
-
-class _Awaited(Sequence[T]):
-    """Results of threads that may still be at work, waited for where they are used."""
-
-    def __init__(self, coming: Sequence[Future[T]]) -> None:
-        self._coming = coming
-
-    def __len__(self) -> int:
-        return len(self._coming)
-
-    def __getitem__(self, k: Any) -> Any:
-        return self._coming[k].result()
-
-
 _COMPLETE = "complete"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Run:
-    """A case, the folder it leaves its files in, and who listens to its progress.
+class Run(StagedRun[Case]):
+    """The stages of a virtual experiment.
 
     Parameters
     ----------
-    case
-        What to do.
-    folder
-        Where; made if it does not exist.
-    progress
-        Listener.
+    case, folder, progress
+        As of every run.
     solution
         A solution file to use instead of simulating.
     """
 
-    case: Case
-    folder: Path
-    progress: Progress = silent
     solution: Path | None = None
-
-    @property
-    def stages(self) -> Stages:
-        """What is finished in the folder."""
-        return Stages(self.folder)
 
     def fem(self) -> Solution:
         """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
@@ -176,8 +84,7 @@ class Run:
             return path, vtu
 
         key = stage_key(self.case.plain()["experiment"], "fem")
-        self.stages.do("fem", key, work, collective=True)
-        return Solution.read(path)
+        return self.do("fem", key, work, lambda: Solution.read(path), collective=True)
 
     def solved(self) -> Solution:
         """The solution that was given, or else a simulated one.
@@ -200,11 +107,12 @@ class Run:
         """
         solution, folder = self._solution(), self.folder / "images"
         strains, spec = self._strains(solution), self.case.imaging
-        key = image_key(solution, spec, strains)
-        self.stages.do(
-            "image", key, lambda: make_images(solution, spec, folder, strains, self.progress).files
+        return self.do(
+            "image",
+            image_key(solution, spec, strains),
+            lambda: make_images(solution, spec, folder, strains, self.progress).files,
+            lambda: ImageSet.read(folder),
         )
-        return ImageSet.read(folder)
 
     def correlate(self) -> dict[float, Result]:
         """Correlate every deformed image with the reference; leaves ``correlation/``.
@@ -215,15 +123,14 @@ class Run:
             If the images were made of another experiment or with other options than this case's.
         """
         images = self._images()
-        paths = {strain: self._result_path(strain) for strain in images.strains}
 
         def work() -> list[Path]:
-            for strain, path in paths.items():
-                self._correlate_one(images, strain).write(path)
-            return list(paths.values())
+            for strain in images.strains:
+                self._correlate_one(images, strain).write(self._result_path(strain))
+            return [self._result_path(strain) for strain in images.strains]
 
-        self.stages.do("correlate", self._correlate_key(images), work)
-        return {strain: Result.read(path) for strain, path in paths.items()}
+        key = self._correlate_key(images)
+        return self.do("correlate", key, work, lambda: self._results(images))
 
     def validate(self) -> dict[str, Any]:
         """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
@@ -243,17 +150,11 @@ class Run:
         path, page = self.folder / "summary.json", self.folder / "report.html"
 
         def work() -> tuple[Path, Path]:
-            results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
-            case = self.case
-            measured = MeasuredExperiment(
-                case.experiment, case.correlation, self._solution(), images, results
-            )
-            validate(measured, case.plain(), self.folder, self.progress)
+            write_json(path, self._report(images, page))
             return path, page
 
-        self.stages.do("validate", stage_key([correlated, self.case.title]), work)
-        summary: dict[str, Any] = read_json(path)
-        return summary
+        key = stage_key([correlated, self.case.title])
+        return self.do("validate", key, work, lambda: dict(read_json(path)))
 
     def all(self) -> dict[str, Any]:
         """Run every stage that is not finished; returns the content of ``summary.json``.
@@ -279,6 +180,33 @@ class Run:
         return summary
 
     # -- parts --------------------------------------------------------------------------
+
+    def _report(self, images: ImageSet, page: Path) -> dict[str, Any]:
+        """Compare with the truth and write the report; returns the content of the summary."""
+        from modeharvest.report.experiment import draw, write_experiment_report
+        from modeharvest.report.figures.experiment import ExperimentReportData
+
+        case, solution, results = self.case, self._solution(), self._results(images)
+        measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
+        strains = sorted(results)
+        # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
+        with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
+            comparisons = _Awaited([threads.submit(compare_snapshot, measured, e) for e in strains])
+            every = range(len(strains))
+            spectra = _Awaited(
+                [threads.submit(displacement_spectrum, comparisons, k, measured) for k in every]
+            )
+            snapshots = _Awaited(
+                [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
+            )
+            data = ExperimentReportData(
+                solution, images, strains, [results[strain] for strain in strains],
+                comparisons, spectra, measured.specimen.pitch,
+            )  # fmt: skip
+            drawings = draw(data, self.progress)
+            summary = experiment_summary(measured, case.plain(), list(snapshots))
+        write_experiment_report(page, case.plain(), drawings, summary)
+        return summary
 
     def _images(self) -> ImageSet:
         advice = "make it again with 'modeharvest image'"
@@ -311,9 +239,9 @@ class Run:
 
     def _shipped(self) -> Solution | None:
         """The solution that comes with the package, if it is of this very experiment."""
-        for name in shipped_cases():
+        for name in shipped_cases("experiment"):
             path = shipped_solution(name)
-            if path is not None and read_case(name).experiment == self.case.experiment:
+            if path is not None and Case.read(name).experiment == self.case.experiment:
                 return Solution.read(path)
         return None
 
@@ -348,19 +276,21 @@ class Run:
         self, info: Mapping[str, Any], have: Sequence[float], where: object
     ) -> list[float]:
         """The strains asked for that there are; of one's own simulation that ended early, some."""
-        wanted = self.case.experiment.strains
+        wanted, outcome = self.case.experiment.strains, _outcome(info)
         found = [e for e in wanted if any(abs(e - other) < 1e-9 for other in have)]
-        is_early = self.solution is None and _outcome(info) != _COMPLETE
-        if len(found) == len(wanted) or (found and is_early):
+        if len(found) == len(wanted) or (found and self.solution is None and outcome != _COMPLETE):
             return found
-        said = f" (simulation {_outcome(info)})" if _outcome(info) != _COMPLETE else ""
+        why = f" (simulation {outcome})" if outcome != _COMPLETE else ""
         raise InputError(
             f"expected snapshots at strains {', '.join(f'{e:g}' for e in wanted)}, got "
-            f"{', '.join(f'{e:g}' for e in have) or 'none'}{said} in {where}"
+            f"{', '.join(f'{e:g}' for e in have) or 'none'}{why} in {where}"
         )
 
     def _result_path(self, strain: float) -> Path:
         return self.folder / "correlation" / f"result_{round(1e4 * strain):04d}.json"
+
+    def _results(self, images: ImageSet) -> dict[float, Result]:
+        return {strain: Result.read(self._result_path(strain)) for strain in images.strains}
 
     def _correlate_one(self, images: ImageSet, strain: float) -> Result:
         how, specimen = self.case.correlation, self.case.experiment.specimen
@@ -376,6 +306,30 @@ class Run:
             how.options(),
             self.progress,
         )
+
+
+@contextmanager
+def _brief_turns() -> Iterator[None]:
+    """Let no thread keep the GIL for long: by default each of many short kernels waits 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+class _Awaited(Sequence[T]):
+    """Results of threads that may still be at work, waited for where they are used."""
+
+    def __init__(self, coming: Sequence[Future[T]]) -> None:
+        self._coming = coming
+
+    def __len__(self) -> int:
+        return len(self._coming)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._coming[k].result()
 
 
 def require_same_experiment(info: Mapping[str, Any], experiment: Experiment, where: object) -> None:

@@ -24,7 +24,7 @@ from modeharvest.idic.solver.passes import accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.mapping.rasterise import rasterise
-from modeharvest.runs.case import read_case, shipped_solution
+from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.compiled import cached_in, sources
 from modeharvest.util.machine import is_alone
 from modeharvest.util.progress import Progress, silent
@@ -35,7 +35,7 @@ _CASE = "paper-virtual"
 
 def _images() -> None:
     """What the stage ``image`` compiles."""
-    case, solution = read_case(_CASE), shipped_solution(_CASE)
+    case, solution = Case.read(_CASE), shipped_solution(_CASE)
     assert solution is not None
     spec = replace(case.imaging, pixel_size=0.1)
     with tempfile.TemporaryDirectory() as folder:
@@ -44,7 +44,7 @@ def _images() -> None:
 
 def _correlation() -> None:
     """What the stages ``correlate`` and ``validate`` compile."""
-    case, rng = read_case(_CASE), np.random.default_rng(0)
+    case, rng = Case.read(_CASE), np.random.default_rng(0)
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     start = ansatz.initial_guess(strain, case.correlation.start_amplitude)

@@ -19,18 +19,13 @@ Its TOML file has the tables of a virtual experiment and ``[study]``, with a kin
 
 from __future__ import annotations
 
-import time
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib import resources
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import pandas as pd
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from modeharvest.fem.field import Solution
 from modeharvest.report.model import Findings, StudyRun, slug, write_study_report
@@ -39,14 +34,14 @@ from modeharvest.report.study_noise import report_noise
 from modeharvest.report.study_resolution import report_resolution
 from modeharvest.report.study_robustness import report_robustness
 from modeharvest.report.study_systematic import report_systematic
-from modeharvest.runs.case import Case, checked, kind_of, of_kind, read_tables
+from modeharvest.runs.case import Case, of_kind, read_tables, with_kind
 from modeharvest.runs.experiment import Run
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json, require_writable, write_json
-from modeharvest.util.progress import Progress, named, silent
-from modeharvest.util.stages import Stages, exclusive
-from modeharvest.util.typed import nearest
+from modeharvest.util.progress import Progress, named
+from modeharvest.util.stages import StagedRun, exclusive, versions
+from modeharvest.util.typed import to_plain
 from modeharvest.validation.campaign import Campaign
 from modeharvest.validation.studies.modes import MeasuredModesStudy
 from modeharvest.validation.studies.noise import NoiseStudy
@@ -78,13 +73,13 @@ def study_with_options(
         raise InputError(
             "expected --workers or --scheduler, got both: a scheduler has workers of its own"
         )
-    case = read_study(name)
+    case = StudyCase.read(name)
     crew = Workers(2 if workers is None else workers, memory, scheduler)
     words = ["modeharvest study", name, "--out DIR"]
     words += ["--quick"] if quick else []
     words += ["--solution FILE"] if solution else []
     return StudyAnalysis(
-        case.quick() if quick else case, out, crew, progress, solution, " ".join(words)
+        case.quick() if quick else case, out, progress, crew, solution, " ".join(words)
     ).all()
 
 
@@ -95,7 +90,6 @@ KINDS: dict[str, type[Any]] = {
     "resolution": ResolutionStudy,
     "modes": MeasuredModesStudy,
 }
-_SHIPPED = resources.files("modeharvest") / "cases" / "studies"
 _QUICK = 2.0
 """A quick study's pixels are that much larger."""
 
@@ -103,12 +97,19 @@ _QUICK = 2.0
 class StudyCase(Case):
     """A question, and the virtual experiment that it is asked of."""
 
-    study: Any = RobustnessStudy()
+    table = "study"
 
-    @field_validator("study", mode="before")
+    study: Annotated[Any, of_kind(KINDS, "study")] = RobustnessStudy()
+
     @classmethod
-    def _of_kind(cls, table: Any) -> Any:
-        return of_kind(table, KINDS, "study") if isinstance(table, Mapping) else table
+    def read(cls, name: str | Path) -> Self:
+        """Read a study as every other case; it has to ask something."""
+        if "study" not in read_tables(name):
+            raise InputError(
+                f"{name}: expected a table [study] with a kind among {list(KINDS)}, got none; a "
+                f"virtual experiment by itself is run with 'modeharvest run {name} --out DIR'"
+            )
+        return super().read(name)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -120,10 +121,10 @@ class StudyCase(Case):
                 f"study: expected a strain among experiment.strains = {list(strains)}, got "
                 f"{study.strain}"
             )
-        if self.imaging.distortion is not None:
+        if self.imaging.distortion is not None or self.calibration is not None:
+            got = "calibration" if self.imaging.distortion is None else "imaging.distortion"
             raise InputError(
-                "study: expected a perfect lens, got imaging.distortion; studies measure ideal "
-                "images"
+                f"study: expected a perfect lens, got {got}; studies measure ideal images"
             )
         return self
 
@@ -140,37 +141,7 @@ class StudyCase(Case):
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, the study and materials by their kinds."""
-        return {**super().plain(), "study": kind_of(self.study, KINDS)}
-
-
-def shipped_studies() -> dict[str, str]:
-    """Names and titles of the studies that come with the package."""
-    paths = sorted(Path(str(p)) for p in _SHIPPED.iterdir() if p.name.endswith(".toml"))
-    return {p.stem: str(tomllib.loads(p.read_text("utf-8"))["title"]) for p in paths}
-
-
-def read_study(name: str | Path) -> StudyCase:
-    """Read a study by the name of a shipped one or by the path of a TOML file.
-
-    Raises
-    ------
-    InputError
-        If there is no such study, it is not TOML, a key is unknown (the nearest known one is
-        suggested), a value is out of its range, or options contradict each other.
-    """
-    path = Path(name)
-    if path.suffix != ".toml" and not path.is_file():
-        known = list(shipped_studies())
-        if str(name) not in known:
-            raise InputError(f"unknown study {str(name)!r}{nearest(str(name), known)}")
-        path = Path(str(_SHIPPED / f"{name}.toml"))
-    tables = read_tables(path)
-    if "study" not in tables:
-        raise InputError(
-            f"{name}: expected a table [study] with a kind among {list(KINDS)}, got none; a "
-            f"virtual experiment by itself is run with 'modeharvest run {name} --out DIR'"
-        )
-    return checked(StudyCase, tables, name)
+        return {**super().plain(), "study": with_kind(self.study, KINDS)}
 
 
 FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
@@ -184,29 +155,22 @@ FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
 
 
 @dataclass(frozen=True)
-class StudyAnalysis:
-    """A study, the folder it leaves its files in, who works and who listens.
+class StudyAnalysis(StagedRun[StudyCase]):
+    """A study's work: images, cases run by workers, findings.
 
     Parameters
     ----------
-    case
-        What to ask of which specimen.
-    folder
-        Where; made if it does not exist.
+    case, folder, progress
+        As of every run.
     workers
         Who runs the cases.
-    progress
-        Listener.
     solution
         A solution file to use instead of simulating.
     command
         What makes it again, for the report.
     """
 
-    case: StudyCase
-    folder: Path
     workers: Workers = field(default_factory=Workers)
-    progress: Progress = silent
     solution: Path | None = None
     command: str = "modeharvest study STUDY --out DIR"
 
@@ -236,27 +200,22 @@ class StudyAnalysis:
             require_writable(folder)
             _claim(folder, self.case.kind)
             self.workers.require_ready(study.function, folder)
-            with self._timed("solution and images"):
+            with self.timed("solution and images"):
                 cases = study.prepare(self.subject(), folder, self.progress)
             campaign = Campaign(study.function, cases, folder)
-            with self._timed("cases"):
+            with self.timed("cases"):
                 listener = named(self.progress, f"study: {len(cases)} cases")
                 table = campaign.run(self.workers, listener)
             if (table["error"] != "").all():
                 first = table["error"].iloc[0]
                 raise InputError(f"all {len(table)} cases failed; the first: {first}")
-            with self._timed("findings"):
+            with self.timed("findings"):
                 findings = FINDINGS[type(study)](study, table, folder)
-            return self._tell(campaign, table, findings)
+            return self._write_report(campaign, table, findings)
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        """Take down what a stage takes."""
-        begin = time.perf_counter()
-        yield
-        Stages(self.folder).took(stage, time.perf_counter() - begin)
-
-    def _tell(self, campaign: Campaign, table: pd.DataFrame, findings: Findings) -> dict[str, Any]:
+    def _write_report(
+        self, campaign: Campaign, table: pd.DataFrame, findings: Findings
+    ) -> dict[str, Any]:
         """Leave tables, ``summary.json`` and ``report.html``."""
         files = {"table.csv": "every case: its values, error, result"}
         for title, part in {**findings.tables, **findings.attachments}.items():
@@ -286,7 +245,7 @@ class StudyAnalysis:
     def _summary(
         self, campaign: Campaign, table: pd.DataFrame, findings: Findings
     ) -> dict[str, Any]:
-        """The content of ``summary.json``; docs/studies.md tells its keys."""
+        """The content of ``summary.json``; for its keys see docs/studies.md."""
         failed = table[table["error"] != ""]
         return {
             "title": self.case.title or self.case.kind.capitalize(),
@@ -294,14 +253,14 @@ class StudyAnalysis:
             "command": self.command,
             "seeds": self.case.study.seeds,
             "sentences": list(findings.sentences),
-            "numbers": _plain(dict(findings.numbers)),
+            "numbers": to_plain(findings.numbers),
             "cases": len(table),
             "failed": [
                 {"file": campaign.path(campaign.cases[k]).name, "error": failed["error"][k]}
                 for k in failed.index
             ],
             "other_results_by_version": campaign.of_other_versions(),
-            "versions": _versions(),
+            "versions": versions("numpy", "scipy", "numba", "distributed"),
             "case": self.case.plain(),
         }
 
@@ -331,34 +290,18 @@ def _kind_in(path: Path, kind: str) -> str:
 
 def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
     """What to keep in mind of how the study went."""
-    said = []
+    notes = []
     if summary["failed"]:
         first = summary["failed"][0]
-        said.append(
+        notes.append(
             f"{len(summary['failed'])} of {summary['cases']} cases failed; their tracebacks are "
             f"in cases/. The first, {first['file']}: {first['error']}"
         )
     for other, count in summary["other_results_by_version"].items():
         of = "other options" if other == __version__ else f"modeharvest {other}"
-        said.append(f"Stored results of {of}, {count} in number, were left alone and not mixed in.")
-    said.append(
+        notes.append(f"{count} stored results of {of} were left alone and not mixed in.")
+    notes.append(
         "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
         "not plane) is not in it."
     )
-    return tuple(said)
-
-
-def _plain(value: Any) -> Any:
-    """Values as JSON knows them: NaN as null, numpy's numbers as numbers."""
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    return None if isinstance(value, float) and value != value else value
-
-
-def _versions() -> dict[str, str]:
-    libraries = ("numpy", "scipy", "numba", "distributed")
-    return {"modeharvest": __version__} | {name: version(name) for name in libraries}
+    return tuple(notes)

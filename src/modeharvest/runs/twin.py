@@ -12,16 +12,12 @@
         distortion.json     of the lens
         twin.json           where the stage really went
     harvest/                all that a harvest leaves; its report also shows the truth
-
-:func:`one_seed` photographs a twin again: a 95 % interval of a field, 1.96 standard deviations by
-noise about what one photograph shows, should hold the noise-free result in 95 of 100 of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,37 +25,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
-from modeharvest.idic.correlate import correlate, fit_displacement
+from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
-    covariances,
-    noise_of,
-    prepared_pair,
 )
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
-from modeharvest.idic.solver.final_smoothing import blurred_pair
-from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import Distortion
-from modeharvest.imaging.distortion.target import photograph_target
-from modeharvest.imaging.distortion.undistort import seen_points, undistorted
+from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
+from modeharvest.imaging.distortion.undistort import seen_points
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
-from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import write_image
-from modeharvest.runs.case import TwinCase
+from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
-from modeharvest.runs.photographs.case import read_photograph_case
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthRow
-from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, read_json, write_json
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import Stages, exclusive, stage_key
-from modeharvest.util.typed import plain
+from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
+from modeharvest.util.typed import to_plain
 
 _SIDECAR = "twin.json"
 
@@ -109,7 +99,7 @@ class Twin:
 
 
 def make_twin(
-    case: TwinCase, solution: Solution, folder: Path | str, progress: Progress = silent
+    case: Case, solution: Solution, folder: Path | str, progress: Progress = silent
 ) -> Twin:
     """Make (or find finished) the photographs of a twin, and its truth.
 
@@ -130,10 +120,9 @@ def make_twin(
         If the case has no distortion, an image doesn't fit, or the disk refuses.
     """
     twin, spec, strains = Twin(Path(folder)), case.imaging, case.experiment.strains
-    if spec.distortion is None:
-        raise InputError("twin: expected an [imaging.distortion] to calibrate, got none")
+    target = _target(case)
     truth, photographs = twin.folder / "truth", twin.experiment.parent
-    key = stage_key([image_key(solution, spec, strains), plain(case.calibration), case.title])
+    key = stage_key([image_key(solution, spec, strains), to_plain(target), case.title])
 
     def work() -> list[Path]:
         solution.write(truth / "solution.h5")
@@ -142,7 +131,7 @@ def make_twin(
         lens = spec.lens(images.grid.shape)
         assert lens is not None
         write_distortion(truth / "distortion.json", lens)
-        target, seen = case.calibration, seen_points(lens, images.grid.shape)
+        seen = seen_points(lens, images.grid.shape)
         shots = photograph_target(target, spec.speckle, seen, spec.sensor, spec.bits)
         for k, (name, levels) in enumerate(shots):
             progress(k, len(target.shifts_px), "images: calibration")
@@ -157,6 +146,17 @@ def make_twin(
 
     Stages(twin.folder).do("twin", key, work)
     return twin
+
+
+def _target(case: Case) -> CalibrationTarget:
+    """What the lens is calibrated with; InputError if there is none, or no lens."""
+    if case.calibration is None or case.imaging.distortion is None:
+        missing = "imaging.distortion" if case.calibration else "calibration"
+        raise InputError(
+            f"twin: expected an [imaging.distortion] to calibrate and a [calibration], "
+            f"got no [{missing}]"
+        )
+    return case.calibration
 
 
 def _copy_photographs(images: ImageSet, folder: Path) -> list[Path]:
@@ -179,10 +179,10 @@ def _exposures(images: ImageSet) -> Iterator[tuple[str, str]]:
         yield Path(entry["image"]).stem, entry["camera_image"]
 
 
-def _experiment_text(case: TwinCase, images: ImageSet) -> str:
+def _experiment_text(case: Case, images: ImageSet) -> str:
     """The TOML file that a user would write."""
     deformed = ", ".join(f'"{name}.tif"' for name, _ in _exposures(images) if name != "reference")
-    about = ", ".join(f"({col:g}, {row:g})" for col, row in case.calibration.shifts_px)
+    about = ", ".join(f"({col:g}, {row:g})" for col, row in _target(case).shifts_px)
     return f"""\
 title = "{case.title}"
 
@@ -214,24 +214,17 @@ _WAVES, _AMPLITUDE, _LENS_PX = 0.01, 0.03, 0.05
 
 
 @dataclass(frozen=True)
-class TwinRun:
-    """A twin's case, the folder it leaves its files in, and who listens.
+class TwinRun(StagedRun[Case]):
+    """The stages of a twin: those of its simulation, its photographs, those of their harvest.
 
     Parameters
     ----------
-    case
-        Of the twin.
-    folder
-        Where.
-    progress
-        Listener.
+    case, folder, progress
+        As of every run.
     solution
         A solution file to use instead of simulating.
     """
 
-    case: TwinCase
-    folder: Path
-    progress: Progress = silent
     solution: Path | None = None
 
     def twin(self) -> Twin:
@@ -241,10 +234,8 @@ class TwinRun:
 
     def harvesting(self, twin: Twin) -> HarvestRun:
         """The harvest of the photographs; knows nothing of the truth."""
-        experiment = read_photograph_case(twin.experiment)
-        folder = self.folder / "harvest"
-        source = str(twin.experiment)
-        return HarvestRun(experiment, twin.experiment.parent, folder, self.progress, source)
+        case, folder = PhotographCase.read(twin.experiment), self.folder / "harvest"
+        return HarvestRun(case, folder, self.progress, str(twin.experiment))
 
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``."""
@@ -347,111 +338,3 @@ def _over(box: Box) -> tuple[FloatArray, FloatArray]:
 
 def _rms(values: NDArray[Any]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-INTERVAL = 1.96
-"""Standard deviations of a 95 % interval."""
-_POINTS = 25
-"""Points along each side of the cellular part at which intervals are counted."""
-
-
-def one_seed(case: Mapping[str, Any], folder: Path) -> dict[str, float]:
-    """Photograph and measure once more; the share of intervals that hold the noise-free result.
-
-    Parameters
-    ----------
-    case
-        ``name`` of the deformed photograph and ``seed``.
-    folder
-        Of a finished twin run (``twin/`` and ``harvest/``).
-
-    Returns
-    -------
-    dict
-        For v0, v1 and v1 phi1 the share of points covered, and the rms of the deviation over its
-        standard deviation, which should be 1.
-    """
-    scene = _scene(folder, case["name"])
-    found = scene.measured(scene.photographs(case["seed"]))
-    clean, sd = scene.clean, scene.errors
-    ansatz, at = found.ansatz, (scene.x, scene.y)
-    pairs = {
-        "v0": (ansatz.v0(found.unknowns, *at) - ansatz.v0(clean.unknowns, *at), sd.v0),
-        "v1": (ansatz.v(0, found.unknowns, *at) - ansatz.v(0, clean.unknowns, *at), sd.v[0]),
-        "v1phi1": (
-            ansatz.fluctuation(0, found.unknowns, *at) - ansatz.fluctuation(0, clean.unknowns, *at),
-            sd.fluctuation[0],
-        ),
-    }
-    told = {}
-    for name, (deviation, error) in pairs.items():
-        ratio = deviation[error > 0] / error[error > 0]
-        told[f"covered {name}"] = float(np.mean(np.abs(ratio) <= INTERVAL))
-        told[f"deviation {name}"] = float(np.sqrt(np.mean(ratio**2)))
-    return told
-
-
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """All that does not depend on the seed: what a worker keeps."""
-
-    twin: Twin
-    harvesting: HarvestRun
-    pair: ImagePair
-    name: str
-    blur_px: float
-    start: Result
-    clean: Result
-    errors: FieldErrors
-    x: FloatArray
-    y: FloatArray
-
-    def photographs(self, seed: int | None) -> tuple[FloatImage, FloatImage]:
-        """Reference and deformed photograph with the noise of a seed, or none; undistorted."""
-        spec, images = self.twin.images.spec, self.twin.images
-        strain = min(images.strains, key=lambda e: abs(e - int(self.name.rsplit("_", 1)[1]) / 1e4))
-        white = 2**spec.bits - 1
-        taken = []
-        for grey, label in (
-            (images.reference(), "reference"),
-            (images.deformed(strain), "deformed"),
-        ):
-            levels: NDArray[Any] = white * grey
-            if seed is not None:
-                sensor = replace(spec.sensor, shot_seed=1000 + seed, read_seed=2000 + seed)
-                irradiance = ((grey - sensor.offset) / sensor.gain).astype(np.float32)
-                levels = sensor.expose(irradiance, spec.bits, label)
-            distortion = self.harvesting.optics.distortion
-            image = levels.astype(np.float32)
-            taken.append(image if distortion is None else undistorted(image, distortion))
-        return taken[0], taken[1]
-
-    def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
-        """Correlate as the harvest finished, from the harvest's result on."""
-        masks = self.pair.masks
-        if self.blur_px > 0.0:
-            images = blurred_pair(*images, *masks, self.blur_px)
-        options = self.harvesting.experiment.correlation.options()
-        fine = replace(options, levels=options.levels[-1:])
-        start = self.start
-        return correlate(*images, start.grid, start.ansatz, start.unknowns, *masks, fine)
-
-
-@lru_cache(maxsize=1)
-def _scene(folder: Path, name: str) -> _Scene:
-    twin = Twin(folder / "twin")
-    experiment = read_photograph_case(twin.experiment)
-    harvesting = HarvestRun(experiment, twin.experiment.parent, folder / "harvest")
-    prepared, measured = harvesting.prepared(), harvesting.results()[name]
-    pair = prepared_pair(prepared, name)
-    box = harvesting.geometry.region.cellular
-    x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)
-    y = np.linspace(box.y_min, box.y_max, _POINTS, dtype=np.float64)
-    noise, cell = noise_of(prepared, name), experiment.specimen.cell_size
-    by_noise, _, _ = covariances(measured, pair, noise, cell)
-    errors = field_errors(measured.result, x, y, by_noise)
-    blank = measured.result
-    scene = _Scene(
-        twin, harvesting, pair, name, measured.blur_px, blank, blank, errors, x, y
-    )  # fmt: skip
-    return replace(scene, clean=scene.measured(scene.photographs(None)))

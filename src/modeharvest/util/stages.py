@@ -31,7 +31,7 @@ from importlib import resources
 from importlib.metadata import version
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
@@ -44,8 +44,11 @@ from modeharvest.util.files import (
     write_json,
 )
 from modeharvest.util.machine import on_first
+from modeharvest.util.progress import Progress, silent
 
 _SOURCES = (".py", ".html", ".css")
+C = TypeVar("C")
+R = TypeVar("R")
 
 
 def versions(*libraries: str) -> dict[str, str]:
@@ -192,6 +195,49 @@ class Stages:
         stage = {"key": key, "files": entries}
         record = {**self._record(), name: stage}
         write_json(self.folder / RECORD, dict(sorted(record.items())))
+
+
+@dataclass(frozen=True)
+class StagedRun(Generic[C]):
+    """What every kind of run has: a case, a folder, stages that are not done twice.
+
+    Parameters
+    ----------
+    case
+        What to do.
+    folder
+        Where to leave the files; made if it does not exist.
+    progress
+        Listener.
+    """
+
+    case: C
+    folder: Path
+    progress: Progress = silent
+
+    @property
+    def stages(self) -> Stages:
+        """What is finished in the folder."""
+        return Stages(self.folder)
+
+    def do(
+        self,
+        name: str,
+        key: str,
+        work: Callable[[], Iterable[Path]],
+        read: Callable[[], R],
+        collective: bool = False,
+    ) -> R:
+        """Do a stage unless it is finished (see :class:`Stages`); returns what its files say."""
+        self.stages.do(name, key, work, collective=collective)
+        return read()
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Take down what work takes that stores its own outcome."""
+        begin = time.perf_counter()
+        yield
+        self.stages.took(name, time.perf_counter() - begin)
 
 
 def stage_key(content: object, *folders: str) -> str:

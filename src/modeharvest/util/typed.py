@@ -1,14 +1,16 @@
-"""Plain values, as files hold them, turned into the dataclasses they describe.
+"""Plain values, as files hold them, from dataclasses and to the dataclasses they describe.
 
-pydantic does the work; what it finds is told in one line. Numbers have to be finite, and a boolean
-or a text is no number, though pydantic would take ``true`` for 1 and ``"3"`` for 3.
+For the latter pydantic does the work; its first finding becomes one line. Numbers have to be
+finite, and a boolean or a text is no number, though pydantic would take ``true`` for 1 and ``"3"``
+for 3.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -70,9 +72,20 @@ def _kind(value: object) -> str:
     return "a text" if isinstance(value, str) else ""
 
 
-def plain(value: Any) -> Any:
-    """A dataclass as plain JSON values; anything else as it is."""
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+def to_plain(value: Any) -> Any:
+    """Plain JSON values: dataclasses and mappings as dictionaries, arrays and tuples as lists.
+
+    Null stands for what is no finite number.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(inner) for key, inner in value.items()}
+    if hasattr(value, "tolist"):  # numpy's arrays and numbers
+        return to_plain(value.tolist())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [to_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def sentence(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:

@@ -333,7 +333,7 @@ def _components(frames: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float,
                     found.setdefault(label, []).append((
                         100 * frame["strain"], abs(wave["xi"][c]),
                         max(_known_or_zero(wave[sd], c) for sd in ("sd_noise", "sd_model_error")),
-                        float(not mode["held"] and mode["observable"]),
+                        float(not mode["fixed"] and mode["observable"]),
                     ))  # fmt: skip
     return found
 

@@ -11,47 +11,401 @@
     [modes]        # which modes, which branches
     [study]        # optional: how the pattern depends on d/l, l, material and loading
 
-The tables are the dataclasses of :mod:`modeharvest.runs.lattice.options`. In Python::
+In Python::
 
     case = LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))
 
-Here is also what each stage of the analysis depends on: with the same key it is not done again.
+No lattice needs gmsh before its cell is meshed. Here is also what each stage of the analysis
+depends on: with the same key it is not done again.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runtime_checkable
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
-from modeharvest.fem.materials import MATERIALS, Material, Ogden
-from modeharvest.runs.case import CaseModel, checked, is_lattice, kind_of, of_kind, read_tables
-from modeharvest.runs.lattice.options import (
-    LATTICES,
-    DispersionPlan,
-    FileLattice,
-    LatticeSpec,
-    Loading,
-    ModesPlan,
-    Search,
-    SquareLattice,
+from modeharvest.fem.bloch.dispersion import ZONES, Wave, in_plane
+from modeharvest.fem.experiment import SMALLEST_STEP
+from modeharvest.fem.lattice.options import (
+    MacroLoading,
+    Rates,
+    equibiaxial,
+    simple_shear,
+    uniaxial,
+    uniaxial_strain,
 )
+from modeharvest.fem.materials import MATERIALS, Material, Ogden
+from modeharvest.runs.case import CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import sha256_of
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import digest, stage_key
-from modeharvest.util.typed import nearest, plain
+from modeharvest.util.typed import nearest
 from modeharvest.validation.studies.lattice import SHOWN, LatticeModeStudy, run_lattice_study
 from modeharvest.validation.studies.lattice_pattern import LOADINGS, RATIOS, StudiedLattice
 from modeharvest.validation.studies.lattice_pattern import STUDIED_MATERIALS as MATERIALS_BY_NAME
 
+if TYPE_CHECKING:
+    from modeharvest.fem.lattice.cells import UnitCell
+
+
+@runtime_checkable
+class LatticeSpec(Protocol):
+    """A lattice of which one primitive cell can be meshed."""
+
+    @property
+    def pitch(self) -> float:
+        """Unit cell size l [mm], the unit of wave lengths in spectra."""
+
+    @property
+    def symmetry(self) -> str:
+        """Without load: "square", "hexagonal" (60 degrees from a1 to a2) or "oblique"."""
+
+    def cell(self) -> UnitCell:
+        """The primitive cell, meshed; an InputError if there is no such lattice."""
+
+
+@dataclass(frozen=True)
+class SquareLattice:
+    """Circular holes in square stacking: ``fem.lattice.cells.square``.
+
+    Parameters
+    ----------
+    pitch, diameter
+        l and d [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    """
+
+    pitch: float = 1.9
+    diameter: float = 1.5
+    mesh_size: float = 0.15
+    symmetry = "square"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell."""
+        from modeharvest.fem.lattice.cells import square
+
+        return square(self.pitch, self.diameter, self.mesh_size)
+
+
+@dataclass(frozen=True)
+class HexagonalLattice:
+    """Circular holes in hexagonal stacking: ``fem.lattice.cells.hexagonal``.
+
+    Parameters
+    ----------
+    pitch, diameter
+        Distance of the holes' centres and their diameter [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    """
+
+    pitch: float = 1.386
+    diameter: float = 1.28
+    mesh_size: float = 0.1
+    symmetry = "hexagonal"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell: one hole."""
+        from modeharvest.fem.lattice.cells import hexagonal
+
+        return hexagonal(self.pitch, self.diameter, self.mesh_size)
+
+
+@dataclass(frozen=True)
+class ChiralLattice:
+    """Rings joined by ligaments that touch them tangentially: ``fem.lattice.cells.chiral``.
+
+    Parameters
+    ----------
+    pitch
+        Distance of neighbouring rings' centres [mm].
+    mesh_size
+        Edge length of the elements [mm].
+    ring_radius, ring_thickness, ligament_thickness
+        [mm]; shares of the pitch that ``chiral`` states unless given.
+    handedness
+        "clockwise" or "counterclockwise".
+    """
+
+    pitch: float = 1.9
+    mesh_size: float = 0.1
+    ring_radius: float | None = None
+    ring_thickness: float | None = None
+    ligament_thickness: float | None = None
+    handedness: str = "clockwise"
+    ligaments = 4
+    symmetry = "square"
+
+    def cell(self) -> UnitCell:
+        """The primitive cell: one ring."""
+        from modeharvest.fem.lattice.cells import chiral
+
+        walls = (self.ring_radius, self.ring_thickness, self.ligament_thickness)
+        return chiral(self.pitch, self.mesh_size, self.ligaments, *walls, self.handedness)
+
+
+@dataclass(frozen=True)
+class TetrachiralLattice(ChiralLattice):
+    """Four ligaments at each ring, rings on a square lattice."""
+
+
+@dataclass(frozen=True)
+class HexachiralLattice(ChiralLattice):
+    """Six ligaments at each ring, rings on a hexagonal lattice."""
+
+    ligaments = 6
+    symmetry = "hexagonal"
+
+
+@dataclass(frozen=True)
+class FileLattice:
+    """A cell of one's own, a mesh or a geometry: ``fem.lattice.files.read_cell``.
+
+    Parameters
+    ----------
+    path
+        The file [mm]; in a case file, relative to that file's folder.
+    pitch
+        Unit cell size l [mm], the unit of wave lengths in spectra.
+    vectors
+        a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material.
+    mesh_size
+        Largest edge length [mm] where a geometry is meshed; None for a mesh.
+    """
+
+    path: str
+    pitch: float
+    vectors: tuple[tuple[float, float], tuple[float, float]] | None = None
+    mesh_size: float | None = None
+    symmetry = "oblique"
+
+    def cell(self) -> UnitCell:
+        """The cell as the file has it."""
+        from modeharvest.fem.lattice.files import read_cell
+
+        return read_cell(self.path, self.vectors, self.mesh_size)
+
+
+LATTICES: dict[str, type[Any]] = {
+    "square": SquareLattice,
+    "hexagonal": HexagonalLattice,
+    "tetrachiral": TetrachiralLattice,
+    "hexachiral": HexachiralLattice,
+    "file": FileLattice,
+}
+
+
+Component = float | Literal["free"]
+_ZERO = ((0.0, 0.0), (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How the lattice is loaded; the load e multiplies all rates.
+
+    Parameters
+    ----------
+    kind
+        Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
+        lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or
+        "prescribed": the rates below.
+    axis
+        "x" or "y", of the first two kinds.
+    gradient
+        dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only.
+    stress
+        dP̄/de [MPa] where the gradient is free; of "prescribed" only.
+    """
+
+    kind: Literal["uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"] = "uniaxial"
+    axis: Literal["x", "y"] = "x"
+    gradient: tuple[tuple[Component, Component], tuple[Component, Component]] | None = None
+    stress: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind == "prescribed" and self.gradient is None:
+            raise InputError(
+                'loading: expected the gradient of "prescribed", such as [[-1.0, 0.0], [0.0, '
+                '"free"]], got none'
+            )
+        if self.kind != "prescribed" and (self.gradient or self.stress):
+            raise InputError(
+                f'loading: expected gradient and stress with kind = "prescribed", got {self.kind!r}'
+            )
+        self.macro()
+
+    def macro(self) -> MacroLoading:
+        """What the equilibrium equations need."""
+        axis = "xy".index(self.axis)
+        if self.gradient is not None:
+            (a, b), (c, d) = self.gradient
+            rates: Rates = ((_rate(a), _rate(b)), (_rate(c), _rate(d)))
+            return MacroLoading(rates, self.stress or _ZERO)
+        return {
+            "uniaxial": uniaxial(axis),
+            "uniaxial-strain": uniaxial_strain(axis),
+            "equibiaxial": equibiaxial(),
+            "shear": simple_shear(),
+        }[self.kind]
+
+    @property
+    def name(self) -> str:
+        """In words, for tables and pictures."""
+        words = self.kind.replace("-", " ")
+        return f"{words} along {self.axis}" if self.kind.startswith("uniaxial") else words
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether the lattice keeps its rotational symmetry."""
+        (a, b), (c, d) = self.macro().gradient
+        return a is not None and a == d and b == 0 == c
+
+
+def _rate(component: Component) -> float | None:
+    return None if component == "free" else float(component)
+
+
+@dataclass(frozen=True)
+class Search:
+    """Up to which load, and how finely, the first critical point is looked for.
+
+    Parameters
+    ----------
+    largest
+        Load up to which to look [-].
+    divisions
+        Of each axis of the zone of wave vectors; an even number has M and X on the grid.
+    largest_step
+        Of the load [-].
+    """
+
+    largest: float = 0.3
+    divisions: int = 8
+    largest_step: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (0 < self.largest < 1 and self.largest_step >= SMALLEST_STEP):
+            raise InputError(
+                f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
+                f"{self}"
+            )
+        if not 2 <= self.divisions <= 200:
+            raise InputError(f"search: expected 2 to 200 divisions, got {self.divisions}")
+
+
+@dataclass(frozen=True)
+class DispersionPlan:
+    """Where the lowest eigenvalues are computed.
+
+    Parameters
+    ----------
+    loads
+        [-]; none: 0, half the critical load and the critical one.
+    points
+        Wave vectors along the path.
+    bands
+        Eigenvalues at each of them.
+    map_divisions
+        Of each axis of the zone's map; even, 0 for no map.
+    corners
+        Names and phases [π rad] of the path, such as [["Γ", [0, 0]], ["M", [1, 1]]]; none: a tour
+        that suits the lattice and its load.
+    """
+
+    loads: tuple[float, ...] = ()
+    points: int = 60
+    bands: int = 3
+    map_divisions: int = 24
+    corners: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_loads("dispersion", self.loads)
+        tour = _phases(wave for _, wave in self.corners)
+        if self.corners and (len(tour) < 2 or self.points < len(tour)):
+            raise InputError(
+                "dispersion: expected two corners or more, and no fewer points, got "
+                f"{len(tour)} corners and {self.points} points"
+            )
+        if not (8 <= self.points <= 10_000 and 1 <= self.bands <= 100):
+            raise InputError(
+                "dispersion: expected 8 to 10000 points and 1 to 100 bands, got "
+                f"{self.points} and {self.bands}"
+            )
+        if not 0 <= self.map_divisions <= 1000 or self.map_divisions % 2:
+            raise InputError(
+                "dispersion: expected an even number of map divisions from 0 to 1000, got "
+                f"{self.map_divisions}"
+            )
+
+    def tour(self, lattice: LatticeSpec, loading: Loading) -> tuple[tuple[str, Wave], ...]:
+        """Names and phases [rad] of the path's corners."""
+        if self.corners:
+            waves = _phases(wave for _, wave in self.corners)
+            return tuple((name, w) for (name, _), w in zip(self.corners, waves, strict=True))
+        if loading.is_isotropic or lattice.symmetry == "oblique":
+            return ZONES[lattice.symmetry]
+        return ZONES["rhombic" if lattice.symmetry == "hexagonal" else "oblique"]
+
+
+@dataclass(frozen=True)
+class ModesPlan:
+    """Which modes are computed, and which buckled branches are followed.
+
+    Parameters
+    ----------
+    waves
+        Phases [π rad], such as [[1, 1]]; none: those that are critical first.
+    load
+        At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
+        another load than the critical one have no branches.
+    combinations
+        One row of coefficients for each branch to follow, as many as there are modes, in the order
+        of their waves (critical ones by phases, the largest first); none: each mode alone, and
+        the sum of all.
+    branch_loads
+        At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
+        critical load.
+    """
+
+    waves: tuple[tuple[float, ...], ...] = ()
+    load: float = 0.0
+    combinations: tuple[tuple[float, ...], ...] = ()
+    branch_loads: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        _phases(self.waves)
+        _check_loads("modes", (self.load, *self.branch_loads))
+        for row in self.combinations:
+            if not any(row) or not all(math.isfinite(c) for c in row):
+                raise InputError(f"modes: expected finite combinations, not all 0, got {row}")
+
+    @property
+    def phases(self) -> tuple[Wave, ...]:
+        """The waves in rad."""
+        return _phases(self.waves)
+
+
+def _phases(waves: Any) -> tuple[Wave, ...]:
+    """Units of π to rad, each wave checked to be in the plane."""
+    checked = (in_plane(wave) for wave in waves)
+    return tuple((math.pi * p, math.pi * q) for p, q in checked)
+
+
+def _check_loads(where: str, loads: Sequence[float]) -> None:
+    if not all(0 <= load < 1 for load in loads):
+        raise InputError(f"{where}: expected loads of 0 or more and below 1, got {tuple(loads)}")
+
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A study of a square lattice's pattern: see ``validation.mode_study``.
+    """A study of a square lattice's pattern: see ``validation.studies.lattice``.
 
     Every ratio under every loading, and where the pattern stops being what buckles first; other
     unit cell sizes and materials at the case's own d/l and loading.
@@ -65,7 +419,7 @@ class StudyPlan:
     pitches
         Other l [mm].
     materials
-        Other materials, by their names in ``validation.independence.MATERIALS``.
+        Other materials, by their names in ``STUDIED_MATERIALS``.
     overlays
         d/l of the pictures of numerical over analytic mode [-].
     divisions
@@ -104,30 +458,29 @@ class StudyPlan:
 class LatticeCase(CaseModel):
     """An infinite lattice under load, and what is asked about it."""
 
-    lattice: LatticeSpec = SquareLattice()
-    material: Material = Ogden()
+    table = "lattice"
+
+    lattice: Annotated[LatticeSpec, of_kind(LATTICES, "lattice")] = SquareLattice()
+    material: Annotated[Material, of_kind(MATERIALS, "material")] = Ogden()
     loading: Loading = Loading()
     search: Search = Search()
     dispersion: DispersionPlan = DispersionPlan()
     modes: ModesPlan = ModesPlan()
     study: StudyPlan | None = None
 
-    @field_validator("lattice", mode="before")
     @classmethod
-    def _of_kind(cls, table: Any) -> Any:
-        return of_kind(table, LATTICES, "lattice") if isinstance(table, dict) else table
-
-    @field_validator("material", mode="before")
-    @classmethod
-    def _of_material(cls, table: Any) -> Any:
-        return of_kind(table, MATERIALS, "material") if isinstance(table, dict) else table
+    def read(cls, name: str | Path) -> Self:
+        """Read a case as every other; a lattice's own file is found beside the case's."""
+        case = super().read(name)
+        if isinstance(case.lattice, FileLattice):
+            file = str(Path(name).parent / case.lattice.path)
+            case = case.model_copy(update={"lattice": replace(case.lattice, path=file)})
+        return case
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, lattice and material by their kinds."""
-        content = {name: plain(getattr(self, name)) for name in type(self).model_fields}
-        content["lattice"] = kind_of(self.lattice, LATTICES)
-        content["material"] = kind_of(self.material, MATERIALS)
-        return content
+        lattice, material = with_kind(self.lattice, LATTICES), with_kind(self.material, MATERIALS)
+        return {**super().plain(), "lattice": lattice, "material": material}
 
     @model_validator(mode="after")
     def _is_square_to_be_studied(self) -> Self:
@@ -160,27 +513,6 @@ class LatticeCase(CaseModel):
             shown=plan.overlays,
             progress=progress,
         )
-
-
-def read_lattice_case(name: str | Path) -> LatticeCase:
-    """Read a lattice's case by the name of a shipped one or by the path of a TOML file.
-
-    Raises
-    ------
-    InputError
-        If there is no such case, it is a virtual experiment, it is not TOML, a key is unknown
-        (the nearest known one is suggested) or a value is out of its range.
-    """
-    tables = read_tables(name)
-    if not is_lattice(tables) and "experiment" in tables:
-        raise InputError(
-            f"{name}: expected an infinite lattice, got a virtual experiment; run 'modeharvest run "
-            f"{name} --out DIR'"
-        )
-    lattice = tables.get("lattice")
-    if isinstance(lattice, dict) and isinstance(lattice.get("path"), str):
-        lattice["path"] = str(Path(name).parent / lattice["path"])
-    return checked(LatticeCase, tables, name)
 
 
 def stage_keys(case: LatticeCase) -> dict[str, str]:

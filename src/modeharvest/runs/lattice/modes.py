@@ -26,8 +26,7 @@ from modeharvest.idic.spectra.mode_family import (
     read_spectrum,
     write_family,
 )
-from modeharvest.runs.lattice.case import LatticeCase
-from modeharvest.runs.lattice.options import ModesPlan, Search
+from modeharvest.runs.lattice.case import LatticeCase, ModesPlan, Search
 from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, combination_name
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, dolfinx_missing

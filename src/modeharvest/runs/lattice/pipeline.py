@@ -30,7 +30,6 @@ from modeharvest.fem.bloch.modes import (
     write_vtu,
     write_xdmf,
 )
-from modeharvest.report.lattice import write_lattice_report
 from modeharvest.runs.lattice.case import LatticeCase, stage_keys
 from modeharvest.runs.lattice.modes import (
     LatticeModel,
@@ -55,36 +54,23 @@ from modeharvest.runs.lattice.results import (
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
-from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import Stages, exclusive, stage_key
+from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 
 
 @dataclass(frozen=True)
-class LatticeAnalysis:
-    """A lattice's case, the folder it leaves its files in, and who listens to its progress.
+class LatticeAnalysis(StagedRun[LatticeCase]):
+    """The stages of a lattice's analysis.
 
     Parameters
     ----------
-    case
-        What to do.
-    folder
-        Where; made if it does not exist.
-    progress
-        Listener.
+    case, folder, progress
+        As of every run.
     source
         Name or file of the case, for the report.
     """
 
-    case: LatticeCase
-    folder: Path
-    progress: Progress = silent
     source: str = "CASE"
-
-    @property
-    def stages(self) -> Stages:
-        """What is finished in the folder."""
-        return Stages(self.folder)
 
     def critical(self) -> CriticalPoint:
         """Find the first critical load over all wave vectors; leaves ``critical.json``.
@@ -103,8 +89,7 @@ class LatticeAnalysis:
             write_critical(path, self.case.loading.name, found)
             return (path,)
 
-        self.stages.do("critical", self._keys["critical"], work)
-        return read_critical(path)
+        return self.do("critical", self._keys["critical"], work, lambda: read_critical(path))
 
     def dispersion(self) -> Dispersion:
         """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
@@ -124,8 +109,7 @@ class LatticeAnalysis:
             found.write_csv(table)
             return path, table
 
-        self.stages.do("dispersion", self._keys["dispersion"], work)
-        return Dispersion.read(path)
+        return self.do("dispersion", self._keys["dispersion"], work, lambda: Dispersion.read(path))
 
     def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
         """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
@@ -151,8 +135,7 @@ class LatticeAnalysis:
                 write(other, *found)
             return path, *others.values()
 
-        self.stages.do("modes", self._keys["modes"], work)
-        return read_modes(path)
+        return self.do("modes", self._keys["modes"], work, lambda: read_modes(path))
 
     def families(self) -> None:
         """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
@@ -194,15 +177,16 @@ class LatticeAnalysis:
         done = self._finished()
 
         def work() -> tuple[Path, ...]:
+            from modeharvest.report.lattice import write_lattice_report
+
             run = self._run(done)
             write_lattice_report(page, run, self.progress)
             found = self._found_patterns() if "families" in done else []
             write_json(path, summary_of(run, self.case, found))
             return path, page
 
-        self.stages.do("report", stage_key([done, self.case.title, self.source]), work)
-        content: dict[str, Any] = read_json(path)
-        return content
+        key = stage_key([done, self.case.title, self.source])
+        return self.do("report", key, work, lambda: dict(read_json(path)))
 
     def bloch(self) -> dict[str, Any]:
         """Stability against all waves, and dispersion; returns the content of ``summary.json``.

@@ -24,8 +24,8 @@ from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, pul
 from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.report.photographs import write_harvest_report
-from modeharvest.runs.photographs.case import PhotographCase, read_photograph_case
+from modeharvest.runs.case import CaseModel
+from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import (
     Optics,
     all_files,
@@ -42,8 +42,8 @@ from modeharvest.runs.photographs.summary import harvest_summary
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import Stages, digest, exclusive, stage_key, versions
-from modeharvest.util.typed import plain
+from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
+from modeharvest.util.typed import to_plain
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
@@ -52,51 +52,36 @@ _CODE = ("fem", "imaging", "idic", "runs")
 
 
 @dataclass(frozen=True)
-class HarvestRun:
-    """An experiment, the folder it leaves its files in, and who listens to its progress.
+class HarvestRun(StagedRun[PhotographCase]):
+    """The stages of a harvest.
 
     Parameters
     ----------
-    experiment
-        Of which there are photographs.
-    base
-        Folder that its files' names are relative to.
-    folder
-        Where to leave what is found.
-    progress
-        Listener.
+    case, folder, progress
+        As of every run.
     source
-        The experiment's file, for the report.
+        The case's file, for the report.
     """
 
-    experiment: PhotographCase
-    base: Path
-    folder: Path
-    progress: Progress = silent
     source: str = "EXPERIMENT.toml"
-
-    @property
-    def stages(self) -> Stages:
-        """What is finished in the folder."""
-        return Stages(self.folder)
 
     @cached_property
     def optics(self) -> Optics:
         """The lens; a calibration leaves ``distortion.json`` and ``calibration.json``."""
-        table = self.experiment.distortion
+        table = self.case.distortion
         if table.file:
-            return Optics(read_distortion(self.base / table.file))
+            return Optics(read_distortion(self.case.base / table.file))
         if not table.calibration:
             return Optics()
-        files = named_files(self.base, table.calibration, unique=False)
+        base = self.case.base
+        files = named_files(base, table.calibration, unique=False)
 
         def work() -> tuple[Path, ...]:
-            calibrate_lens(table, self.base, self.folder, self.progress)
+            calibrate_lens(table, base, self.folder, self.progress)
             return self.folder / "distortion.json", self.folder / "calibration.json"
 
-        key = stage_key([plain(table), [sha256_of(path) for path in files]], *_CODE)
-        self.stages.do("optics", key, work)
-        return calibrated_lens(self.folder)
+        key = stage_key([to_plain(table), [sha256_of(path) for path in files]], *_CODE)
+        return self.do("optics", key, work, lambda: calibrated_lens(self.folder))
 
     def prepared(self) -> PreparedPhotographs:
         """Make the photographs ready; leaves ``prepared/``."""
@@ -104,15 +89,15 @@ class HarvestRun:
 
         def work() -> tuple[Path, ...]:
             distortion = self.optics.distortion
-            return prepare(self.experiment, self.base, folder, distortion, self.progress).files
+            return prepare(self.case, folder, distortion, self.progress).files
 
-        self.stages.do("prepare", self._prepared_key(), work)
-        return PreparedPhotographs.read(folder)
+        key = self._prepared_key()
+        return self.do("prepare", key, work, lambda: PreparedPhotographs.read(folder))
 
     @cached_property
     def geometry(self) -> Geometry:
         """Holes, lattice and cellular part, from the reference."""
-        return find_geometry(self.prepared(), self.experiment.specimen, self.base)
+        return find_geometry(self.prepared(), self.case.specimen, self.case.base)
 
     def results(self) -> dict[str, MeasuredPhotograph]:
         """Correlate every photograph, each after the one before; leaves ``results/``.
@@ -132,22 +117,22 @@ class HarvestRun:
         for name in prepared.names:
             key = digest([key, name, self._local_digest(name)])
             self._measure_one(prepared, name, found, key)
-            if not self._told(name)["failed"]:
+            if not self._record(name)["failed"]:
                 found[name] = self._read(name)
         if not found:
             name = prepared.names[0]
-            raise InputError(f"{name}: {self._told(name)['failed']}")
+            raise InputError(f"{name}: {self._record(name)['failed']}")
         return found
 
     def failures(self) -> tuple[tuple[str, str], ...]:
         """Names of the photographs that were read but could not be measured, and why."""
-        told = {name: self._told(name)["failed"] for name in self.prepared().names}
-        return tuple((name, reason) for name, reason in told.items() if reason)
+        reasons = {name: self._record(name)["failed"] for name in self.prepared().names}
+        return tuple((name, reason) for name, reason in reasons.items() if reason)
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
         return gather_harvest(
-            self.experiment,
+            self.case,
             self.prepared(),
             self.geometry,
             self.optics,
@@ -172,6 +157,8 @@ class HarvestRun:
         with exclusive(self.folder):
             require_writable(self.folder)
             self.results()
+            from modeharvest.report.photographs import write_harvest_report
+
             harvest = self.harvest(truth)
             summary = harvest_summary(harvest)
             write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
@@ -196,8 +183,8 @@ class HarvestRun:
                 measured = measure(
                     self._pair(prepared, name, before, found),
                     self.geometry,
-                    self.experiment.specimen.cell_size,
-                    self.experiment.correlation,
+                    self.case.specimen.cell_size,
+                    self.case.correlation,
                     self._local(prepared, name),
                     None if before is None else found[before],
                     self.progress,
@@ -207,18 +194,14 @@ class HarvestRun:
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            told = {
-                "fixed": measured.fixed,
-                "blur_px": measured.blur_px,
-                "said": measured.sentences,
-            }
-            write_json(start, {"failed": "", **told})
+            record = {"fixed": measured.fixed, "blur_px": measured.blur_px}
+            write_json(start, {"failed": "", **record, "said": measured.sentences})
             return result, field, start
 
         self.stages.do(f"correlate {name}", key, work)
 
     def _local(self, prepared: PreparedPhotographs, name: str) -> LocalField | None:
-        return local_field(self.experiment, self.base, prepared, name, self.optics.distortion)
+        return local_field(self.case, prepared, name, self.optics.distortion)
 
     def _pair(
         self,
@@ -229,7 +212,7 @@ class HarvestRun:
     ) -> ImagePair:
         """The photograph and what it is correlated with."""
         reference, mask = prepared.image(), prepared.mask()
-        if self.experiment.correlation.formulation == "updated" and before is not None:
+        if self.case.correlation.formulation == "updated" and before is not None:
             result = found[before].result
             reference, seen = pulled_back(prepared.image(before), result, result.order)
             mask = mask & seen
@@ -237,16 +220,16 @@ class HarvestRun:
 
     def _read(self, name: str) -> MeasuredPhotograph:
         result, field, _ = self._paths(name)
-        told = self._told(name)
+        record = self._record(name)
         return MeasuredPhotograph(
             Result.read(result),
             read_field(field),
-            bool(told["fixed"]),
-            float(told["blur_px"]),
-            tuple(told["said"]),
+            bool(record["fixed"]),
+            float(record["blur_px"]),
+            tuple(record["said"]),
         )
 
-    def _told(self, name: str) -> dict[str, Any]:
+    def _record(self, name: str) -> dict[str, Any]:
         return dict(read_json(self._paths(name)[2]))
 
     def _paths(self, name: str) -> tuple[Path, Path, Path]:
@@ -254,27 +237,28 @@ class HarvestRun:
         return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
 
     def _prepared_key(self) -> str:
-        tables, files = self.experiment.plain(), all_files(self.experiment, self.base)
+        tables, files = self.case.plain(), all_files(self.case)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
         return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *_CODE)
 
     def _how(self) -> list[Any]:
-        tables = self.experiment.plain()
+        tables = self.case.plain()
         return [tables["correlation"], tables["local"]]
 
     def _local_digest(self, name: str) -> str:
-        files = self.experiment.local.files
-        path = of_each_photograph(self.experiment, self.base, files, "local.files").get(name)
+        path = of_each_photograph(self.case, self.case.local.files, "local.files").get(name)
         return "" if path is None else sha256_of(path)
 
 
-def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -> dict[str, Any]:
-    """Harvest an experiment's photographs; what ``modeharvest harvest`` does.
+def harvest(
+    case: str | Path | CaseModel, folder: Path | str, progress: Progress = silent
+) -> dict[str, Any]:
+    """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
     Parameters
     ----------
-    path
-        Its TOML file.
+    case
+        The path of its TOML file, or the case itself.
     folder
         Where to leave the files.
     progress
@@ -288,9 +272,9 @@ def harvest(path: Path | str, folder: Path | str, progress: Progress = silent) -
     Raises
     ------
     InputError
-        If the experiment can't be used; before anything is computed, if a file is missing.
+        If the case can't be used; before anything is computed, if a file is missing.
     """
-    path = Path(path)
-    experiment = read_photograph_case(path)
-    require_inputs(experiment, path.parent)
-    return HarvestRun(experiment, path.parent, Path(folder), progress, str(path)).all()
+    found = PhotographCase.of(case)
+    require_inputs(found)
+    source = "CASE" if case is found else str(case)
+    return HarvestRun(found, Path(folder), progress, source).all()

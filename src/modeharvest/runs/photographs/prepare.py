@@ -75,15 +75,13 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
     return tuple(paths)
 
 
-def of_each_photograph(
-    experiment: PhotographCase, base: Path, names: Sequence[str], what: str
-) -> dict[str, Path]:
+def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) -> dict[str, Path]:
     """The file that goes with each deformed photograph, by the photograph's name.
 
     Parameters
     ----------
-    experiment, base
-        What there is, and the folder its names are relative to.
+    case
+        What there is.
     names
         Of the files, or patterns; none at all is all right.
     what
@@ -94,8 +92,8 @@ def of_each_photograph(
     InputError
         If there aren't as many as photographs.
     """
-    files = named_files(base, names, unique=False)
-    photographs = named_files(base, experiment.images.deformed)
+    files = named_files(case.base, names, unique=False)
+    photographs = named_files(case.base, case.images.deformed)
     if files and len(files) != len(photographs):
         raise InputError(
             f"{what}: expected one file for each of {len(photographs)} deformed images, got "
@@ -104,17 +102,17 @@ def of_each_photograph(
     return {path.stem: file for path, file in zip(photographs, files, strict=False)}
 
 
-def all_files(experiment: PhotographCase, base: Path) -> tuple[Path, ...]:
-    """Every file that an experiment names, but fields of a local DIC."""
-    images, table, lens = experiment.images, experiment.specimen, experiment.distortion
+def all_files(case: PhotographCase) -> tuple[Path, ...]:
+    """Every file that a case names, but fields of a local DIC."""
+    images, table, lens = case.images, case.specimen, case.distortion
     names = [images.reference, *images.deformed, *images.repeats]
     names += [table.material, table.cells, *table.deformed_material]
     names += [lens.file, *lens.calibration]
-    return named_files(base, [name for name in names if name], unique=False)
+    return named_files(case.base, [name for name in names if name], unique=False)
 
 
-def require_inputs(experiment: PhotographCase, base: Path) -> None:
-    """Raise in one line unless all that an experiment names is there.
+def require_inputs(case: PhotographCase) -> None:
+    """Raise in one line unless all that a case names is there.
 
     Raises
     ------
@@ -123,17 +121,16 @@ def require_inputs(experiment: PhotographCase, base: Path) -> None:
     MissingDependencyError
         If pyvale is asked for and not installed.
     """
-    local = experiment.local
-    files = (*all_files(experiment, base), *named_files(base, local.files, unique=False))
+    local = case.local
+    files = (*all_files(case), *named_files(case.base, local.files, unique=False))
     missing = [path for path in files if not path.is_file()]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
             f"expected the files that the experiment names, found no file {missing[0]}{more}"
         )
-    masks = experiment.specimen.deformed_material
-    of_each_photograph(experiment, base, masks, "specimen.deformed_material")
-    of_each_photograph(experiment, base, local.files, "local.files")
+    of_each_photograph(case, case.specimen.deformed_material, "specimen.deformed_material")
+    of_each_photograph(case, local.files, "local.files")
     if local.code == "pyvale":
         pyvale_python()
 
@@ -196,41 +193,25 @@ def calibrated_lens(folder: Path) -> Optics:
 
 
 def prepare(
-    experiment: PhotographCase,
-    base: Path,
+    case: PhotographCase,
     folder: Path,
     distortion: Distortion | None = None,
     progress: Progress = silent,
 ) -> PreparedPhotographs:
-    """Make an experiment's photographs ready; leaves them in ``folder``.
-
-    Parameters
-    ----------
-    experiment
-        Of which there are photographs.
-    base
-        Folder that its files' names are relative to.
-    folder
-        Where to leave them.
-    distortion
-        Of the optics.
-    progress
-        Listener.
+    """Make a case's photographs ready; leaves them in ``folder``.
 
     Raises
     ------
     InputError
         If the reference can't be used, or none of the deformed images.
     """
-    images, table = experiment.images, experiment.specimen
+    images, table, base = case.images, case.specimen, case.base
     reference = read_reference(base / images.reference)
-    cell_px = table.cell_size / experiment.scale.mm_per_px
+    cell_px = table.cell_size / case.scale.mm_per_px
     ready = _Maker(folder, distortion, material_options(cell_px))
     mask = ready.save("reference", reference, _given(base, table.material))
     deformed = named_files(base, images.deformed)
-    masks = of_each_photograph(
-        experiment, base, table.deformed_material, "specimen.deformed_material"
-    )
+    masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
     names, skipped, notes = [], [], list(reference.notes) + ready.sentences
     for k, path in enumerate(deformed):
         progress(k, len(deformed), "prepare photographs")
@@ -248,20 +229,17 @@ def prepare(
             f"{skipped[0][1]}"
         )
     rows, cols = reference.shape
-    grid = PixelGrid.centred(rows, cols, experiment.scale.mm_per_px)
+    grid = PixelGrid.centred(rows, cols, case.scale.mm_per_px)
     info = {
         "names": names,
         "skipped": skipped,
-        "noise": vars(_noise(experiment, base, reference, mask)),
+        "noise": vars(_noise(case, reference, mask)),
         "grid": vars(grid),
         "full_scale": reference.full_scale,
         "notes": notes,
     }
     write_json(folder / PREPARED_FILE, info)
     return PreparedPhotographs(folder, info)
-
-
-"""Window in which the speckle's contrast is looked at, as a share of the cell."""
 
 
 class _Maker:
@@ -297,47 +275,33 @@ def _given(base: Path, name: str) -> Path | None:
     return base / name if name else None
 
 
-def _noise(
-    experiment: PhotographCase, base: Path, reference: Photograph, mask: BoolArray
-) -> CameraNoise:
+def _noise(case: PhotographCase, reference: Photograph, mask: BoolArray) -> CameraNoise:
     """Given, measured or estimated, in this order; before any interpolation smooths it."""
-    if experiment.noise.sd is not None:
-        return CameraNoise(experiment.noise.sd, GIVEN)
-    repeats = experiment.images.repeats
-    if not repeats:
+    if case.noise.sd is not None:
+        return CameraNoise(case.noise.sd, GIVEN)
+    if not case.images.repeats:
         return estimated_noise(reference.image, mask)
-    others = [read_frame(path, reference).image for path in named_files(base, repeats, False)]
+    repeats = named_files(case.base, case.images.repeats, unique=False)
+    others = [read_frame(path, reference).image for path in repeats]
     return measured_noise([reference.image, *others], mask)
 
 
 def local_field(
-    experiment: PhotographCase,
-    base: Path,
+    case: PhotographCase,
     prepared: PreparedPhotographs,
     name: str,
     distortion: Distortion | None,
 ) -> LocalField | None:
     """The displacement field of one deformed photograph by a local DIC; None if there is none.
 
-    Files are of the photographs as they are; what the lens did to them is taken out here.
-
-    Parameters
-    ----------
-    experiment, base
-        What there is, and the folder its names are relative to.
-    prepared
-        The photographs, made ready.
-    name
-        Of the deformed photograph.
-    distortion
-        Of the lens.
+    Files are of the photographs before the lens was taken out of them; it is taken out here.
 
     Raises
     ------
     InputError
         If there aren't as many files as photographs, or this one's can't be used.
     """
-    table, grid = experiment.local, prepared.grid
+    table, grid = case.local, prepared.grid
     if table.code == "none":
         return None
     if table.code == "pyvale":
@@ -346,17 +310,17 @@ def local_field(
             prepared.image(), prepared.image(name), grid, prepared.mask(), prepared.mask(name),
             options,
         )  # fmt: skip
-    path = of_each_photograph(experiment, base, table.files, "local.files")[name]
+    path = of_each_photograph(case, table.files, "local.files")[name]
     field = read_field(
         path,
         grid,
-        units=_told(table.unit),
-        y_axis=_told(table.y_axis),
+        units=_or_none(table.unit),
+        y_axis=_or_none(table.y_axis),
         first_pixel=table.first_pixel,
         columns=table.columns,
     )
     return field if distortion is None else without_distortion(field, grid, distortion)
 
 
-def _told(value: str) -> str | None:
+def _or_none(value: str) -> str | None:
     return None if value == "auto" else value

@@ -294,7 +294,7 @@ _ALONG = 120
 
 
 def gather_harvest(
-    experiment: PhotographCase,
+    case: PhotographCase,
     prepared: PreparedPhotographs,
     geometry: Geometry,
     optics: Optics,
@@ -311,7 +311,9 @@ def gather_harvest(
 
     Parameters
     ----------
-    experiment, prepared, geometry, optics, results
+    case
+        What was harvested.
+    prepared, geometry, optics, results
         The stages' outcomes.
     skipped
         Names of photographs that were not used, and why.
@@ -327,13 +329,13 @@ def gather_harvest(
     frames, moments = [], []
     for k, (name, measured) in enumerate(results.items()):
         progress(k, len(results), "error bars")
-        frame = _frame(experiment, prepared, geometry, name, measured)
+        frame = _frame(case, prepared, geometry, name, measured)
         frames.append(frame)
         moments.append(_moment(frame, geometry.region.cellular))
     noise, path = prepared.noise, Path(source)
     return Harvest(
-        title=experiment.title or "Photographs of a test",
-        experiment=experiment.plain(),
+        title=case.title or "Photographs of a test",
+        experiment=case.plain(),
         grid=prepared.grid,
         reference=prepared.image(),
         mask=prepared.mask(),
@@ -358,7 +360,7 @@ def gather_harvest(
 
 
 def _frame(
-    experiment: PhotographCase,
+    case: PhotographCase,
     prepared: PreparedPhotographs,
     geometry: Geometry,
     name: str,
@@ -366,7 +368,7 @@ def _frame(
 ) -> HarvestedFrame:
     result, image = measured.result, prepared.image(name)
     box = geometry.region.cellular
-    cell = experiment.specimen.cell_size
+    cell = case.specimen.cell_size
     x, y = _axes(geometry.region.domain)
     noise = noise_of(prepared, name)
     by_noise, by_model_error, warnings = covariances(
@@ -396,7 +398,7 @@ def _frame(
         spectrum=spectrum,
         pattern=pattern,
         parts=_parts(measured, geometry, cell),
-        local=measured.local if experiment.local.code != "none" else None,
+        local=measured.local if case.local.code != "none" else None,
         start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
         warnings=warnings,
     )
@@ -410,11 +412,6 @@ def _parts(
         return ()
     spectra = {p.name: measured_spectrum(measured.local, cell, p.box) for p in geometry.parts}
     return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
-
-
-"""Pixels so near to a hole have no say in error bars [px]."""
-
-"""Examples of noise: with 100 cells a standard deviation is good to 4 %."""
 
 
 def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:

@@ -22,12 +22,12 @@ images are in px, positions and fields in mm. rms is per component.
     ``w_rms_px``, ``sd_px``, ``w_beyond_noise_px``), ``modes``, ``pattern_reading`` and
     ``start`` (sentences), ``warnings``.
 ``frames[].modes``
-    One for each mode: ``family``, ``held``, ``observable``, ``amplitude_px`` (rms of v phi),
+    One for each mode: ``family``, ``fixed``, ``observable``, ``amplitude_px`` (rms of v phi),
     ``largest_px`` (its largest length), ``v_max_mm`` with ``v_max_sd_noise_mm`` and
     ``v_max_sd_model_error_mm`` (largest |v| over the part with holes), ``overlap`` (with v0, the
     largest cosine), ``parameters`` (``name``, ``unit``, ``value``, ``sd_noise``,
     ``sd_model_error``), ``waves`` (``xi``, the wave vector [1/l], with ``sd_noise`` and
-    ``sd_model_error``; null where the mode was held).
+    ``sd_model_error``; null where the mode was fixed).
 ``timeline``
     For each frame ``name``, ``strain``, ``amplitude_px``, ``model_error_px``, ``noise_px``,
     ``has_pattern``.
@@ -51,8 +51,7 @@ images are in px, positions and fields in mm. rms is per component.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, is_dataclass
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -61,6 +60,7 @@ from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.uncertainty.covariance import FieldErrors
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.typed import to_plain
 
 _CELLS = 360
 """Along the images' longer side, at which fields are evaluated for their largest values."""
@@ -77,7 +77,7 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
     sd_noise, sd_left = _sd(np.eye(family.size), noise), _sd(np.eye(family.size), left)
     return {
         "family": family.name,
-        "held": family.size == 0,
+        "fixed": family.size == 0,
         "observable": i not in seen.unobservable,
         "amplitude_px": seen.amplitude_px[i],
         **_largest_values(harvest, frame, i),
@@ -102,11 +102,11 @@ def _wave_vectors(
     found = []
     for w, wave in enumerate(waves):
         rows = to_xi * mode.family.matrix[PER_WAVE * w + 2 : PER_WAVE * w + 4]
-        held = not rows.any()
+        fixed = not rows.any()
         found.append({
             "xi": to_xi * wave[2:4],
-            "sd_noise": None if held else _sd(rows, noise),
-            "sd_model_error": None if held else _sd(rows, left),
+            "sd_noise": None if fixed else _sd(rows, noise),
+            "sd_model_error": None if fixed else _sd(rows, left),
         })  # fmt: skip
     return found
 
@@ -177,10 +177,10 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         "optics": _optics(harvest),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
         "sentences": harvest.sentences,
-        "truth": [] if truth is None else [asdict(row) for row in truth.rows],
+        "truth": [] if truth is None else truth.rows,
         "versions": harvest.versions,
     }  # fmt: skip
-    plain: dict[str, Any] = plain_values(summary)
+    plain: dict[str, Any] = to_plain(summary)
     return plain
 
 
@@ -221,7 +221,7 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
 
 
 def _frame_warnings(frame: HarvestedFrame) -> list[str]:
-    """What identifiability warns of, but for modes that are held, as it advises."""
+    """What identifiability warns of, but for modes that are fixed, as it advises."""
     seen, modes = frame.identifiability, frame.result.ansatz.modes
     said = dict(zip(seen.unobservable, seen.warnings, strict=False))  # those come first
     return [w for w in seen.warnings
@@ -310,20 +310,3 @@ def _optics(harvest: Harvest) -> dict[str, Any] | None:
 
 def _share(level: float, full_scale: float | None) -> float | None:
     return level / full_scale if full_scale else None
-
-
-def plain_values(value: Any) -> Any:
-    """Dictionaries, lists, strings, numbers; null for what is not a finite number."""
-    if isinstance(value, Mapping):
-        return {str(k): plain_values(v) for k, v in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain_values(asdict(value))
-    if isinstance(value, np.ndarray):
-        return plain_values(value.tolist())
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain_values(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
