@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from affine_aside import affine_aside
 from numpy.typing import NDArray
 
 from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
@@ -23,7 +24,7 @@ from modeharvest.imaging.distortion.calibration.pair import recover_camera
 from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import affine_aside, undistorted, undistorted_mask
+from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.sensor import quantise
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec

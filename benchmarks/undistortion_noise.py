@@ -20,7 +20,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import Level
-from modeharvest.imaging.distortion.calibration.result import undistorted_noise
+from modeharvest.imaging.distortion.calibration.result import sampled_correlations
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.grid import PixelGrid
@@ -86,6 +86,24 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
         f"| {name} | {100 * noise:g} % | {abs(truth).max():.1f} | {blur:g} "
         f"| {mean_error:.4f} | {scatter:.4f} | {words} | {np.mean(residual):.3f} |"
     )
+
+
+def undistorted_noise(order: int = 5) -> tuple[float, float]:
+    """Variance of white noise of variance 1 in an undistorted image, and where that is sampled.
+
+    The residual of a correlation of two undistorted images holds the first of f and the second of
+    g: its variance is their sum times that of the camera's noise. The unknowns see slower waves,
+    of which no noise is lost: their covariance is that of the camera's noise itself.
+
+    Parameters
+    ----------
+    order
+        Of both splines, 3 or 5.
+    """
+    _, correlations = sampled_correlations(0.0, order, 1.0)
+    once = float(correlations.max())
+    # Sampling noise with correlations R at a phase that is anything: sum over lags of R R.
+    return once**2, float((correlations**2).sum()) ** 2
 
 
 def noise_free(lens: CameraDistortion | None) -> float:

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from affine_aside import affine_aside
 from calibration_set import photographs, random_lens
 from numpy.typing import NDArray
 from scipy import ndimage
+from undistortion_noise import undistorted_noise
 
 from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
-from modeharvest.imaging.distortion.calibration.result import (
-    Calibration,
-    sampled_noise,
-    undistorted_noise,
-)
+from modeharvest.imaging.distortion.calibration.result import Calibration, sampled_noise
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import affine_aside, undistorted
+from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.errors import InputError
 

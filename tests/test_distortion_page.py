@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from affine_aside import affine_aside
 from calibration_set import photographs, random_lens
 
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import affine_aside
 
 PAGE = (Path(__file__).parents[1] / "docs" / "distortion.md").read_text("utf-8")
 SHAPE = (140, 170)

@@ -2,17 +2,11 @@
 
 f(phi_S(x)) of the paper's Eq. (r2) is :func:`undistorted`: each image is resampled once on the
 ideal pixel grid, and a correlation of such images needs to know nothing of the lens.
-
-Photographs of a target under unknown shifts look the same for phi_S and for phi_S after any affine
-map A, because A turns shifts into shifts. So :func:`affine_aside` compares two distortions after
-the A that brings them nearest to each other; with S of 15 px over 1000 px, to subtract the affine
-part of S itself would be wrong by some tenths of a px.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -151,53 +145,3 @@ def without_affine(distortion: Distortion, shape: tuple[int, int]) -> Polynomial
         default=0,
     )  # fmt: skip
     return PolynomialDistortion(shape, coefficients[:, : PolynomialDistortion.size_of(degree)])
-
-
-_LINES = 33
-"""Of the grid on which distortions are compared."""
-
-
-@dataclass(frozen=True, eq=False)
-class AffineAside:
-    """The difference of two distortions whose affine parts don't count.
-
-    Parameters
-    ----------
-    rms_px, largest_px
-        Over the image: rms per component; largest length [px].
-    difference
-        (2, 33, 33) phi_found(x) - phi_truth(A x), along rows and columns, on an even grid over
-        the image [px].
-    matrix, offset
-        (2, 2), (2,) of A x = matrix x + offset, x = (row, col) [px].
-    """
-
-    rms_px: float
-    largest_px: float
-    difference: FloatArray
-    matrix: FloatArray
-    offset: FloatArray
-
-
-def affine_aside(found: Distortion, truth: Distortion, shape: tuple[int, int]) -> AffineAside:
-    """Compare two distortions over an image of ``shape`` (rows, cols) [px], affine part aside."""
-    axes = [np.linspace(0.0, n - 1.0, _LINES) for n in shape]
-    row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
-    seen = np.stack(found.observed(row, col))
-    terms = np.stack([np.ones(row.size), row, col])
-    affine = np.eye(2, 3, 1)
-    for _ in range(6):  # Gauss-Newton, from the identity
-        at = affine @ terms
-        misfit = np.stack(truth.observed(*at)) - seen
-        slope = truth.gradient(*at) + np.eye(2)[:, :, None]
-        columns = np.einsum("ijn,kn->injk", slope, terms).reshape(2 * row.size, 6)
-        step = np.linalg.lstsq(columns, -misfit.ravel(), rcond=None)[0]
-        affine = affine + step.reshape(2, 3)
-    misfit = seen - np.stack(truth.observed(*(affine @ terms)))
-    return AffineAside(
-        rms_px=float(np.sqrt(np.mean(misfit**2))),
-        largest_px=float(np.hypot(*misfit).max()),
-        difference=misfit.reshape(2, _LINES, _LINES),
-        matrix=affine[:, 1:],
-        offset=affine[:, 0],
-    )

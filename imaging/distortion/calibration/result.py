@@ -42,33 +42,15 @@ def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, 
         neighbouring samples have in common: the variance that a field sees that varies slowly
         from sample to sample. ``many`` is 1 for a stride of 1 px: no information is lost there.
     """
-    lags, correlations = _correlations(blur_px, order, stride_px)
+    lags, correlations = sampled_correlations(blur_px, order, stride_px)
     one = float(correlations[lags == 0.0].sum())
     return one**2, float(correlations.sum()) ** 2
 
 
-def undistorted_noise(order: int = 5) -> tuple[float, float]:
-    """Variance of white noise of variance 1 in an undistorted image, and where that is sampled.
-
-    The residual of a correlation of two undistorted images holds the first of f and the second of
-    g: its variance is their sum times that of the camera's noise. The unknowns see slower waves,
-    of which no noise is lost: their covariance is that of the camera's noise itself.
-
-    Parameters
-    ----------
-    order
-        Of both splines, 3 or 5.
-    """
-    _, correlations = _correlations(0.0, order, 1.0)
-    once = float(correlations.max())
-    # Sampling noise with correlations R at a phase that is anything: sum over lags of R R.
-    return once**2, float((correlations**2).sum()) ** 2
-
-
-def _correlations(
+def sampled_correlations(
     blur_px: float, order: int, stride_px: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lags [px] along an axis, and covariances of sampled noise at them."""
+    """Lags [px] along an axis, and covariances at them of white noise blurred and sampled."""
     reach = int(np.ceil(16 + 6 * blur_px))
     impulse = np.zeros((24, 2 * reach + 1))
     impulse[:, reach] = 1.0  # a line, so that the other axis has no say
