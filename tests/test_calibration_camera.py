@@ -8,7 +8,8 @@ from calibration_set import photographs, random_lens
 from numpy.typing import NDArray
 
 from modeharvest.imaging.distortion.calibration.model import CameraModel, PolynomialModel
-from modeharvest.imaging.distortion.calibration.pair import RecoveredLens, recover_camera
+from modeharvest.imaging.distortion.calibration.pair import recover_camera
+from modeharvest.imaging.distortion.calibration.result import LensEstimate
 from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
 from modeharvest.util.errors import InputError
 
@@ -28,13 +29,13 @@ def pair(lens: Distortion, noise: float = NOISE) -> tuple[FloatArray, FloatArray
     return ideal, seen + noise * np.random.default_rng(8).normal(size=SHAPE)
 
 
-def difference(found: RecoveredLens, lens: Distortion) -> float:
+def difference(found: LensEstimate, lens: Distortion) -> float:
     """Rms per component over the image [px]."""
     d = np.stack(found.distortion.shift(*POSITIONS)) - np.stack(lens.shift(*POSITIONS))
     return float(np.sqrt(np.mean(d**2)))
 
 
-def predicted(found: RecoveredLens) -> float:
+def predicted(found: LensEstimate) -> float:
     return float(np.sqrt(np.mean(np.square(found.sd(*POSITIONS)))))
 
 

@@ -30,7 +30,7 @@ AnyDistortion = PolynomialDistortion | CameraDistortion | SampledDistortion
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "M")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "D1")
-_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_CAMERA = tuple(f.name for f in fields(CameraDistortion))  # coefficients in OpenCV's order
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -133,11 +133,11 @@ def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:
             "thin prisms and tilted sensors are not supported"
         )
     fx, _, cx, _, fy, cy, *_ = (float(number) for number in matrix)
-    lens = dict(zip(_ORDER, map(float, coefficients), strict=False))
+    lens = dict(zip(_CAMERA[4:], map(float, coefficients), strict=False))
     return made(CameraDistortion, {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens})
 
 
-def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> CameraDistortion:
+def _from_dice(root: ElementTree.Element, which: int | str, path: Path) -> CameraDistortion:
     """Camera of a DICe calibration file."""
     cameras = [
         {p.get("name", ""): p.get("value", "") for p in item.iter("Parameter")}
@@ -145,9 +145,9 @@ def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> Came
         if item.get("name", "").startswith("CAMERA")
     ]
     ids = [camera.get("CAMERA_ID", "") for camera in cameras]
-    index = ids.index(wanted) if wanted in ids else wanted
+    index = ids.index(which) if which in ids else which
     if not (isinstance(index, int) and 0 <= index < len(cameras)):
-        raise InputError(f"expected camera {wanted!r} at {path}, got the cameras {ids}")
+        raise InputError(f"expected camera {which!r} at {path}, got the cameras {ids}")
     entries = cameras[index]
     model = entries.get("LENS_DISTORTION_MODEL", "OPENCV_LENS_DISTORTION")
     if model != "OPENCV_LENS_DISTORTION" or float(entries.get("FS", 0.0)) != 0.0:
@@ -155,6 +155,5 @@ def _from_dice(root: ElementTree.Element, wanted: int | str, path: Path) -> Came
             f"expected OPENCV_LENS_DISTORTION without skew (FS) at {path}, got {model} with FS "
             f"{entries.get('FS', 0.0)}"
         )
-    names = ("fx", "fy", "cx", "cy", *_ORDER)
-    lens = {n: float(entries[n.upper()]) for n in names if n.upper() in entries}
+    lens = {n: float(entries[n.upper()]) for n in _CAMERA if n.upper() in entries}
     return made(CameraDistortion, lens)

@@ -31,7 +31,7 @@ _STEPS = 30
 class Distortion(ABC):
     """A mapping of ideal image positions to those where a lens shows them.
 
-    Kinds say :meth:`shift` and :meth:`gradient`; the mapping and its inverse follow. Positions
+    Kinds define :meth:`shift` and :meth:`gradient`; the mapping and its inverse follow. Positions
     are (row, col) in px, whole numbers at pixel centres, of any shapes that broadcast together;
     an open grid, (rows, 1) and (1, cols), is fastest.
     """
@@ -60,28 +60,28 @@ class Distortion(ABC):
             If the mapping is not one-to-one there: it folds.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
-        seen = np.stack([row.ravel(), col.ravel()])
-        found = np.empty_like(seen)
-        for first in range(0, seen.shape[1], _CHUNK):
+        observed = np.stack([row.ravel(), col.ravel()])
+        found = np.empty_like(observed)
+        for first in range(0, observed.shape[1], _CHUNK):
             part = slice(first, first + _CHUNK)
-            found[:, part] = self._newton(seen[:, part])
+            found[:, part] = self._newton(observed[:, part])
         return found[0].reshape(row.shape), found[1].reshape(row.shape)
 
-    def _newton(self, seen: FloatArray) -> FloatArray:
-        """(2, n) ideal positions of (2, n) seen ones."""
-        found = seen - np.stack(self.shift(*seen))
+    def _newton(self, observed: FloatArray) -> FloatArray:
+        """(2, n) ideal positions of (2, n) observed ones."""
+        found = observed - np.stack(self.shift(*observed))
         for _ in range(_STEPS):
-            misfit = np.stack(self.observed(*found)) - seen
+            misfit = np.stack(self.observed(*found)) - observed
             (rr, rc), (cr, cc) = self.gradient(*found)
             det = (1.0 + rr) * (1.0 + cc) - rc * cr
             if (det <= 0.0).any():
-                raise _folds(seen[:, int(np.argmax(det <= 0.0))])
+                raise _folds(observed[:, int(np.argmax(det <= 0.0))])
             found[0] -= ((1.0 + cc) * misfit[0] - rc * misfit[1]) / det
             found[1] -= ((1.0 + rr) * misfit[1] - cr * misfit[0]) / det
             length = np.abs(misfit).max(axis=0) / np.minimum(det, 1.0)
             if not (length > _SETTLED_PX).any():  # NaN counts as settled
                 return found
-        raise _folds(seen[:, int(np.nanargmax(length))])
+        raise _folds(observed[:, int(np.nanargmax(length))])
 
 
 def _folds(position: FloatArray) -> InputError:
@@ -239,18 +239,23 @@ class CameraDistortion(Distortion):
                 f"distortion: expected focal lengths above 0 px, got {self.fx} and {self.fy}"
             )
 
-    def _normalised(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def normalised(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """x and y of image positions [-]."""
         x: FloatArray = np.subtract(col, self.cx, dtype=np.float64) / self.fx
         y: FloatArray = np.subtract(row, self.cy, dtype=np.float64) / self.fy
         return x, y
 
+    def radial(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Numerator and denominator of q, both less 1, at s = r^2."""
+        top = s * (self.k1 + s * (self.k2 + s * self.k3))
+        return top, s * (self.k4 + s * (self.k5 + s * self.k6))
+
     def shift(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """S: the components (d_row, d_col) [px] at ideal positions [px]."""
-        x, y = self._normalised(row, col)
+        x, y = self.normalised(row, col)
         x2, y2, xy = x * x, y * y, x * y
         s = x2 + y2
-        top = s * (self.k1 + s * (self.k2 + s * self.k3))
-        below = s * (self.k4 + s * (self.k5 + s * self.k6))
+        top, below = self.radial(s)
         more = (top - below) / (1.0 + below)  # q - 1 without cancellation
         d_col = self.fx * (x * more + 2.0 * self.p1 * xy + self.p2 * (s + 2.0 * x2))
         d_row = self.fy * (y * more + self.p1 * (s + 2.0 * y2) + 2.0 * self.p2 * xy)
@@ -258,10 +263,9 @@ class CameraDistortion(Distortion):
 
     def gradient(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
-        x, y = np.broadcast_arrays(*self._normalised(row, col))
+        x, y = np.broadcast_arrays(*self.normalised(row, col))
         s = x * x + y * y
-        top = s * (self.k1 + s * (self.k2 + s * self.k3))
-        below = s * (self.k4 + s * (self.k5 + s * self.k6))
+        top, below = self.radial(s)
         more = (top - below) / (1.0 + below)
         d_top = self.k1 + s * (2.0 * self.k2 + 3.0 * s * self.k3)
         d_below = self.k4 + s * (2.0 * self.k5 + 3.0 * s * self.k6)

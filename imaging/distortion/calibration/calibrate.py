@@ -16,14 +16,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
+from numpy.typing import ArrayLike
 from skimage.registration import phase_cross_correlation
 
 from modeharvest.imaging.distortion.calibration.fit import (
+    POSE_UNKNOWNS,
     Fit,
     Pose,
     View,
+    blurred_spline,
+    checked_images,
     fit_views,
     normalised_illumination,
     with_poses,
@@ -34,9 +36,7 @@ from modeharvest.imaging.distortion.calibration.result import (
     calibration_of,
     sampled_noise,
 )
-from modeharvest.imaging.photographs.files import require_contrast
-from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
@@ -106,7 +106,7 @@ def calibrate(
     options
         How.
     progress
-        Told about every fit.
+        Listener.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def calibrate(
 
 
 def _coarse_fit(
-    photographs: Sequence[NDArray[np.float32]],
+    photographs: Sequence[FloatImage],
     poses: Sequence[Pose],
     moving: tuple[bool, bool, bool],
     options: CalibrationOptions,
@@ -154,7 +154,7 @@ def _coarse_fit(
 
 
 def _trials(
-    photographs: Sequence[NDArray[np.float32]],
+    photographs: Sequence[FloatImage],
     model: PolynomialModel,
     fit: Fit,
     moving: tuple[bool, bool, bool],
@@ -183,23 +183,13 @@ def _trials(
     return trials, stride
 
 
-def _checked(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
+def _checked(images: Sequence[ArrayLike]) -> list[FloatImage]:
     if len(images) < 3:
         raise InputError(
             "expected a calibration set of at least 3 photographs, shifted along two directions, "
             f"got {len(images)}: a calibration set without enough shifts"
         )
-    found = [np.asarray(image, dtype=np.float32) for image in images]
-    for n, image in enumerate(found):
-        if image.ndim != 2 or image.shape != found[0].shape or min(image.shape) < 64:
-            raise InputError(
-                "expected calibration photographs of one size, at least 64 x 64 px, got "
-                f"{image.shape} for number {n + 1} and {found[0].shape} for number 1"
-            )
-        if not np.isfinite(image).all():
-            raise InputError(f"expected finite grey levels in calibration photograph {n + 1}")
-        require_contrast(image, f"calibration photograph {n + 1},")
-    return found
+    return checked_images(images, [f"{n + 1}. calibration" for n in range(len(images))])
 
 
 def _given(shifts: ArrayLike | None, count: int) -> FloatArray:
@@ -213,7 +203,7 @@ def _given(shifts: ArrayLike | None, count: int) -> FloatArray:
     return relative
 
 
-def _rough_shifts(photographs: Sequence[NDArray[np.float32]]) -> FloatArray:
+def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
     """(m, 2) shifts since the first photograph [px], within some px, from binned photographs."""
     factor = max(1, max(photographs[0].shape) // _COARSE_PX)
     register: Any = phase_cross_correlation  # which has no types
@@ -227,27 +217,29 @@ def _rough_shifts(photographs: Sequence[NDArray[np.float32]]) -> FloatArray:
     return found * factor
 
 
-def _binned(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def _binned(image: FloatImage, factor: int) -> FloatImage:
     rows, cols = (n // factor for n in image.shape)
     blocks = image[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
 def _views(
-    photographs: Sequence[NDArray[np.float32]],
+    photographs: Sequence[FloatImage],
     poses: Sequence[Pose],
     free: tuple[bool, ...],
     blur: float,
     order: int,
 ) -> list[View]:
     """Photographs as splines; the first one stays where it is."""
-    views = []
-    for n, (image, pose) in enumerate(zip(photographs, poses, strict=True)):
-        blurred = ndimage.gaussian_filter(image, blur) if blur > 0.0 else image
-        own = free if n else (False,) * 5
-        spline = SplineImage.of(blurred, order)
-        views.append(View(spline, pose, own, border_px=max(_BORDER_PX, blur)))
-    return views
+    return [
+        View(
+            blurred_spline(image, blur, order),
+            pose,
+            free if n else (False,) * POSE_UNKNOWNS,
+            border_px=max(_BORDER_PX, blur),
+        )
+        for n, (image, pose) in enumerate(zip(photographs, poses, strict=True))
+    ]
 
 
 def _points(

@@ -13,12 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from modeharvest.imaging.distortion.calibration.model import DistortionModel
 from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.photographs.files import require_contrast
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
+from modeharvest.util.errors import InputError
 from modeharvest.util.scaled_eigen import ScaledEigen
 
 POSE_UNKNOWNS = 5
@@ -81,13 +84,33 @@ class View:
     border_px: float = 4.0
 
 
+def checked_images(images: Sequence[ArrayLike], names: Sequence[str]) -> list[FloatImage]:
+    """The images; InputError if sizes differ or are small, or one shows no pattern."""
+    found = [np.asarray(image, dtype=np.float32) for image in images]
+    for image, name in zip(found, names, strict=True):
+        if image.ndim != 2 or image.shape != found[0].shape or min(image.shape) < 64:
+            raise InputError(
+                "expected images of one size, at least 64 x 64 px, got "
+                f"{found[0].shape} for the {names[0]} one and {image.shape} for the {name} one"
+            )
+        if not np.isfinite(image).all():
+            raise InputError(f"expected finite grey levels in the {name} image")
+        require_contrast(image, name)
+    return found
+
+
+def blurred_spline(image: FloatImage, blur_px: float, order: int) -> SplineImage:
+    """The spline of an image blurred by a Gaussian of that standard deviation [px]."""
+    return SplineImage.of(ndimage.gaussian_filter(image, blur_px) if blur_px else image, order)
+
+
 def with_poses(views: Sequence[View], poses: Sequence[Pose]) -> list[View]:
     """The same views, in other poses."""
     return [replace(view, pose=pose) for view, pose in zip(views, poses, strict=True)]
 
 
 def normalised_illumination(
-    images: Sequence[NDArray[np.float32]], shifts: FloatArray | None = None
+    images: Sequence[FloatImage], shifts: FloatArray | None = None
 ) -> list[Pose]:
     """Poses with (m, 2) shifts [px] that give all images the mean and spread of the first one."""
     mean, spread = float(images[0].mean(dtype=np.float64)), float(images[0].std(dtype=np.float64))
@@ -251,10 +274,10 @@ def _assemble(
         count = np.sum([sample.inside for sample in samples], axis=0)
         weight = 1.0 / np.maximum(count, 1)
         mean = weight * np.sum([sample.value for sample in samples], axis=0)
-        seen = count > 1
+        shared = count > 1
         total = np.zeros((size, row.size))
         for n, (sample, at) in enumerate(zip(samples, where, strict=True)):
-            used = sample.inside & seen
+            used = sample.inside & shared
             deviation = np.where(used, sample.value - mean, 0.0)
             columns = sample.columns * used
             matrix[np.ix_(at, at)] += columns @ columns.T
@@ -264,7 +287,7 @@ def _assemble(
             others = (mean * count - sample.value)[used] / (count[used] - 1)
             sums[n] += _moments(sample.value[used], others)
         matrix -= (total * weight) @ total.T
-        freedom += int((count[seen] - 1).sum())
+        freedom += int((count[shared] - 1).sum())
     return _Equations(matrix, gradient, squares, freedom, _correlations(sums))
 
 
@@ -282,14 +305,14 @@ def _sample(
     cos, sin = np.cos(pose.angle), np.sin(pose.angle)
     at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]
     at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + pose.shift[1]
-    seen_row, seen_col = distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
-    border = view.border_px
-    inside = (seen_row >= border) & (seen_row <= rows - 1 - border)
-    inside &= (seen_col >= border) & (seen_col <= cols - 1 - border)
-    value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
-    value[inside], d_row[inside], d_col[inside] = view.spline.sample(
-        seen_row[inside], seen_col[inside]
+    observed_row, observed_col = (
+        distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
     )
+    border = view.border_px
+    inside = (observed_row >= border) & (observed_row <= rows - 1 - border)
+    inside &= (observed_col >= border) & (observed_col <= cols - 1 - border)
+    value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
+    value[inside], d_row[inside], d_col[inside] = view.spline.sample(p_row[inside], p_col[inside])
     slope = pose.contrast * np.stack([d_row, d_col])
     columns = np.zeros((len(c) + POSE_UNKNOWNS, row.size))
     if view.distorted:
@@ -299,8 +322,8 @@ def _sample(
     turn_row, turn_col = -sin * arm_row - cos * arm_col, cos * arm_row - sin * arm_col
     columns[len(c) :] = [*slope, slope[0] * turn_row + slope[1] * turn_col, value, inside]
     kept = np.r_[np.ones(len(c), np.bool_), view.free]
-    levelled = np.where(inside, pose.contrast * value + pose.brightness, 0.0)
-    return _ViewSample(inside, levelled, columns[kept])
+    normalised = np.where(inside, pose.contrast * value + pose.brightness, 0.0)
+    return _ViewSample(inside, normalised, columns[kept])
 
 
 def _moments(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -14,8 +14,6 @@ from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, Po
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
 
 class DistortionModel(Protocol):
     """Distortions with unknown coefficients c."""
@@ -146,14 +144,13 @@ class CameraModel:
         if name in ("cx", "cy"):  # S depends on p - c alone
             return -self.camera.gradient(row, col)[:, 0 if name == "cy" else 1]
         lens = self.camera
-        x, y = (col - lens.cx) / lens.fx, (row - lens.cy) / lens.fy
+        x, y = lens.normalised(row, col)
         s = x * x + y * y
         if name == "p1":
             return np.stack([lens.fy * (s + 2 * y * y), lens.fx * 2 * x * y])
         if name == "p2":
             return np.stack([lens.fy * 2 * x * y, lens.fx * (s + 2 * x * x)])
-        top = 1.0 + s * (lens.k1 + s * (lens.k2 + s * lens.k3))
-        below = 1.0 + s * (lens.k4 + s * (lens.k5 + s * lens.k6))
+        top, below = (1.0 + part for part in lens.radial(s))
         power = {"k1": s, "k2": s**2, "k3": s**3, "k4": s, "k5": s**2, "k6": s**3}[name]
         slope = power / below if name in ("k1", "k2", "k3") else -power * top / below**2
         return np.stack([lens.fy * y * slope, lens.fx * x * slope])

@@ -7,17 +7,16 @@ so all of S can be seen, its affine part included.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from modeharvest.imaging.distortion.calibration.fit import (
-    Fit,
     Pose,
     View,
+    blurred_spline,
+    checked_images,
     fit_views,
     normalised_illumination,
 )
@@ -26,57 +25,15 @@ from modeharvest.imaging.distortion.calibration.model import (
     DistortionModel,
     PolynomialModel,
 )
-from modeharvest.imaging.distortion.calibration.result import sampled_noise
+from modeharvest.imaging.distortion.calibration.result import LensEstimate, sampled_noise
 from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion
-from modeharvest.imaging.photographs.files import require_contrast
-from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 
 _BLURS_PX = (12.0, 6.0, 3.0, 0.7)
 _COARSE_POINTS, _COARSE_DEGREE = 30_000, 3
 _MARGIN_PX = 8.0
 """Nearer to the edge of the image blur and spline see beyond the edge of the scene."""
-
-
-@dataclass(frozen=True, eq=False)
-class RecoveredLens:
-    """A lens as found from a pair.
-
-    Parameters
-    ----------
-    distortion
-        What the model made of it.
-    coefficients, covariance
-        (k,) and (k, k) of the model's unknowns.
-    model
-        Which these are.
-    match
-        Correlation of the images once the distortion is taken out [-].
-    noise_sd
-        Of an image, from what is left over [grey levels].
-    bic
-        Bayesian information criterion; of two models of one pair take that with the lower one.
-    sentence
-        What was found.
-    """
-
-    distortion: Distortion
-    coefficients: FloatArray
-    covariance: FloatArray
-    model: DistortionModel
-    match: float
-    noise_sd: float
-    bic: float
-    sentence: str
-
-    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Standard deviation of S along rows and columns [px] at ideal positions [px]."""
-        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
-        columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
-        variance = np.einsum("ckn,kl,cln->cn", columns, self.covariance, columns)
-        along_row, along_col = np.sqrt(np.maximum(variance, 0.0)).reshape(2, *row.shape)
-        return along_row, along_col
 
 
 def recover_camera(
@@ -86,7 +43,7 @@ def recover_camera(
     mask: ArrayLike | None = None,
     points: int = 200_000,
     order: int = 5,
-) -> RecoveredLens:
+) -> LensEstimate:
     """Find the lens that shows the scene of one image as another.
 
     Parameters
@@ -109,8 +66,7 @@ def recover_camera(
     InputError
         If sizes differ, an image is blank, or the images don't show the same scene.
     """
-    images = [np.asarray(image, dtype=np.float32) for image in (undistorted, distorted)]
-    _require_pair(images)
+    images = checked_images((undistorted, distorted), ("undistorted", "distorted"))
     rows, cols = images[0].shape
     model = model or _unknown_camera(rows, cols)
     # Far from the solution a cubic is led less astray than a camera or a high degree.
@@ -124,27 +80,33 @@ def recover_camera(
     c = _nearest(model, coarse.distortion(c), (rows, cols))
     views = _views(images, poses, _BLURS_PX[-1], order, True)
     fit = fit_views(model, c, views, at, tolerance_px=1e-5)
-    return _recovered(model, fit, sampled_noise(_BLURS_PX[-1], order, stride))
+    if fit.matches.min() < 0.5 or not fit.converged:
+        raise InputError(
+            "expected two images of one scene, without and with distortion, got a pair whose grey "
+            f"levels correlate by {fit.matches.min():.2f} only; check the files, or try another "
+            "model"
+        )
+    return LensEstimate.of(model, fit, sampled_noise(_BLURS_PX[-1], order, stride))
 
 
 def _views(
-    images: list[NDArray[np.float32]], poses: Sequence[Pose], blur: float, order: int, light: bool
+    images: list[FloatImage], poses: Sequence[Pose], blur: float, order: int, light: bool
 ) -> list[View]:
     """The image without and that with distortion; of the latter the light may change."""
-    ideal, seen = (SplineImage.of(ndimage.gaussian_filter(i, blur), order) for i in images)
+    ideal, observed = (blurred_spline(image, blur, order) for image in images)
     free = (False, False, False, light, light)
-    return [View(ideal, poses[0], distorted=False), View(seen, poses[1], free)]
+    return [View(ideal, poses[0], distorted=False), View(observed, poses[1], free)]
 
 
 def _nearest(model: DistortionModel, distortion: Distortion, shape: tuple[int, int]) -> FloatArray:
     """Coefficients with which a model comes nearest to a distortion over the image."""
     axes = [np.linspace(0.0, n - 1.0, 21) for n in shape]
     row, col = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
-    wanted = np.stack(distortion.shift(row, col))
+    target = np.stack(distortion.shift(row, col))
     scale = model.scale
 
     def misfit(scaled: FloatArray) -> FloatArray:
-        return (np.stack(model.distortion(scaled * scale).shift(row, col)) - wanted).ravel()
+        return (np.stack(model.distortion(scaled * scale).shift(row, col)) - target).ravel()
 
     def slope(scaled: FloatArray) -> FloatArray:
         columns = model.sensitivities(scaled * scale, row, col) * scale[:, None]
@@ -157,19 +119,6 @@ def _nearest(model: DistortionModel, distortion: Distortion, shape: tuple[int, i
 def _unknown_camera(rows: int, cols: int) -> CameraModel:
     focal = float(max(rows, cols))
     return CameraModel(CameraDistortion(focal, focal, 0.5 * (cols - 1), 0.5 * (rows - 1)))
-
-
-def _require_pair(images: list[NDArray[np.float32]]) -> None:
-    first, second = images
-    if first.ndim != 2 or first.shape != second.shape or min(first.shape) < 64:
-        raise InputError(
-            "expected two images of one size, at least 64 x 64 px, got "
-            f"{first.shape} without and {second.shape} with distortion"
-        )
-    for image, what in zip(images, ("undistorted", "distorted"), strict=True):
-        if not np.isfinite(image).all():
-            raise InputError(f"expected finite grey levels in the {what} image")
-        require_contrast(image, what)
 
 
 def _points(
@@ -188,29 +137,3 @@ def _points(
         kept = inside[row.astype(np.intp), col.astype(np.intp)]
         return (row[kept], col[kept]), float(stride)
     return (row, col), float(stride)
-
-
-def _recovered(model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> RecoveredLens:
-    if fit.matches.min() < 0.5 or not fit.converged:
-        raise InputError(
-            "expected two images of one scene, without and with distortion, got a pair whose grey "
-            f"levels correlate by {fit.matches.min():.2f} only; check the files, or try another "
-            "model"
-        )
-    one, many = noise
-    k = len(fit.coefficients)
-    lens = model.distortion(fit.coefficients)
-    covariance = fit.inverse[:k, :k] * (fit.variance * many / one)
-    noise_sd = float(np.sqrt(fit.variance / one))
-    what = "a camera" if isinstance(model, CameraModel) else "a polynomial"
-    if isinstance(model, PolynomialModel):
-        what += f" of degree {model.degree}"
-    sentence = (
-        f"The distorted image is the undistorted one through {what} with {k} unknowns; what is "
-        f"left is like a noise of {noise_sd:.3g} grey levels in each (correlation "
-        f"{fit.matches.min():.5f})."
-    )
-    return RecoveredLens(
-        lens, fit.coefficients, covariance, model, float(fit.matches.min()), noise_sd, fit.bic,
-        sentence,
-    )  # fmt: skip

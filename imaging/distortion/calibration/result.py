@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from modeharvest.imaging.distortion.calibration.fit import Fit
-from modeharvest.imaging.distortion.calibration.model import PolynomialModel
-from modeharvest.imaging.distortion.lens import PolynomialDistortion
+from modeharvest.imaging.distortion.calibration.model import DistortionModel, PolynomialModel
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 
@@ -65,6 +65,67 @@ def sampled_correlations(
     return lags, correlations
 
 
+@dataclass(frozen=True, eq=False)
+class LensEstimate:
+    """A lens as a fit found it.
+
+    Parameters
+    ----------
+    distortion
+        What the model made of it.
+    coefficients, covariance
+        (k,) and (k, k) of the model's unknowns.
+    model
+        Which these are.
+    noise_sd
+        Noise of an image, estimated from the residual [grey levels].
+    matches
+        (m,) correlation of each image with the mean of the others, the distortion taken out [-].
+    bic
+        Bayesian information criterion; of two models of one set take that with the lower one.
+    """
+
+    distortion: Distortion
+    coefficients: FloatArray
+    covariance: FloatArray
+    model: DistortionModel
+    noise_sd: float
+    matches: FloatArray
+    bic: float
+
+    @classmethod
+    def of(cls, model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> LensEstimate:
+        """The lens of a fit, ``noise`` being what :func:`sampled_noise` gives."""
+        one, many = noise
+        k = len(fit.coefficients)
+        return cls(
+            distortion=model.distortion(fit.coefficients),
+            coefficients=fit.coefficients,
+            covariance=fit.inverse[:k, :k] * (fit.variance * many / one),
+            model=model,
+            noise_sd=float(np.sqrt(fit.variance / one)),
+            matches=fit.matches,
+            bic=fit.bic,
+        )
+
+    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Standard deviation of S along rows and columns [px] at ideal positions [px].
+
+        That of the images' noise; what the model can't follow is not in it.
+        """
+        return _sd(self.model, self.coefficients, self.covariance, row, col)
+
+
+def _sd(
+    model: DistortionModel, c: FloatArray, covariance: FloatArray, row: ArrayLike, col: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+    columns = model.sensitivities(c, row.ravel(), col.ravel())
+    variance = (np.einsum("ckn,kl->cln", columns, covariance, optimize=True) * columns).sum(axis=1)
+    along_row, along_col = np.sqrt(np.maximum(variance, 0.0)).reshape(2, *row.shape)
+    return along_row, along_col
+
+
 @dataclass(frozen=True)
 class DegreeTrial:
     """What a degree of S gave.
@@ -108,7 +169,7 @@ class Calibration:
     trials
         One for each degree.
     noise_sd
-        Noise of a photograph, estimated from what is left over [grey levels].
+        Noise of a photograph, estimated from the residual [grey levels].
     matches
         (m,) correlation of each photograph with the mean of the others [-].
     covariance
@@ -136,7 +197,9 @@ class Calibration:
 
         That of the photographs' noise; what a polynomial of this degree can't follow is not in it.
         """
-        return _sd(self.distortion, self.covariance, self.fixed, row, col)
+        lens = self.distortion
+        model = PolynomialModel(lens.shape, lens.degree, self.fixed)
+        return _sd(model, lens.coefficients[:, self.fixed :].ravel(), self.covariance, row, col)
 
 
 def calibration_of(
@@ -155,64 +218,48 @@ def calibration_of(
         (:func:`~modeharvest.imaging.distortion.calibration.result.sampled_noise`).
     """
     model, fit = min(trials, key=lambda trial: trial[1].bic)
+    lens, k = LensEstimate.of(model, fit, noise), len(fit.coefficients)
     one, many = noise
-    k = len(fit.coefficients)
-    covariance: FloatArray = fit.inverse * (fit.variance * many / one)
     own = np.zeros(fit.free.shape)
-    own[fit.free] = np.sqrt(np.diag(covariance)[k:])
+    own[fit.free] = np.sqrt(np.diag(fit.inverse * (fit.variance * many / one))[k:])
     found = Calibration(
         distortion=model.distortion(fit.coefficients),
         shifts=np.array([pose.shift for pose in fit.poses]),
         shifts_sd=own[:, :2],
         angles=np.array([pose.angle for pose in fit.poses]),
         angles_sd=own[:, 2],
-        trials=_trials(trials, many / one),
-        noise_sd=float(np.sqrt(fit.variance / one)),
+        trials=_trials(trials, noise),
+        noise_sd=lens.noise_sd,
         matches=fit.matches,
-        covariance=covariance[:k, :k],
+        covariance=lens.covariance,
         fixed=model.fixed,
     )
     return replace(found, sentences=calibration_text(found, known))
 
 
 def _trials(
-    fitted: Sequence[tuple[PolynomialModel, Fit]], factor: float
+    fitted: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
 ) -> tuple[DegreeTrial, ...]:
     row, col = (np.linspace(0.0, n - 1.0, 25) for n in fitted[0][0].shape)
     at = row[:, None], col[None, :]
-    least = min(fit.bic for _, fit in fitted)
+    lowest = min(fit.bic for _, fit in fitted)
     trials: list[DegreeTrial] = []
     before: FloatArray = np.zeros((2, 25, 25))
     for model, fit in fitted:
-        k = len(fit.coefficients)
-        lens = model.distortion(fit.coefficients)
-        now = np.stack(lens.shift(*at))
-        covariance = fit.inverse[:k, :k] * fit.variance * factor
-        sd = _sd(lens, covariance, model.fixed, *at)
+        lens = LensEstimate.of(model, fit, noise)
+        now = np.stack(lens.distortion.shift(*at))
         trials.append(
             DegreeTrial(
                 degree=model.degree,
                 unknowns=len(fit.inverse),
                 residual_rms=float(np.sqrt(fit.variance)),
-                bic=fit.bic - least,
+                bic=fit.bic - lowest,
                 change_px=float(np.sqrt(np.mean((now - before) ** 2))),
-                sd_px=float(np.sqrt(np.mean(np.square(sd)))),
+                sd_px=float(np.sqrt(np.mean(np.square(lens.sd(*at))))),
             )
         )
         before = now
     return tuple(trials)
-
-
-def _sd(
-    lens: PolynomialDistortion, covariance: FloatArray, fixed: int, row: ArrayLike, col: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    basis = lens.basis(row, col)[..., fixed:]
-    n = basis.shape[-1]
-    along_row, along_col = (
-        np.sqrt(np.maximum(((basis @ part) * basis).sum(axis=-1), 0.0))
-        for part in (covariance[:n, :n], covariance[n:, n:])
-    )
-    return np.asarray(along_row), np.asarray(along_col)
 
 
 def calibration_text(found: Calibration, known: bool) -> tuple[str, ...]:
@@ -221,33 +268,33 @@ def calibration_text(found: Calibration, known: bool) -> tuple[str, ...]:
     row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
     size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
     turned = np.abs(found.angles).max()
-    said = [
+    notes = [
         f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
         f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
         f"{chosen.sd_px:.4f} px rms over the image.",
     ]
     if chosen is found.trials[-1] and len(found.trials) > 1:
-        said.append(
+        notes.append(
             f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
             f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
         )
     if known:
-        said.append(
+        notes.append(
             "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
             "constant part can't be observed and is zero at the polynomial's mean."
         )
     else:
-        said.append(
+        notes.append(
             "The shifts were not known, so the affine part of S can't be observed and is zero: "
             "scale and skew of the image are open, as with any pixel size that isn't measured."
         )
     if turned > 0.0:
-        said.append(
+        notes.append(
             f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
             f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
         )
-    said.append(
+    notes.append(
         "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
         "or a change of the distance to the lens would be taken for distortion."
     )
-    return tuple(said)
+    return tuple(notes)
