@@ -33,6 +33,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.render import render_deformed
 from modeharvest.imaging.sensor import Aperture
+from modeharvest.imaging.speckle.layer import Layer
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.runs.case import shipped_solution
 
@@ -40,6 +41,11 @@ STRAIN = 0.128
 WINDOW = PixelGrid(200, 200, 0.01, -1.0, 1.0)  # about one cell of 190 px, with its holes
 POINTS = 1000
 FloatArray = NDArray[np.float64]
+
+
+def binary_samples(speckle: Speckle) -> FloatArray:
+    """The pattern's two phases before the blur, over its period."""
+    return Layer(speckle.spec.binary_field, speckle.shape).binary()
 
 
 def spectral_sum(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArray:
@@ -50,7 +56,7 @@ def spectral_sum(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
         blur = np.exp(-2.0 * (math.pi * speckle.spec.blur_px * k / n) ** 2)
         waves.append((k / n, np.exp(-2j * math.pi * np.outer(k, np.arange(n)) / n), blur / n))
     (f_row, to_row, blur_row), (f_col, to_col, blur_col) = waves
-    coefficients = to_row @ speckle.binary() @ to_col.T * np.outer(blur_row, blur_col)
+    coefficients = to_row @ binary_samples(speckle) @ to_col.T * np.outer(blur_row, blur_col)
     along_row = np.exp(2j * math.pi * np.outer(row, f_row))
     along_col = np.exp(2j * math.pi * np.outer(col, f_col))
     return np.asarray(((along_row @ coefficients) * along_col).sum(axis=1).real)
@@ -58,7 +64,7 @@ def spectral_sum(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
 
 def quadrature(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArray:
     """(n,) intensities at image positions (row, col), (n,) each [px], as a sum in space."""
-    b, binary = speckle.spec.blur_px, speckle.binary()
+    b, binary = speckle.spec.blur_px, binary_samples(speckle)
     reach = np.arange(-math.ceil(12 * b), math.ceil(12 * b) + 1)
 
     def weights(position: float) -> tuple[NDArray[np.int64], FloatArray]:

@@ -18,6 +18,11 @@ FloatArray = NDArray[np.float64]
 EXACT = 1e-11
 
 
+def binary(speckle: Speckle) -> FloatArray:
+    """The base layer's two phases before the blur."""
+    return Layer(speckle.spec.binary_field, speckle.shape).binary()
+
+
 def directly_summed(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArray:
     """Sum the trigonometric polynomial and its two derivatives term by term: (3, points)."""
     rows, cols = speckle.period
@@ -25,7 +30,7 @@ def directly_summed(speckle: Speckle, row: FloatArray, col: FloatArray) -> Float
     transfer = np.exp(
         -2.0 * (math.pi * speckle.spec.blur_px) ** 2 * (f_row[:, None] ** 2 + f_col**2)
     )
-    c = np.fft.fft2(speckle.binary()) * transfer / (rows * cols)
+    c = np.fft.fft2(binary(speckle)) * transfer / (rows * cols)
     along_row = np.exp(2j * math.pi * np.outer(row, f_row))
     along_col = np.exp(2j * math.pi * np.outer(col, f_col))
     d_row, d_col = 2j * math.pi * f_row, 2j * math.pi * f_col
@@ -40,7 +45,7 @@ def directly_summed(speckle: Speckle, row: FloatArray, col: FloatArray) -> Float
 
 def blurred_in_space(speckle: Speckle, row: float, col: float) -> float:
     """Sum the binary pixels times Gaussians centred on them in space, out to 12 sd."""
-    return space_sum(speckle.binary(), speckle.spec.blur_px, row, col)
+    return space_sum(binary(speckle), speckle.spec.blur_px, row, col)
 
 
 def space_sum(samples: FloatArray, b: float, row: float, col: float) -> float:
@@ -123,7 +128,7 @@ def test_phases_have_equal_area_and_the_mean_chord_of_rice(unit: Any, chord: flo
     """Zero crossings along a line are 1/(2 s) apart (Rice); 10 px is the number in cycles/px."""
     spec, n = SpeckleSpec(unit=unit, seed=5), 1000
     s = 1.0 / (2.0 * chord)
-    bright = Speckle(spec, (n, n)).binary() == spec.bright
+    bright = binary(Speckle(spec, (n, n))) == spec.bright
     # Sampled at whole pixels, neighbours differ with probability acos(rho(1)) / pi.
     expected = math.acos(math.exp(-2 * (math.pi * s) ** 2)) / math.pi
     changes = float((bright != np.roll(bright, 1, axis=1)).mean())
@@ -208,17 +213,17 @@ def test_finer_than_pixels_and_layered_is_exact_between_them(
 
 
 def layers_in_space(spec: SpeckleSpec, shape: tuple[int, int], row: float, col: float) -> float:
-    base = layer_in_space(Layer(spec.grains, shape), row, col)
+    base = layer_in_space(Layer(spec.binary_field, shape), row, col)
     if spec.ink is None:
         return base
     return base * (
-        1.0 - spec.ink.darkness * layer_in_space(Layer(spec.ink.grains, shape), row, col)
+        1.0 - spec.ink.darkness * layer_in_space(Layer(spec.ink.binary_field, shape), row, col)
     )
 
 
 def layer_in_space(layer: Layer, row: float, col: float) -> float:
-    n = layer.grains.finer
-    return space_sum(layer.binary(), n * layer.grains.blur_px, n * row, n * col)
+    n = layer.field.finer
+    return space_sum(layer.binary(), n * layer.field.blur_px, n * row, n * col)
 
 
 def test_gradient_of_two_layers_is_the_slope(points: tuple[FloatArray, FloatArray]) -> None:

@@ -9,7 +9,7 @@ Gaussian are a trigonometric polynomial
 because the Gaussian's transfer function at the samples' Nyquist frequency is 3e-9 or less: for
 blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole
 pixels, a non-uniform FFT [2]_ at any other point, both to rounding. Where millions of points are
-wanted, a B-spline of its waves is twenty times faster; unlike an interpolated image it comes with
+needed, a B-spline of its waves is twenty times faster; unlike an interpolated image it comes with
 a proof of how far it may be off.
 
 References
@@ -71,8 +71,8 @@ def gaussian_field(
 
 
 @dataclass(frozen=True)
-class Grains:
-    """What the grains of a layer look like: a thresholded Gaussian field, blurred.
+class BinaryField:
+    """A thresholded Gaussian field of two phases, and its blur: what a layer looks like.
 
     Parameters
     ----------
@@ -81,9 +81,9 @@ class Grains:
     blur_px
         Standard deviation of the Gaussian blur [px].
     levels
-        Values outside and inside the grains, before the blur.
+        Values outside and inside the second phase, before the blur.
     coverage
-        Share of the area that the grains cover [-].
+        Share of the area of the second phase [-].
     seed
         Seed of the random numbers.
     """
@@ -101,12 +101,12 @@ class Grains:
 
 
 class Layer:
-    """One realisation of grains: exact values at whole pixels and anywhere between.
+    """One realisation of a blurred binary field: exact at whole pixels and anywhere between.
 
     Parameters
     ----------
-    grains
-        What they look like.
+    field
+        Its phases and its blur.
     shape
         (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
         that suit an FFT; the realisation depends on them, hence on ``shape``.
@@ -117,12 +117,12 @@ class Layer:
     samples : (rows, cols) of samples in a period.
     """
 
-    def __init__(self, grains: Grains, shape: tuple[int, int]) -> None:
-        self.grains, self.shape = grains, shape
+    def __init__(self, field: BinaryField, shape: tuple[int, int]) -> None:
+        self.field, self.shape = field, shape
         rows, cols = (int(scipy.fft.next_fast_len(n, real=True)) for n in shape)
         self.period: tuple[int, int] = (rows, cols)
-        self.samples: tuple[int, int] = (grains.finer * rows, grains.finer * cols)
-        blur = grains.finer * grains.blur_px
+        self.samples: tuple[int, int] = (field.finer * rows, field.finer * cols)
+        blur = field.finer * field.blur_px
         transfer = np.exp(-2.0 * (math.pi * blur) ** 2 * _squared_frequency(self.samples))
         spectrum = scipy.fft.rfft2(self.binary())
         spectrum *= transfer / math.prod(self.samples)
@@ -130,10 +130,10 @@ class Layer:
 
     def binary(self) -> FloatArray:
         """(rows, cols) of the samples: the two levels before the blur."""
-        grains = self.grains
-        field = gaussian_field(grains.cycles_per_px / grains.finer, grains.seed, self.samples)
-        outside, inside = grains.levels
-        return np.where(field > norm.isf(grains.coverage), inside, outside)
+        field = self.field
+        values = gaussian_field(field.cycles_per_px / field.finer, field.seed, self.samples)
+        outside, inside = field.levels
+        return np.where(values > norm.isf(field.coverage), inside, outside)
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact values at whole pixels.
@@ -142,7 +142,7 @@ class Layer:
         multiplied by those of its row and its column frequency (see Aperture.transfer).
         """
         spectrum = self._spectrum * math.prod(self.samples)
-        finer = self.grains.finer
+        finer = self.field.finer
         if transfer is not None:
             spectrum *= transfer(finer * np.fft.fftfreq(self.samples[0]))[:, None]
             spectrum *= transfer(finer * np.fft.rfftfreq(self.samples[1]))
@@ -151,7 +151,7 @@ class Layer:
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """Values at image positions (row, col) [px], off by at most ``spline.bound``."""
-        finer = self.grains.finer
+        finer = self.field.finer
         if finer == 1:
             return self.spline(row, col)
         return self.spline(np.multiply(finer, row), np.multiply(finer, col))

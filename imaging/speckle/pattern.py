@@ -1,4 +1,4 @@
-"""A speckle pattern that is known exactly everywhere: one layer, or grains of ink on it.
+"""A speckle pattern that is known exactly everywhere: one layer, or dots of ink on it.
 
 The one layer is a thresholded and blurred Gaussian field (see ``layer``). The second is ink that an
 air brush leaves on a powdered surface, as on the specimen of the paper's section "Real
@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modeharvest.imaging.speckle.layer import Grains, Layer
+from modeharvest.imaging.speckle.layer import BinaryField, Layer
 from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -28,13 +28,13 @@ SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
 _NARROWEST_BLUR_PX = 0.75  # 3 x 3 samples a pixel
 _WIDEST_BLUR_PX = 100.0  # beyond it no speckle is left
-_LOWEST_FREQUENCY = 1e-4  # cycles/px: grains of thousands of pixels
+_LOWEST_FREQUENCY = 1e-4  # cycles/px: speckles of thousands of pixels
 _WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations away
 
 
 @dataclass(frozen=True)
 class Ink:
-    """A second layer: grains of ink, thresholded from a Gaussian field of their own and blurred.
+    """A second layer: dots of ink, thresholded from a Gaussian field of their own and blurred.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ class Ink:
             raise InputError(f"ink: expected a seed of 0 or more, got {self.seed}")
 
     @property
-    def grains(self) -> Grains:
+    def binary_field(self) -> BinaryField:
         """What the layer is made of."""
-        return Grains(
+        return BinaryField(
             self.standard_deviation, self.blur_px, (0.0, 1.0), self.coverage, (self.seed, 1)
         )
 
@@ -131,9 +131,10 @@ class SpeckleSpec:
         return self.standard_deviation * _CYCLES[self.unit]
 
     @property
-    def grains(self) -> Grains:
+    def binary_field(self) -> BinaryField:
         """What the pattern, or the layer under the ink, is made of: half dark, half bright."""
-        return Grains(self.cycles_per_px, self.blur_px, (self.dark, self.bright), 0.5, self.seed)
+        levels = self.dark, self.bright
+        return BinaryField(self.cycles_per_px, self.blur_px, levels, 0.5, self.seed)
 
 
 def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> None:
@@ -142,7 +143,7 @@ def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> No
             f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px and at most "
             f"{_WIDEST_BLUR_PX:g} px, got {blur_px} px"
         )
-    widest = _WIDEST_FREQUENCY * Grains(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
+    widest = _WIDEST_FREQUENCY * BinaryField(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
     if not _LOWEST_FREQUENCY <= cycles_per_px <= widest:
         raise InputError(
             f"{what}: expected a spectral standard deviation from {_LOWEST_FREQUENCY:g} to "
@@ -171,14 +172,10 @@ class Speckle:
             raise InputError(f"speckle: expected an image of at least 8 x 8 px, got {shape}")
         self.spec = spec
         self.shape = shape
-        self._base = Layer(spec.grains, shape)
-        self._ink = None if spec.ink is None else Layer(spec.ink.grains, shape)
+        self._base = Layer(spec.binary_field, shape)
+        self._ink = None if spec.ink is None else Layer(spec.ink.binary_field, shape)
         self._darkness = 0.0 if spec.ink is None else spec.ink.darkness
         self.period: tuple[int, int] = self._base.period
-
-    def binary(self) -> FloatArray:
-        """Return the base layer's two phases before the blur, over the period's samples [-]."""
-        return self._base.binary()
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact intensities at whole pixels [fraction of full scale].
@@ -192,12 +189,9 @@ class Speckle:
         InputError
             If there is a transfer and ink.
         """
-        base = self._base.image(transfer)
-        if self._ink is None:
-            return base
-        if transfer is not None:
+        if transfer is not None and self._ink is not None:
             raise InputError("speckle: expected one layer where pixels average, got two")
-        return base * (1.0 - self._darkness * self._ink.image())
+        return self._product(lambda layer: layer.image(transfer))
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """Intensities at image positions (row, col) [px], of the positions' shape.
@@ -205,10 +199,12 @@ class Speckle:
         They are off by at most ``bound``, at most 6e-8 of full scale a layer, and in fact by
         less than a hundredth of that; NaN where a position is.
         """
-        base = self._base(row, col)
-        if self._ink is not None:
-            base *= 1.0 - self._darkness * self._ink(row, col)
-        return base
+        return self._product(lambda layer: layer(row, col))
+
+    def _product(self, value: Callable[[Layer], FloatArray]) -> FloatArray:
+        """What the base layer has of a value, darkened by what the ink has of it."""
+        base = value(self._base)
+        return base if self._ink is None else base * (1.0 - self._darkness * value(self._ink))
 
     @property
     def spline(self) -> PeriodicSpline:
@@ -226,10 +222,7 @@ class Speckle:
 
         ``eps`` is the relative precision of the non-uniform FFT.
         """
-        base = self._base.exact(row, col, eps)
-        if self._ink is None:
-            return base
-        return base * (1.0 - self._darkness * self._ink.exact(row, col, eps))
+        return self._product(lambda layer: layer.exact(row, col, eps))
 
     def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
         """(2, ...) exact derivatives along (row, col) at image positions (row, col) [1/px]."""

@@ -305,12 +305,10 @@ def _sample(
     cos, sin = np.cos(pose.angle), np.sin(pose.angle)
     at_row = 0.5 * (rows - 1) + cos * arm_row - sin * arm_col + pose.shift[0]
     at_col = 0.5 * (cols - 1) + sin * arm_row + cos * arm_col + pose.shift[1]
-    observed_row, observed_col = (
-        distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
-    )
+    p_row, p_col = distortion.observed(at_row, at_col) if view.distorted else (at_row, at_col)
     border = view.border_px
-    inside = (observed_row >= border) & (observed_row <= rows - 1 - border)
-    inside &= (observed_col >= border) & (observed_col <= cols - 1 - border)
+    inside = (p_row >= border) & (p_row <= rows - 1 - border)
+    inside &= (p_col >= border) & (p_col <= cols - 1 - border)
     value, d_row, d_col = np.zeros(row.shape), np.zeros(row.shape), np.zeros(row.shape)
     value[inside], d_row[inside], d_col[inside] = view.spline.sample(p_row[inside], p_col[inside])
     slope = pose.contrast * np.stack([d_row, d_col])
