@@ -42,10 +42,7 @@ def local(images: ImageSet, strain: float, subsets: SubsetOptions) -> LocalField
         print(f"no subsets: {missing}")
         return None
     begin = time.perf_counter()
-    field = subset_field(
-        images.reference(camera=True), images.deformed(strain, camera=True), images.grid,
-        images.mask(), images.deformed_mask(strain), subsets,
-    )  # fmt: skip
+    field = subset_field(images.pair(strain, camera=True), subsets)
     print(f"{field.source}: {time.perf_counter() - begin:.0f} s")
     return field
 
@@ -96,7 +93,7 @@ def main() -> None:
             masks = images.mask(), images.deformed_mask(strain)
             measured = local(images, strain, subsets)
             for field in (None,) if measured is None else (None, measured):
-                start = initial_guess(f, g, images.grid, CELL, CELLULAR, *masks, local=field)
+                start = initial_guess(images.pair(strain, camera=True), CELL, CELLULAR, local=field)
                 found = correlate(f, g, images.grid, start.ansatz, start.unknowns, *masks)
                 tell(images, strain, start.local, start, found)
 

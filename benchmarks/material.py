@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.photograph.holes import find_hole_lattice
-from modeharvest.idic.photograph.matching import HoleMotion, match
+from modeharvest.idic.photograph.matching import HoleMotion, possible_motions
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import Truth
@@ -42,7 +42,7 @@ def motion_error(motion: HoleMotion, images: ImageSet) -> float:
     grid, mask = images.grid, images.mask()
     u = Truth.read(images.folder / images.info["snapshots"][0]["truth"]).displacement
     row, col = np.mgrid[: grid.rows, : grid.cols]
-    _, found = motion.in_mm(grid)
+    found = motion.in_mm(grid).u
     errors = []
     for (r, c), moved in zip(motion.before, found, strict=True):
         near = np.s_[int(r) - 90 : int(r) + 91, int(c) - 90 : int(c) + 91]
@@ -66,7 +66,7 @@ def main() -> None:
                 off = edge_distance(mask, truth)
                 wrong = 100 * (mask != truth).mean()
                 line += f"  {wrong:12.3f} % {off.mean():+.2f}  {np.sqrt((off**2).mean()):.2f} px |"
-            motion = match(*map(find_hole_lattice, masks))
+            motion = possible_motions(*map(find_hole_lattice, masks))[0]
             print(
                 f"{line} {motion_error(motion, images):.2f} px of {len(motion)} holes", flush=True
             )

@@ -27,6 +27,7 @@ from scipy.signal import fftconvolve
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field
 from modeharvest.idic.slow_fields import orders
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.report.grades import write_star_grading
@@ -90,7 +91,7 @@ def grade(star_set: StarSet, shape: str, width: int, options: argparse.Namespace
     fields: list[LocalField] = []
     for role in ("deformed", "still"):
         g = read_image(star_set.folder / image_name(role, options.noise))
-        measured = subset_field(f, g, star.grid, mask, options=how)
+        measured = subset_field(ImagePair(f, g, star.grid, mask), how)
         named = LocalField(
             measured.x, measured.y, measured.u, measured.valid, source=f"{shape}, {width} px"
         )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from manufactured import image_pair, reference_points, speckle
 from numpy.typing import NDArray
+from sampled import sampled_field
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.local.field import sampled_field
 from modeharvest.idic.modes import FourierMode, square_family
 from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.result import Result

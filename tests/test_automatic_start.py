@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sampled import sampled_field
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import AnsatzOptions
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.local.field import LocalField, sampled_field
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import first_motion, outline_motion, robust_fit
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
     initial_guess,
 )
-from modeharvest.idic.photograph.motion import (
-    first_motion,
-    hole_centres,
-    outline_motion,
-    robust_fit,
-)
+from modeharvest.idic.photograph.initial_modes import hole_centres
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, square_mode
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import shipped_solution
 from modeharvest.util.errors import InputError
@@ -46,10 +45,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
 
 
 def start_of(images: ImageSet, strain: float, **more: object) -> InitialGuess:
-    return initial_guess(
-        images.reference(), images.deformed(strain), images.grid, PITCH, CELLULAR,
-        images.mask(), images.deformed_mask(strain), **more,
-    )  # fmt: skip
+    return initial_guess(images.pair(strain), PITCH, CELLULAR, **more)
 
 
 def correlated(images: ImageSet, strain: float, ansatz, unknowns):
@@ -111,7 +107,8 @@ def test_a_local_field_is_taken_at_its_word(images: ImageSet) -> None:
 
 def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     grid, mask = images.grid, images.mask()
-    centres = hole_centres(mask, grid, CELLULAR, PITCH)
+    pair = images.pair(0.128)
+    centres = hole_centres(pair, [CELLULAR], PITCH)
     assert len(centres) == 60
     x, y = np.meshgrid(grid.x, grid.y)
     u = np.array(
@@ -121,7 +118,7 @@ def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     u[7] += 3.0  # a hole taken for another
     u[9] = np.nan
     domain = Box.centred(15.2, 20.8)
-    motion, sentence = first_motion(domain, grid, mask, images.deformed_mask(0.128), (centres, u))
+    motion, sentence = first_motion(domain, pair, LocalField(*centres.T, u))
     assert "the motion of 59 hole centres: a polynomial of degree 3" in sentence
     assert "2 of 118 components set aside" in sentence
     off = motion(np.stack(np.meshgrid(grid.x, grid.y), -1)) - images.truth(0.128).displacement
@@ -151,13 +148,15 @@ def holes_mask(
 
 
 GRID = PixelGrid.centred(300, 220, 0.06)
-BLANK = np.zeros(GRID.shape)
+NOISE = np.random.default_rng(0).normal(size=GRID.shape)
+UNSEEN = ImagePair(NOISE, NOISE, GRID)
+"""Images that are not looked at."""
 
 
 def from_field(
     local: LocalField, cellular, cell_size: float = PITCH, **more: object
 ) -> InitialGuess:
-    return initial_guess(BLANK, BLANK, GRID, cell_size, cellular, local=local, **more)
+    return initial_guess(UNSEEN, cell_size, cellular, local=local, **more)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.95, 0.95), (0.3, -0.7), (-1.4, 0.2)])
@@ -233,16 +232,17 @@ def test_two_halves_with_patterns_of_their_own_get_modes_of_their_own() -> None:
 def test_a_wrong_cell_size_is_contradicted(images: ImageSet) -> None:
     grid, mask = images.grid, images.mask()
     local = sampled_field(images.truth(0.128).displacement, grid, mask, 4)
-    f, g = images.reference(), images.deformed(0.128)
+    pair = images.pair(0.128)
+    unmasked = replace(pair, mask=None, deformed_mask=None)
     # By the holes in the mask, whether there is a pattern or not.
     with pytest.raises(InputError, match=r"got 1.89 mm between neighbours of 60 holes"):
-        initial_guess(f, g, grid, 3.8, CELLULAR, mask, local=local)
+        initial_guess(pair, 3.8, CELLULAR, local=local)
     # By the spectrum, where no mask shows the holes.
     with pytest.raises(InputError, match=r"peaks at .* belong to a cell of 1\.9 mm"):
-        initial_guess(f, g, grid, 1.6, CELLULAR, local=local)
+        initial_guess(unmasked, 1.6, CELLULAR, local=local)
     # By the lattice that was found.
     with pytest.raises(InputError, match=r"a lattice of holes 1.9 mm apart"):
-        initial_guess(f, g, grid, 1.6, CELLULAR, local=local, lattice=1.9 * np.eye(2))
+        initial_guess(unmasked, 1.6, CELLULAR, local=local, lattice=1.9 * np.eye(2))
 
 
 def test_options_are_what_the_ansatz_can_say() -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modeharvest.idic.local.field import LocalField, sampled_field
+from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.slow_fields import Box
-from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.errors import InputError
 
 X, Y = (a.ravel() for a in np.meshgrid(np.arange(5.0), np.arange(4.0)))
@@ -53,16 +52,6 @@ def test_what_a_model_leaves_is_set_against_the_fields_own_errors() -> None:
     quiet = field.less(lambda p: field.u)
     assert quiet.rms_beyond_noise == 0.0
     assert np.isnan(LocalField(X, Y, U).rms_beyond_noise)
-
-
-def test_pixels_are_sampled_where_there_is_material() -> None:
-    grid = PixelGrid.centred(40, 60, 0.1)
-    x, y = np.meshgrid(grid.x, grid.y)
-    mask = np.hypot(x, y) > 1.0
-    field = sampled_field(np.stack([x, y], -1), grid, mask, 4)
-    np.testing.assert_allclose(field.u, np.column_stack([field.x, field.y]), atol=1e-12)
-    assert np.hypot(field.x, field.y).min() > 1.0
-    assert field.spacing == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,8 @@ def test_correlations_are_the_definitions() -> None:
 
 def test_blocks_in_mm_have_y_upwards() -> None:
     match = match_blocks(SPECKLE.image(), moved((5.0, -8.0)))
-    _, u = match.in_mm(PixelGrid.centred(*SHAPE, 0.5))
-    np.testing.assert_allclose(np.median(u, axis=0), [-4.0, -2.5])
+    moved_mm = match.in_mm(PixelGrid.centred(*SHAPE, 0.5))
+    np.testing.assert_allclose(np.median(moved_mm.u, axis=0), [-4.0, -2.5])
 
 
 def test_blocks_lie_on_material() -> None:

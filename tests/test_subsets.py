@@ -24,6 +24,7 @@ from modeharvest.idic.local.subsets import (
     subset_field,
 )
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.errors import InputError, MissingDependencyError
 
@@ -65,7 +66,7 @@ def test_what_pyvale_writes_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     header = '"subset_x","subset_y","disp_u","disp_v","disp_mag","converged","cost_zncc","ftol",'
     answer = "\n".join([header + '"xtol","num_iter",', *rows])
     monkeypatch.setenv(WHERE, str(stand_in(tmp_path, answer)))
-    field = subset_field(*pair(), GRID, MASK)
+    field = subset_field(ImagePair(*pair(), GRID, MASK))
     assert field.lost == 1
     np.testing.assert_allclose(field.u[0], [1.5 * 0.05, 0.5 * 0.05], atol=1e-12)
     np.testing.assert_allclose([field.x[0], field.y[0]], GRID.to_mm(40, 20))
@@ -79,7 +80,7 @@ def test_a_failure_of_pyvale_is_told_in_a_line(
 ) -> None:
     monkeypatch.setenv(WHERE, str(stand_in(tmp_path, "", code=1)))
     with pytest.raises(InputError, match="got none: RuntimeError: Seed subset failed"):
-        subset_field(*pair(), GRID, MASK)
+        subset_field(ImagePair(*pair(), GRID, MASK))
 
 
 def test_without_pyvale_the_way_to_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +148,7 @@ def test_material_too_narrow_for_a_subset_is_named(
     narrow = np.zeros(GRID.shape, dtype=bool)
     narrow[:, 50:60] = True
     with pytest.raises(InputError, match="take smaller subsets"):
-        subset_field(*pair(), GRID, narrow)
+        subset_field(ImagePair(*pair(), GRID, narrow))
 
 
 @pytest.mark.skipif(not os.environ.get(WHERE), reason=f"needs pyvale; {WHERE} says where")
@@ -155,7 +156,7 @@ def test_pyvale_measures_a_known_field() -> None:
     f, g = pair()
     inner = MASK.copy()
     inner[:, -12:] = False  # leaves the image there
-    field = subset_field(f, g, GRID, inner, options=SubsetOptions(step_px=8, threads=1))
+    field = subset_field(ImagePair(f, g, GRID, inner), SubsetOptions(step_px=8, threads=1))
     assert field.valid_share > 0.95
     expected = np.column_stack([0.11 + 0.02 * field.x, np.zeros_like(field.x)])
     error = (field.u - expected)[field.good] / GRID.pixel_size

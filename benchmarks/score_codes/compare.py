@@ -23,10 +23,11 @@ import numpy as np
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.local.field import sampled_field, write_field
+from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.local.subsets import WHERE, SubsetOptions, subset_field
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.report.terminal import print_grading
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
@@ -80,7 +81,10 @@ def idic(task: Task, field: Path, codes: str) -> None:
         ansatz.initial_guess(task.strain, how.start_amplitude),
         task.mask, task.deformed_mask, how.options(),
     )  # fmt: skip
-    write_field(field, sampled_field(found.displacement(), task.grid, task.mask, STEP_PX))
+    step, grid = STEP_PX, task.grid
+    row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
+    row, col = (i[task.mask[row, col]] for i in (row, col))
+    write_field(field, LocalField(*grid.to_mm(row, col), found.displacement()[row, col]))
 
 
 def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
@@ -92,8 +96,8 @@ def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
     def run(task: Task, field: Path, codes: str) -> None:
         os.environ[WHERE] = codes
         options = SubsetOptions(subset_px=SUBSET_PX, step_px=STEP_PX, filling=filling)
-        images = task.reference, task.deformed, task.grid
-        write_field(field, subset_field(*images, task.mask, task.deformed_mask, options))
+        pair = ImagePair(task.reference, task.deformed, task.grid, task.mask, task.deformed_mask)
+        write_field(field, subset_field(pair, options))
 
     return run
 

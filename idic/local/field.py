@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from modeharvest.idic.local.tables import ROLES, Column, Table, choose, read_table
@@ -23,26 +23,6 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
-
-
-def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:
-    """The field that an ideal lens would have shown: both ends of every displacement put right.
-
-    Parameters
-    ----------
-    field
-        Measured on photographs as they are.
-    grid
-        Their pixels.
-    distortion
-        Of the lens.
-    """
-    u = np.where(field.good[:, None], field.u, 0.0)
-    row, col = distortion.ideal(*grid.to_px(field.x, field.y))
-    row2, col2 = distortion.ideal(*grid.to_px(field.x + u[:, 0], field.y + u[:, 1]))
-    x, y = grid.to_mm(row, col)
-    x2, y2 = grid.to_mm(row2, col2)
-    return replace(field, x=x, y=y, u=np.column_stack([x2 - x, y2 - y]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,39 +166,33 @@ class LocalField:
         return float(np.sqrt(np.maximum(0.0, self.rms**2 - self.sd_rms**2)))
 
 
-def sampled_field(
-    displacement: ArrayLike, grid: PixelGrid, mask: ArrayLike, step: int, source: str = "sampled"
-) -> LocalField:
-    """Take a field known at pixels at every ``step``-th of them, where there is material.
+def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:
+    """The field that an ideal lens would have shown: both ends of every displacement corrected.
 
     Parameters
     ----------
-    displacement
-        (rows, cols, 2) [mm].
+    field
+        Measured on photographs as they are.
     grid
-        Its pixels.
-    mask
-        (rows, cols) True where the displacement counts.
-    step
-        Distance of the points [px].
-    source
-        What to call it.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ from the grid's, or the step is less than 1 px.
+        Their pixels.
+    distortion
+        Of the lens.
     """
-    u, inside = np.asarray(displacement, np.float64), np.asarray(mask, np.bool_)
-    if u.shape != (*grid.shape, 2) or inside.shape != grid.shape or step < 1:
-        raise InputError(
-            f"expected a displacement {(*grid.shape, 2)}, a mask {grid.shape} and a step of at "
-            f"least 1 px, got {u.shape}, {inside.shape} and {step}"
-        )
-    row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
-    row, col = (i[inside[row, col]] for i in (row, col))
-    x, y = grid.to_mm(row, col)
-    return LocalField(x, y, u[row, col], source=source)
+    u = np.where(field.good[:, None], field.u, 0.0)
+    ideal = field_between(
+        np.column_stack(distortion.ideal(*grid.to_px(field.x, field.y))),
+        np.column_stack(distortion.ideal(*grid.to_px(field.x + u[:, 0], field.y + u[:, 1]))),
+        grid,
+    )
+    return replace(field, x=ideal.x, y=ideal.y, u=ideal.u)
+
+
+def field_between(
+    before: FloatArray, after: FloatArray, grid: PixelGrid, source: str = ""
+) -> LocalField:
+    """The displacements from positions (n, 2) (row, col) to others [px]."""
+    (x, y), (x2, y2) = grid.to_mm(*before.T), grid.to_mm(*after.T)
+    return LocalField(x, y, np.column_stack([x2 - x, y2 - y]), source=source)
 
 
 _WRITTEN = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]", "sd_u [mm]", "sd_v [mm]", "valid")

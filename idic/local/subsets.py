@@ -21,15 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.local.field import LocalField, read_field
+from modeharvest.idic.local.motion import CELL_PX, coarse_field, first_motion
 from modeharvest.idic.local.tables import read_table
-from modeharvest.idic.pair import CheckedImages
-from modeharvest.idic.photograph.motion import CELL_PX, coarse_field, first_motion
 from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, MissingDependencyError
 
@@ -176,24 +176,13 @@ def pyvale_python() -> str:
     return sys.executable
 
 
-def subset_field(
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    grid: PixelGrid,
-    mask: ArrayLike | None = None,
-    deformed_mask: ArrayLike | None = None,
-    options: SubsetOptions | None = None,
-) -> LocalField:
+def subset_field(pair: ImagePair, options: SubsetOptions | None = None) -> LocalField:
     """Measure a displacement field by subsets.
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels.
-    grid
-        Their pixels.
-    mask, deformed_mask
-        (rows, cols) True on material; the second only helps to find the largest motion.
+    pair
+        Images; the deformed one's mask only helps to find the largest motion.
     options
         Subsets.
 
@@ -201,44 +190,43 @@ def subset_field(
     -------
     LocalField
         Subsets below the threshold are kept as not valid. The standard deviations are those of
-        :func:`modeharvest.idic.local.subsets.predicted_sd`.
+        :func:`predicted_sd`.
 
     Raises
     ------
     MissingDependencyError
         If pyvale is not installed.
     InputError
-        If images and mask don't fit together, no subset fits into the material, or pyvale fails.
+        If no subset fits into the material, or pyvale fails.
     """
     options = options or SubsetOptions()
     python = pyvale_python()
-    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
-    f, g, inside = images.f, images.g, images.f_mask
-    inside = np.ones(grid.shape, dtype=np.bool_) if inside is None else inside
+    grid, inside = pair.grid, pair.masks[0]
     seeds = _seeds(inside, options.subset_px)
-    largest = options.largest_px or _largest_motion(f, g, grid, inside, images.g_mask)
+    largest = options.largest_px or _largest_motion(pair)
     reason = ""
     with tempfile.TemporaryDirectory(prefix="modeharvest-pyvale-") as name:
         folder = Path(name)
         for seed, share in product(seeds, _SHARES):
             arguments = _arguments(options, grid, seed, round(share * largest))
-            reason = _run(python, folder, f, g, inside, arguments)
+            reason = _run(python, folder, pair, arguments)
             results = sorted(folder.glob("subsets_*.csv"))
             if results:
                 field = read_field(results[0], grid)
                 correlation = read_table(results[0])["cost_zncc"]
-                sd = predicted_sd(f, inside, grid, field, correlation, options.subset_px)
+                sd = predicted_sd(
+                    pair.reference, inside, grid, field, correlation, options.subset_px
+                )
                 return replace(field, sd=sd, source=f"pyvale, subsets of {options.subset_px} px")
     raise InputError(f"subset DIC: expected a result of pyvale, got none: {reason}")
 
 
-def _largest_motion(
-    f: NDArray[Any], g: NDArray[Any], grid: PixelGrid, mask: BoolArray, landing: BoolArray | None
-) -> int:
+def _largest_motion(pair: ImagePair) -> int:
     """Largest motion along either axis [px], by a rough field, with a margin."""
-    known, _ = first_motion(Box(*grid.extent), grid, mask, landing, None)
+    grid = pair.grid
+    known, _ = first_motion(Box(*grid.extent), pair, None)
     cell = CELL_PX * max(1, round(min(grid.shape) / _COARSE_PX)) * grid.pixel_size
-    rough = coarse_field(f, g, grid, cell, known, mask, landing)
+    rough = coarse_field(pair, cell, known)
     most = float(np.quantile(np.abs(rough.u).max(axis=1), _MOST)) / grid.pixel_size
     return int(np.ceil(_MARGIN * most)) + 4
 
@@ -280,17 +268,12 @@ def _arguments(
     }
 
 
-def _run(
-    python: str,
-    folder: Path,
-    f: NDArray[Any],
-    g: NDArray[Any],
-    mask: BoolArray,
-    arguments: dict[str, Any],
-) -> str:
-    """Run pyvale once; the last line of what it says if it fails."""
+def _run(python: str, folder: Path, pair: ImagePair, arguments: dict[str, Any]) -> str:
+    """Run pyvale once; the last line of its error output if it fails."""
+    f, g = pair.reference, pair.deformed
     low, high = min(f.min(), g.min()), max(f.max(), g.max())
     f, g = ((255.0 * (i - low) / (high - low)).astype(np.float32) for i in (f, g))
+    mask = pair.masks[0]
     np.savez(folder / "request.npz", f=f, g=g, mask=mask, arguments=json.dumps(arguments))
     quiet = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
     done = subprocess.run(

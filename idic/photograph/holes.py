@@ -53,13 +53,15 @@ class Holes:
         return np.asarray(2.0 * np.sqrt(self.areas / np.pi))
 
 
-def find_holes(mask: ArrayLike) -> Holes:
+def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
     """Find the holes in a mask.
 
     Parameters
     ----------
     mask
         (rows, cols) True on material.
+    smallest_px2
+        Least area of a hole [px^2]; by default a quarter of the typical one.
 
     Raises
     ------
@@ -79,8 +81,9 @@ def find_holes(mask: ArrayLike) -> Holes:
     border = border[border > 0]
     areas = np.bincount(parts.ravel(), minlength=count + 1).astype(np.float64)
     inner = np.setdiff1d(np.arange(1, count + 1), border)
-    typical = _typical(areas[inner]) if inner.size else 0.0
-    large = inner[areas[inner] >= _MUCH_SMALLER * typical]
+    if smallest_px2 is None:
+        smallest_px2 = _MUCH_SMALLER * _typical(areas[inner]) if inner.size else 0.0
+    large = inner[areas[inner] >= smallest_px2]
     centres = np.array(center_of_mass(~material, parts, large), dtype=np.float64)
     return Holes(
         centres=centres.reshape(-1, 2),

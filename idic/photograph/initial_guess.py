@@ -18,10 +18,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
 from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import (
+    SLOW_DEGREE,
+    RobustFit,
+    coarse_field,
+    first_motion,
+    fit_unknowns,
+)
 from modeharvest.idic.modes import ModeFamily, Taper, square_family
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.initial_modes import (
@@ -32,20 +39,12 @@ from modeharvest.idic.photograph.initial_modes import (
     modes_of,
     require_cell_size,
 )
-from modeharvest.idic.photograph.motion import (
-    SLOW_DEGREE,
-    RobustFit,
-    coarse_field,
-    first_motion,
-    fit_unknowns,
-)
-from modeharvest.idic.photograph.region import junction
+from modeharvest.idic.photograph.region import box_of, junction
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.slow_fields import Box, Brightness
 from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
-from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.pair import checked_mask
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 
 _Placed = tuple[InitialMode, Box]
@@ -123,38 +122,30 @@ class InitialGuess:
 
 
 def initial_guess(
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    grid: PixelGrid,
+    pair: ImagePair,
     cell_size: float,
     cellular: Box | Sequence[Box],
-    mask: ArrayLike | None = None,
-    deformed_mask: ArrayLike | None = None,
     *,
     local: LocalField | None = None,
-    holes: tuple[ArrayLike, ArrayLike] | None = None,
+    holes: LocalField | None = None,
     lattice: ArrayLike | None = None,
     domain: Box | None = None,
     options: AnsatzOptions | None = None,
 ) -> InitialGuess:
-    """Find ansatz and start for a pair of images.
+    """Find ansatz and initial guess for a pair of images.
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels.
-    grid
-        Their pixels.
+    pair
+        The images.
     cell_size
         l, the distance of neighbouring holes [mm].
     cellular
         The part with holes [mm]; or several parts, each with modes of its own.
-    mask, deformed_mask
-        (rows, cols) True on material.
     local
-        A displacement field of a local DIC; the images are not looked at then.
+        A displacement field of a local DIC; the grey levels are not looked at then.
     holes
-        (n, 2) hole centres in the reference and (n, 2) their displacements [mm].
+        Displacements of the holes' centres.
     lattice
         (2, 2) vectors of the lattice of holes as rows [mm]; by default square, along x and y.
     domain
@@ -165,18 +156,17 @@ def initial_guess(
     Raises
     ------
     InputError
-        If the holes or the spectrum contradict the cell size, or the images are no pair.
+        If the holes or the spectrum contradict the cell size.
     """
     options = options or AnsatzOptions()
-    inside = checked_mask(mask, "mask", grid)
-    landing = checked_mask(deformed_mask, "deformed mask", grid)
     boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)
-    domain = domain or _bounding_box(inside, grid)
-    cells = Cells.found(cell_size, lattice, inside, grid, boxes, holes)
+    if domain is None:
+        domain = Box(*pair.grid.extent) if pair.mask is None else box_of(pair.mask, pair.grid)
+    cells = Cells.found(cell_size, lattice, pair, boxes, holes)
     said: list[str] = []
     if local is None:
-        known, sentence = first_motion(domain, grid, inside, landing, holes)
-        local = coarse_field(reference, deformed, grid, cell_size, known, inside, landing)
+        known, sentence = first_motion(domain, pair, holes)
+        local = coarse_field(pair, cell_size, known)
         said += [sentence, f"Without a local DIC: {local.x.size} points of {local.source}."]
     else:
         share = 100 * local.valid_share
@@ -249,13 +239,11 @@ def _assembled(
 
 def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, fixed: bool) -> RobustFit:
     """v0 and every v_i through the field; a mode that can't be seen isn't fitted."""
-    x, y, u = local.valid_points()
-    points = np.column_stack([x, y])
     slow = min(SLOW_DEGREE, ansatz.v0_degree)
     if not fixed:
-        return fit_unknowns(ansatz, a, points, u, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
+        return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
     alone = replace(ansatz, modes=(), brightness=Brightness())
-    fit = fit_unknowns(alone, np.zeros(alone.size), points, u, slow, -1)
+    fit = fit_unknowns(alone, np.zeros(alone.size), local, slow, -1)
     return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
 
 
@@ -266,16 +254,6 @@ def _fit_words(ansatz: Ansatz, fit: RobustFit, fixed: bool) -> str:
         f"{what} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
         "aside."
     )
-
-
-def _bounding_box(mask: NDArray[np.bool_] | None, grid: PixelGrid) -> Box:
-    """The outer edges of the pixels that show material."""
-    if mask is None:
-        return Box(*grid.extent)
-    rows, cols = (np.flatnonzero(mask.any(axis=1 - k))[[0, -1]] for k in range(2))
-    x, y = grid.to_mm(rows, cols)
-    h = 0.5 * grid.pixel_size
-    return Box(float(x[0]) - h, float(x[1]) + h, float(y[1]) - h, float(y[0]) + h)
 
 
 def chosen_modes(

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
+from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import ModeFamily, free_family, square_family
-from modeharvest.idic.photograph.motion import WRONG_CELL, hole_centres, require_hole_distance
+from modeharvest.idic.photograph.holes import find_holes
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.spectra.pattern import WavePattern, mode_equivalent
 from modeharvest.idic.spectra.waves import PlaneWave
-from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
@@ -23,6 +25,14 @@ SAME_WAVE = 0.15
 """Distance [1/l] within which two wave vectors are one, up to a reciprocal lattice vector."""
 NEARLY_SQUARE = 0.05
 """Relative difference of lengths, and cosine between directions, of a square lattice's vectors."""
+
+WRONG_CELL = 0.07
+"""Relative difference of a cell size given from one found, beyond which they contradict each
+other: over the paper's six cells the phase of its mode drifts by 1.3 rad, and a correlation may
+settle in a local minimum. A measured field's peaks are known to a few hundredths."""
+_FEWEST_HOLES = 4
+_SMALLEST_HOLE = 0.01
+"""Area of a hole [cells] below which it is a speck in the mask."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +77,17 @@ class Cells:
         cls,
         cell_size: float,
         lattice: ArrayLike | None,
-        mask: NDArray[np.bool_] | None,
-        grid: PixelGrid,
+        pair: ImagePair,
         boxes: Sequence[Box],
-        holes: tuple[ArrayLike, ArrayLike] | None,
+        holes: LocalField | None,
     ) -> Cells:
-        """Take what is given, and look at the mask for the rest; raises InputError if at odds."""
+        """Take what is given, and the rest from the mask; raises InputError if at odds."""
         if not cell_size > 0:
             raise InputError(f"automatic start: expected a positive cell size, got {cell_size} mm")
         vectors = lattice_vectors(cell_size, lattice)
-        centres = np.zeros((0, 2)) if holes is None else np.asarray(holes[0], np.float64)
-        if not len(centres) and mask is not None:
-            centres = np.vstack([hole_centres(mask, grid, box, cell_size) for box in boxes])
+        centres = np.zeros((0, 2)) if holes is None else np.column_stack([holes.x, holes.y])
+        if holes is None and pair.mask is not None and not pair.mask.all():
+            centres = hole_centres(pair, boxes, cell_size)
         centres = centres[np.isfinite(centres).all(axis=1)]
         require_hole_distance(centres, cell_size)
         corner = np.array([boxes[0].x_min, boxes[0].y_min])
@@ -96,6 +105,29 @@ class Cells:
     def junction(self) -> FloatArray:
         """(2,) the middle of the solid between four holes [mm]."""
         return np.asarray(self.hole - 0.5 * self.vectors.sum(axis=0))
+
+
+def hole_centres(pair: ImagePair, boxes: Sequence[Box], cell_size: float) -> FloatArray:
+    """(n, 2) centres of the holes of the reference that lie in boxes [mm]; specks are left out."""
+    holes = find_holes(pair.masks[0], _SMALLEST_HOLE * (cell_size / pair.grid.pixel_size) ** 2)
+    x, y = pair.grid.to_mm(*holes.centres.T)
+    inside = [
+        (x > box.x_min) & (x < box.x_max) & (y > box.y_min) & (y < box.y_max) for box in boxes
+    ]
+    return np.vstack([np.column_stack([x, y])[within] for within in inside])
+
+
+def require_hole_distance(centres: FloatArray, cell_size: float) -> None:
+    """Raise InputError if neighbouring holes are not a cell size apart; few holes say nothing."""
+    if len(centres) < _FEWEST_HOLES:
+        return
+    apart = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
+    if abs(apart - cell_size) > WRONG_CELL * cell_size:
+        raise InputError(
+            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got "
+            f"{apart:.3g} mm between neighbours of {len(centres)} holes; give cell size "
+            f"{apart:.3g} mm, or check the pixel size"
+        )
 
 
 def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
+from modeharvest.idic.local.field import LocalField, field_between
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
@@ -57,11 +58,9 @@ class HoleMotion:
     def __len__(self) -> int:
         return len(self.index)
 
-    def in_mm(self, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
-        """(positions, displacements), both (n, 2) along x and y [mm]."""
-        x, y = grid.to_mm(self.before[:, 0], self.before[:, 1])
-        x2, y2 = grid.to_mm(self.after[:, 0], self.after[:, 1])
-        return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+    def in_mm(self, grid: PixelGrid) -> LocalField:
+        """The centres in the reference and their displacements."""
+        return field_between(self.before, self.after, grid, "centres of holes")
 
     def at(self, points: ArrayLike) -> FloatArray:
         """Where positions (n, 2) (row, col) of the reference have moved to, from the holes around.
@@ -72,23 +71,6 @@ class HoleMotion:
         where = np.asarray(points, dtype=np.float64)
         between = RBFInterpolator(self.before, self.after - self.before, kernel="linear", degree=1)
         return np.asarray(where + between(where))
-
-    def affine(self) -> tuple[FloatArray, FloatArray]:
-        """Fit (offset, matrix): after = offset + before @ matrix, in (row, col) [px]."""
-        design = np.column_stack([np.ones(len(self)), self.before])
-        found = np.asarray(np.linalg.lstsq(design, self.after, rcond=None)[0], dtype=np.float64)
-        return found[0], found[1:]
-
-
-def match(reference: HoleLattice, deformed: HoleLattice) -> HoleMotion:
-    """Match the holes of two images; see :func:`possible_motions` for when that is ambiguous.
-
-    Raises
-    ------
-    InputError
-        If the lattices can't be the same specimen's.
-    """
-    return possible_motions(reference, deformed)[0]
 
 
 def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[HoleMotion, ...]:
@@ -229,15 +211,9 @@ class BlockMatch:
         """Whether the images show the same surface."""
         return self.share >= _SAME
 
-    def in_mm(self, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
-        """(positions, displacements) of the blocks found, both (m, 2) along x and y [mm].
-
-        To about a pixel; enough for a start.
-        """
-        row, col = self.before[self.found].T
-        x, y = grid.to_mm(row, col)
-        x2, y2 = grid.to_mm(*self.after[self.found].T)
-        return np.column_stack([x, y]), np.column_stack([x2 - x, y2 - y])
+    def in_mm(self, grid: PixelGrid) -> LocalField:
+        """The blocks found, to about a pixel; enough for an initial guess."""
+        return field_between(self.before[self.found], self.after[self.found], grid, "blocks")
 
     @property
     def sentence(self) -> str:

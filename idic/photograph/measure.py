@@ -228,8 +228,7 @@ def measure(
         said += confirmed_by_speckle(pair, partial(_moved_to, before.result))
     boxes = [part.box for part in geometry.parts]
     start = initial_guess(
-        pair.reference, pair.deformed, geometry.grid, cell_size, boxes, pair.mask,
-        pair.deformed_mask, local=local, holes=holes, lattice=geometry.lattice_mm,
+        pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=how,
     )  # fmt: skip
     ansatz, unknowns, fixed = chosen_modes(start, geometry, cell_size, how)
@@ -321,13 +320,13 @@ def _guess_sentences(start: InitialGuess, ansatz: Ansatz, geometry: Geometry) ->
     return tuple(said)
 
 
-def _moved_holes(result: Result, geometry: Geometry) -> tuple[FloatArray, FloatArray] | None:
-    """The reference's holes and v0 there [mm], as if they had been followed; None without any."""
+def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
+    """v0 at the reference's holes, as if they had been followed; None without any."""
     if geometry.lattice is None:
         return None
     x, y = geometry.grid.to_mm(*geometry.lattice.centres.T)
-    moved = result.ansatz.v0(result.unknowns, x[:, None], y[:, None])[:, 0]
-    return np.column_stack([x, y]), moved
+    v0 = result.ansatz.v0(result.unknowns, x[:, None], y[:, None])[:, 0]
+    return LocalField(x, y, v0, source="v0 at the holes")
 
 
 def _moved_to(result: Result, points: FloatArray) -> FloatArray:

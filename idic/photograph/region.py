@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import label
+from scipy.ndimage import find_objects, label
 from scipy.spatial import ConvexHull
 from skimage.draw import polygon2mask
 
@@ -143,9 +143,8 @@ def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Regio
             f"images, got shape {inside.shape}"
         )
     _require_material(inside, np.asarray(mask, dtype=np.bool_), "mask of the cellular part")
-    row, col = np.nonzero(inside)
-    pixels = np.column_stack([row, col]).astype(np.float64)
-    low, high = pixels.min(axis=0) - 0.5, pixels.max(axis=0) + 0.5
+    pixels = np.argwhere(inside).astype(np.float64)
+    low, high = _bounds(inside)
     said = ["The cellular part is a mask image, as given.", *_unlike_box(inside, low, high)]
     return _region(_box(low, high, grid), _hull(pixels), mask, grid, tuple(said))
 
@@ -159,7 +158,7 @@ def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
 def _region(
     box: Box, polygon: FloatArray, mask: ArrayLike, grid: PixelGrid, said: tuple[str, ...]
 ) -> Region:
-    low, high = _outline(np.asarray(mask, dtype=np.bool_))
+    low, high = _bounds(_largest_part(np.asarray(mask, dtype=np.bool_)))
     domain = _box(low, high, grid)
     cut = (
         low[1] < 0.5,
@@ -189,16 +188,28 @@ def _region(
     return Region(box, domain, polygon, (margins[0], margins[1], margins[2], margins[3]), said)
 
 
-def _outline(mask: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest (row, col) of the largest connected part of the material, edges of px."""
+def box_of(mask: BoolArray, grid: PixelGrid) -> Box:
+    """The box along the outer edges of the pixels of a mask [mm]."""
+    return _box(*_bounds(mask), grid)
+
+
+def _bounds(mask: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest (row, col) of the outer edges of a mask's pixels [px]."""
+    rows, cols = find_objects(mask.astype(np.uint8))[0]
+    return (
+        np.array([rows.start - 0.5, cols.start - 0.5]),
+        np.array([rows.stop - 0.5, cols.stop - 0.5]),
+    )
+
+
+def _largest_part(mask: BoolArray) -> BoolArray:
+    """The largest connected part of the material."""
     parts, count = label(mask)
     if count == 0:
         raise InputError("expected material in the mask, got a mask with nothing in it")
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    inside = parts == int(np.argmax(sizes))
-    rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-    return np.array([rows[0] - 0.5, cols[0] - 0.5]), np.array([rows[-1] + 0.5, cols[-1] + 0.5])
+    return np.asarray(parts == int(np.argmax(sizes)))
 
 
 def _box(low: FloatArray, high: FloatArray, grid: PixelGrid) -> Box:

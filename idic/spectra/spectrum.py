@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import find_objects
 from scipy.spatial import cKDTree
 
 from modeharvest.idic.local.field import LocalField
@@ -147,10 +148,9 @@ def spectral_density(
         If shapes differ, the mask is all black, or the displacement is not finite in it.
     """
     _check(displacement, grid, mask, pitch)
-    rows, cols = (np.flatnonzero(mask.any(axis=1 - k)) for k in range(2))
-    extent = tuple(grid.pixel_size * (int(i[-1] - i[0]) + 1) for i in (cols, rows))
-    part = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    part = find_objects(mask.astype(np.uint8))[0]
     inside = mask[part]
+    size = grid.pixel_size * inside.shape[1], grid.pixel_size * inside.shape[0]
     u = [np.where(inside, displacement[part][..., c], 0.0) for c in range(2)]
     x, y = grid.x[part[1]], grid.y[part[0]]
     affine = np.stack([_affine(component, inside, x, y) for component in u])
@@ -166,7 +166,6 @@ def spectral_density(
     x = x[0] + half + h * np.arange(source.shape[1])
     y = y[0] - half - h * np.arange(source.shape[0])[::-1]
     xi1, xi2, u_hat = _transform(source, x, y, h, pitch, padding)
-    size = (float(extent[0]), float(extent[1]))
     return Spectrum(xi1, xi2, u_hat, pitch, x, y, source, coverage, affine, size)
 
 

@@ -25,6 +25,7 @@ from modeharvest.idic.local.field import LocalField, read_field, without_distort
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.pair import PREPARED_FILE, PreparedPhotographs
 from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
+from modeharvest.idic.photograph.measure import prepared_pair
 from modeharvest.idic.uncertainty.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibration.calibrate import calibrate
 from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
@@ -306,10 +307,7 @@ def local_field(
         return None
     if table.code == "pyvale":
         options = SubsetOptions(subset_px=table.subset, step_px=table.step)
-        return subset_field(
-            prepared.image(), prepared.image(name), grid, prepared.mask(), prepared.mask(name),
-            options,
-        )  # fmt: skip
+        return subset_field(prepared_pair(prepared, name), options)
     path = of_each_photograph(case, table.files, "local.files")[name]
     field = read_field(
         path,

@@ -1,7 +1,7 @@
 """Motion before any correlation: from hole centres, outlines or optical flow, by robust fits.
 
-Optical flow: the deformed image is pulled back by what is known already (a slow field through
-hole centres, say), and the optical flow that is left is found on binned and blurred images by
+Optical flow: the deformed image is warped back by what is known already (a slow field through
+hole centres, say), and the remaining optical flow is found on binned and blurred images by
 iterated Lucas–Kanade windows (scikit-image; Le Besnerais & Champagnat, 2005, doi
 10.1109/ICIP.2005.1529706). On the paper's specimen after buckling half of its points are within
 0.6 px of the truth, a tenth are more than 2 px off, mostly at holes' edges; a subset DIC does
@@ -17,26 +17,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.ndimage import binary_fill_holes
 from skimage.registration import optical_flow_ilk
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.pair import CheckedImages
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import Level, LevelPair, level_pair
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
 HUBER = 1.345
 """Residual beyond which a point counts less [standard deviations]; 95 % efficient for normal
 errors (Huber, 1964, doi 10.1214/aoms/1177703732)."""
-SET_ASIDE = 5.0
+OUTLIER = 5.0
 """Residual beyond which a point is called an outlier [standard deviations]."""
 MOST_POINTS = 6000
-"""Points of a field that are used; more would not make a start better."""
+"""Points of a field that are used; more would not make an initial guess better."""
 _ROUNDS = 30
 
 
@@ -49,7 +48,7 @@ class RobustFit:
     coefficients
         (c,) or as the unknowns of the ansatz.
     sd
-        Robust standard deviation of a component that is left (1.4826 times the median) [mm].
+        Robust standard deviation of a component's residual (1.4826 times the median) [mm].
     outliers
         Number of points more than 5 of these off.
     """
@@ -80,7 +79,7 @@ def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
         before, weights = weights, np.minimum(1.0, HUBER * sd / np.maximum(off, 1e-300))
         if np.abs(weights - before).max() < 1e-3:
             break
-    return RobustFit(fit, sd, int((off > SET_ASIDE * sd).sum()) if sd > 0 else 0)
+    return RobustFit(fit, sd, int((off > OUTLIER * sd).sum()) if sd > 0 else 0)
 
 
 def degree_for(count: int, most: int) -> int:
@@ -90,7 +89,7 @@ def degree_for(count: int, most: int) -> int:
 
 
 def fit_unknowns(
-    ansatz: Ansatz, a: ArrayLike, points: FloatArray, u: FloatArray, v0_degree: int, v_degree: int
+    ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int
 ) -> RobustFit:
     """Fit v0, and every v_i, to displacements at points; the modes stay as they are.
 
@@ -100,27 +99,32 @@ def fit_unknowns(
         The kinematics.
     a
         (size,) unknowns, of which the modes' parameters are taken.
-    points, u
-        (n, 2) positions and displacements [mm].
+    field
+        The displacements.
     v0_degree, v_degree
         Total degrees that are fitted, at most those of the ansatz; the rest is zero. A negative
         ``v_degree`` leaves every v_i as it is in ``a``.
+
+    Raises
+    ------
+    InputError
+        If there are fewer components than coefficients.
     """
     a = ansatz.checked(a).copy()
-    stride = max(1, -(-len(points) // MOST_POINTS))
-    points, u = points[::stride], u[::stride]
+    x, y, u = field.valid_points()
+    stride = max(1, -(-len(x) // MOST_POINTS))
+    points, u = np.column_stack([x, y])[::stride], u[::stride]
     free = _low_orders(ansatz, v0_degree, v_degree)
     if 2 * len(points) < free.size:
         raise InputError(
             f"automatic start: expected at least {-(-free.size // 2)} points, got {len(points)}"
         )
     columns = ansatz.sensitivities(a, points[:, None, 0], points[:, None, 1])[..., free]
-    held = a.copy()
-    held[free] = 0.0
-    rest = u - ansatz.displacement_at(held, points)
+    a[free] = 0.0
+    rest = u - ansatz.displacement_at(a, points)
     fit = robust_fit(columns.reshape(-1, free.size), rest.ravel())
-    held[free] = fit.coefficients
-    return RobustFit(held, fit.sd, fit.outliers)
+    a[free] = fit.coefficients
+    return RobustFit(a, fit.sd, fit.outliers)
 
 
 def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.intp]:
@@ -133,76 +137,59 @@ def _low_orders(ansatz: Ansatz, v0_degree: int, v_degree: int) -> NDArray[np.int
 
 
 SLOW_DEGREE = 3
-"""Total degree of v0 at the start, at most: what bends and barrels, but doesn't follow cells."""
-WRONG_CELL = 0.07
-"""Relative difference of a cell size given from one found, beyond which they contradict each
-other: over the paper's six cells the phase of its mode drifts by 1.3 rad, and a correlation may
-settle in a local minimum. A measured field's peaks are known to a few hundredths."""
-_FEWEST_HOLES = 4
-_SMALLEST_HOLE = 0.01
-"""Area of a hole [cells] below which it is a speck in the mask."""
+"""Total degree of v0 in an initial guess, at most: what bends and barrels, but not cell by cell."""
+Slow = Callable[[FloatArray], FloatArray]
+"""From (..., 2) points to (..., 2) displacements [mm]."""
 
 
-def first_motion(
-    domain: Box,
-    grid: PixelGrid,
-    mask: BoolArray | None,
-    deformed_mask: BoolArray | None,
-    holes: tuple[ArrayLike, ArrayLike] | None,
-) -> tuple[Slow, str]:
+def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tuple[Slow, str]:
     """Find the slow motion from what the images' geometry shows.
 
     Parameters
     ----------
     domain
         Of the polynomial [mm].
-    grid
-        The pixels.
-    mask, deformed_mask
-        (rows, cols) True on material.
+    pair
+        Images, of which the masks are used.
     holes
-        (n, 2) hole centres in the reference and (n, 2) their displacements [mm]; NaN where lost.
+        Displacements of the holes' centres.
 
     Returns
     -------
     From (..., 2) points to (..., 2) displacements [mm], and a sentence.
     """
-    if holes is not None:
-        found = _through_holes(domain, *holes)
-        if found is not None:
-            return found
-    affine = None
-    if mask is not None and deformed_mask is not None:
-        affine = outline_motion(mask, deformed_mask, grid)
-    if affine is None:
+    found = None if holes is None else _through_holes(domain, holes)
+    if found is not None:
+        return found
+    plane = None
+    if pair.mask is not None and pair.deformed_mask is not None:
+        plane = outline_motion(pair.mask, pair.deformed_mask, pair.grid)
+    if plane is None:
         return (
             np.zeros_like,
             "v0 starts from no motion: neither holes nor whole outlines are known.",
         )
-    plane = affine
-    return lambda points: plane[:, 0] + points @ plane[:, 1:].T, (
-        f"v0 starts from the outlines: {100 * affine[0, 1]:+.1f} % along x and "
-        f"{100 * affine[1, 2]:+.1f} % along y."
+    return partial(_affine, plane), (
+        f"v0 starts from the outlines: {100 * plane[0, 1]:+.1f} % along x and "
+        f"{100 * plane[1, 2]:+.1f} % along y."
     )
 
 
-def _through_holes(domain: Box, centres: ArrayLike, motion: ArrayLike) -> tuple[Slow, str] | None:
+def _affine(plane: FloatArray, points: FloatArray) -> FloatArray:
+    return plane[:, 0] + points @ plane[:, 1:].T
+
+
+def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
     """A polynomial through the holes' displacements; None if there are too few for a plane."""
-    points, u = (np.asarray(h, dtype=np.float64) for h in (centres, motion))
-    if points.ndim != 2 or points.shape[1:] != (2,) or u.shape != points.shape:
-        raise InputError(
-            "automatic start: expected hole centres (n, 2) and their displacements (n, 2), got "
-            f"{points.shape} and {u.shape}"
-        )
-    good = np.isfinite(np.hstack([points, u])).all(axis=1)
-    degree = degree_for(int(good.sum()), SLOW_DEGREE)
+    count = int(holes.good.sum())
+    degree = degree_for(count, SLOW_DEGREE)
     if degree == 0:
         return None
     slow = Ansatz(domain, (), degree, 0)
-    fit = fit_unknowns(slow, np.zeros(slow.size), points[good], u[good], degree, -1)
+    fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree, -1)
     return partial(slow.displacement_at, fit.coefficients), (
-        f"v0 starts from the motion of {good.sum()} hole centres: a polynomial of degree {degree} "
-        f"leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} of {2 * good.sum()} components set aside."
+        f"v0 starts from the motion of {count} hole centres: a polynomial of degree {degree} "
+        f"leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} of {2 * count} components set aside."
     )
 
 
@@ -221,7 +208,7 @@ def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -
     for inside in (mask, deformed_mask):
         if inside[[0, -1]].any() or inside[:, [0, -1]].any():
             return None
-        row, col = np.nonzero(ndimage.binary_fill_holes(inside))
+        row, col = np.nonzero(binary_fill_holes(inside))
         points = np.column_stack(grid.to_mm(row, col))
         moments.append((points.mean(axis=0), points.std(axis=0)))
     (centre, size), (centre_now, size_now) = moments
@@ -231,36 +218,6 @@ def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -
     affine[0, 1], affine[1, 2] = stretch - 1.0
     return affine
 
-
-def hole_centres(mask: BoolArray, grid: PixelGrid, cellular: Box, cell_size: float) -> FloatArray:
-    """(n, 2) centres of the holes that lie in the cellular part [mm]; specks are left out."""
-    labels, count = ndimage.label(~mask)
-    numbers = np.arange(1, count + 1)
-    centres = np.array(ndimage.center_of_mass(labels > 0, labels, numbers)).reshape(-1, 2)
-    area = ndimage.sum_labels(labels > 0, labels, numbers) * (grid.pixel_size / cell_size) ** 2
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    x, y = grid.to_mm(*centres.T)
-    keep = (area > _SMALLEST_HOLE) & ~np.isin(numbers, border)
-    keep &= (x > cellular.x_min) & (x < cellular.x_max)
-    keep &= (y > cellular.y_min) & (y < cellular.y_max)
-    return np.asarray(np.column_stack([x, y])[keep])
-
-
-def require_hole_distance(centres: FloatArray, cell_size: float) -> None:
-    """Raise InputError if neighbouring holes are not a cell size apart; few holes say nothing."""
-    if len(centres) < _FEWEST_HOLES:
-        return
-    apart = float(np.median(cKDTree(centres).query(centres, k=2)[0][:, 1]))
-    if abs(apart - cell_size) > WRONG_CELL * cell_size:
-        raise InputError(
-            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got "
-            f"{apart:.3g} mm between neighbours of {len(centres)} holes; give cell size "
-            f"{apart:.3g} mm, or check the pixel size"
-        )
-
-
-Slow = Callable[[FloatArray], FloatArray]
-"""From (..., 2) points to (..., 2) displacements [mm]."""
 
 CELL_PX = 48
 """Binned pixels a unit cell: enough to see its pattern, few enough to be quick."""
@@ -272,35 +229,23 @@ WARPS = 8
 """Iterations on each level of the flow's own pyramid."""
 STEP = 2
 """Distance of the field's points [binned px]."""
-GRAIN = 1e-3
+DITHER = 1e-3
 """Noise added to both images, of their contrast: a window without any texture has no flow at all,
 and what it gives instead would spread."""
 
 
-def coarse_field(
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    grid: PixelGrid,
-    cell_size: float,
-    known: Slow,
-    mask: ArrayLike | None = None,
-    deformed_mask: ArrayLike | None = None,
-) -> LocalField:
+def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
     """Find the displacement between two images roughly, near to what is known of it.
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels.
-    grid
-        Their pixels.
+    pair
+        Images and masks.
     cell_size
-        l [mm]; says what may be blurred away.
+        l [mm]; limits the blur.
     known
-        From (..., 2) points to (..., 2) displacements [mm]; what it leaves should be within some
+        From (..., 2) points to (..., 2) displacements [mm]; the rest should be within some
         speckles.
-    mask, deformed_mask
-        (rows, cols) True on material.
 
     Returns
     -------
@@ -310,25 +255,23 @@ def coarse_field(
     Raises
     ------
     InputError
-        As :func:`modeharvest.idic.correlate.correlate`, or if the known part leads out of the image
-        altogether.
+        If the known part leads out of the image altogether.
     """
-    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
-    factor = max(1, round(cell_size / (CELL_PX * grid.pixel_size)))
-    pair = level_pair(
-        images.f, images.g, grid, images.f_mask, images.g_mask, Level(factor, BLUR), 0, 3,
-        levelled=True,
+    factor = max(1, round(cell_size / (CELL_PX * pair.grid.pixel_size)))
+    level = level_pair(
+        pair.reference, pair.deformed, pair.grid, pair.mask, pair.deformed_mask,
+        Level(factor, BLUR), 0, 3, levelled=True,
     )  # fmt: skip
-    coarse = pair.grid
+    coarse = level.grid
     points = np.stack(np.broadcast_arrays(coarse.x[None, :], coarse.y[:, None]), axis=-1)
     slow = np.asarray(known(points), dtype=np.float64)
-    pulled, seen_in_both = _pulled_back(pair, slow)
-    flow = _flow(pair.reference, pulled) * coarse.pixel_size * (1.0, -1.0)
+    warped, inside = _warped_back(level, slow)
+    flow = _flow(level.reference, warped) * coarse.pixel_size * (1.0, -1.0)
     row, col = (i[::STEP, ::STEP].ravel() for i in np.indices(coarse.shape))
-    keep = (pair.mask & seen_in_both)[row, col]
+    keep = (level.mask & inside)[row, col]
     if not keep.any():
         raise InputError(
-            "automatic start: expected the two images to overlap, but what is known of the motion "
+            "automatic start: expected the two images to overlap, but the known part of the motion "
             "leads out of the deformed image everywhere; check the hole centres and the masks"
         )
     row, col = row[keep], col[keep]
@@ -336,21 +279,21 @@ def coarse_field(
     return LocalField(x, y, (slow + flow)[row, col], source="optical flow of the images")
 
 
-def _pulled_back(pair: LevelPair, slow: FloatArray) -> tuple[NDArray[Any], BoolArray]:
+def _warped_back(level: LevelPair, slow: FloatArray) -> tuple[NDArray[Any], BoolArray]:
     """(rows, cols) g at x + slow, the reference where that is outside; and where it is inside."""
-    grid = pair.grid
+    grid = level.grid
     row, col = np.indices(grid.shape)
     to_row, to_col = row - slow[..., 1] / grid.pixel_size, col + slow[..., 0] / grid.pixel_size
-    value, _, _ = pair.deformed.sample(to_row, to_col)
+    value, _, _ = level.deformed.sample(to_row, to_col)
     inside = np.isfinite(value)
-    return np.where(inside, value, pair.reference), inside
+    return np.where(inside, value, level.reference), inside
 
 
 def _flow(reference: NDArray[Any], deformed: NDArray[Any]) -> FloatArray:
     """(rows, cols, 2) displacement along columns and rows [px]."""
     rng = np.random.default_rng(0)
-    grain = GRAIN * float(reference.std())
-    f, g = (np.float64(i) + grain * rng.standard_normal(i.shape) for i in (reference, deformed))
+    noise = DITHER * float(reference.std())
+    f, g = (np.float64(i) + noise * rng.standard_normal(i.shape) for i in (reference, deformed))
     down, right = optical_flow_ilk(  # type: ignore[no-untyped-call]
         f, g, radius=RADIUS, num_warp=WARPS, gaussian=True, prefilter=False, dtype=np.float64
     )
