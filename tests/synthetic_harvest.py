@@ -111,7 +111,7 @@ def frame(name: str, strain: float, amplitude: float, held: bool = False) -> Har
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
         local=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)),
-        start_sentences=("v0 starts from the local DIC.",),
+        start_text=("v0 starts from the local DIC.",),
     )
 
 
@@ -181,7 +181,7 @@ def harvest(
         noise_sd=NOISE,
         noise_source="measured from 3 exposures",
         full_scale=LEVELS,
-        sentences=("The material was found by its speckle.",),
+        text=("The material was found by its speckle.",),
         truth=HarvestTruth(truth, lens(1.01), rows),
         versions={"modeharvest": "0"},
     )

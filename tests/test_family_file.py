@@ -126,7 +126,7 @@ def test_foreign_files_are_refused(
                 read(path)
             assert "\n" not in str(caught.value)
     content = json.loads(whole)
-    for key in ("name", "matrix", "sentences"):
+    for key in ("name", "matrix", "text"):
         path.write_text(json.dumps({k: v for k, v in content.items() if k != key}), "utf-8")
         with pytest.raises(InputError, match=f"no '{key}'"):
             read_family(path)

@@ -58,9 +58,9 @@ def report(harvest: Harvest, folder: File) -> str:
 def bare(harvest: Harvest) -> Harvest:
     """One photograph of which only the correlation is known."""
     frame = replace(harvest.frames[1], mask=None, by_model_error=None, model_error_covariance=None,
-                    spectrum=None, pattern=None, local=None, start_sentences=())  # fmt: skip
+                    spectrum=None, pattern=None, local=None, start_text=())  # fmt: skip
     return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
-                   calibration=None, full_scale=None, sentences=(), truth=None,
+                   calibration=None, full_scale=None, text=(), truth=None,
                    versions={})  # fmt: skip
 
 

@@ -310,7 +310,7 @@ def write_family(
         "amplitude": found.amplitude,
         "captured": found.captured,
         "growth": [list(step) for step in found.growth],
-        "sentences": list(found.sentences),
+        "text": list(found.sentences),
         "waves": found.waves.tolist(),
         "matrix": family.matrix.tolist(),
         "offset": family.offset.tolist(),
@@ -348,7 +348,7 @@ def read_family(path: Path | str) -> FoundFamily:
             float(content["amplitude"]),
             float(content["captured"]),
             tuple((int(count), float(share)) for count, share in content["growth"]),
-            tuple(str(sentence) for sentence in content["sentences"]),
+            tuple(str(sentence) for sentence in content["text"]),
             dict(content["info"]),
         )
 

@@ -15,7 +15,7 @@ from modeharvest.cli.messages import (
     SolutionFile,
     bars,
     folder_option,
-    tell,
+    report_error,
 )
 from modeharvest.util.errors import InputError
 
@@ -93,7 +93,7 @@ def score(
 def _refuse(reasons: Mapping[str, str]) -> None:
     """Name the fields that were not graded; the exit code is then 2."""
     for why in reasons.values():
-        tell(InputError(why))
+        report_error(InputError(why))
     if reasons:
         raise typer.Exit(UNUSABLE)
 

@@ -104,11 +104,11 @@ def compilation_announced(console: Console) -> Iterator[None]:
     from modeharvest.util.compiled import is_cached
 
     class Notice(event.Listener):
-        told = False
+        announced = False
 
         def on_start(self, event: Any) -> None:
-            if not self.told:
-                self.told = True
+            if not self.announced:
+                self.announced = True
                 kept = "once; they are kept on disk" if is_cached() else _NOT_KEPT
                 console.print(f"compiling kernels for this machine: some seconds, {kept}")
 
@@ -163,7 +163,7 @@ def warn(message: str) -> None:
     console.print(f"[yellow]warning:[/yellow] {escape(message)}", highlight=False)
 
 
-def tell(error: BaseException) -> int:
+def report_error(error: BaseException) -> int:
     """Say in one line why a command ended early; returns the exit code.
 
     Nothing leads to a traceback on the terminal: what nobody thought of goes to a file.

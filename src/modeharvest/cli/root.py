@@ -38,7 +38,7 @@ app = typer.Typer(
     help=(
         "A virtual laboratory for integrated digital image correlation (IDIC) on mechanical "
         "metamaterials: buckle a cellular elastomer, make speckle images whose truth is known at "
-        "every pixel, measure them, and see how wrong the measurement was, and why.\n\n"
+        "every pixel, measure them, and see its errors and where they come from.\n\n"
         "Start with: [bold]modeharvest run paper-virtual --out out/demo[/bold], or, for the modes "
         "of an infinite lattice, [bold]modeharvest modes square-lattice --out out/square[/bold]"
     ),
@@ -123,7 +123,7 @@ def _run() -> None:
         raise
     except BaseException as error:
         _drop_output()
-        sys.exit(messages.tell(error))
+        sys.exit(messages.report_error(error))
 
 
 def _open_streams() -> None:
@@ -173,6 +173,6 @@ def _interrupt(number: int, frame: object) -> NoReturn:
 
 
 def _unless_interrupted(ignored: UnraisableHookArgs) -> None:
-    """Tell nothing of an interruption in a destructor or a callback: it isn't lost."""
+    """Print nothing of an interruption in a destructor or a callback: it isn't lost."""
     if not issubclass(ignored.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(ignored)

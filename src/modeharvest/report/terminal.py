@@ -262,7 +262,7 @@ def print_harvest(summary: dict[str, Any], out: Path) -> None:
     console.print(table)
     console.print("± noise of the images / ± what the ansatz leaves over; standard deviations")
     buckling = summary.get("buckling") or {}
-    console.print(escape(buckling.get("sentence", "")))
+    console.print(escape(buckling.get("text", "")))
     for row in summary.get("truth") or []:
         mark = "[green]✓[/green]" if row["ok"] else "[red]✗[/red]"
         obtained = row["obtained"]
@@ -340,10 +340,10 @@ def _waves(frame: dict[str, Any], i: int) -> str:
 
 
 def print_study(summary: dict[str, Any], out: Path) -> None:
-    """Print a study's sentences, its failures, and the file of the report last."""
+    """Print a study's findings, its failures, and the file of the report last."""
     console = Console(highlight=False)
     console.print(f"[bold]{escape(summary['title'])}[/bold]", soft_wrap=True)
-    for sentence in summary["sentences"]:
+    for sentence in summary["text"]:
         console.print(f"- {escape(sentence)}", soft_wrap=True)
     for failure in summary["failed"]:
         console.print(

@@ -74,7 +74,7 @@ def grade_star(
     -------
     StarGrading
         Of the fields that can be graded; those that can't be read, are of another set, in
-        millimetres or don't hold the wave are in its ``refused``, each with the reason.
+        millimetres or don't contain the wave are in its ``refused``, each with the reason.
 
     Raises
     ------
@@ -233,12 +233,12 @@ def score(
         try:
             field = read_measured(path, grid, known.id, declared)
             graded = score_field(field, true(field.x, field.y), labels, grid, reach_px)
-            _, told = check_conventions(field, true, grid)
+            _, notes = check_conventions(field, true, grid)
         except InputError as error:
             refused[str(path)] = str(error)
             continue
         scores.append(graded)
-        remarks += told
+        remarks += notes
     if not scores:
         raise InputError("; ".join(refused.values()))
     best_first = ranked(scores)

@@ -1,4 +1,4 @@
-"""Cases: a TOML file turned into checked objects, faults told in one line.
+"""Cases: a TOML file turned into checked objects, each fault in one line.
 
 A case is a pydantic model whose fields are the project's frozen dataclasses, so a case file,
 ``--help`` and the Python objects use the same names and units. A virtual experiment::
@@ -96,7 +96,7 @@ CaseType = TypeVar("CaseType", bound=CaseModel)
 
 
 def table_of_kind(tables: Mapping[str, Any]) -> str:
-    """The table that tells a case's kind: "lattice", "study", "images", "experiment" or ""."""
+    """The table that makes a case's kind: "lattice", "study", "images", "experiment" or ""."""
     return next((name for name in _KINDS if name in tables), "")
 
 

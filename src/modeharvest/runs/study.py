@@ -223,7 +223,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
             files[name] = title
             with atomic(self.folder / name) as temporary:
                 part.to_csv(temporary, index=False)
-        files["summary.json"] = "the findings' numbers and sentences, and the failures"
+        files["summary.json"] = "the findings' numbers and text, and the failures"
         files["timings.json"] = "what the stages took [s]"
         summary = self._summary(campaign, table, findings)
         write_json(self.folder / "summary.json", summary)
@@ -252,7 +252,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
             "kind": self.case.kind,
             "command": self.command,
             "seeds": self.case.study.seeds,
-            "sentences": list(findings.sentences),
+            "text": list(findings.sentences),
             "numbers": to_plain(findings.numbers),
             "cases": len(table),
             "failed": [

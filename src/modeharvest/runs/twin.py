@@ -189,7 +189,7 @@ title = "{case.title}"
 [images]
 reference = "reference.tif"
 deformed = [{deformed}]
-repeats = ["reference_2.tif"]      # the same state once more: tells the camera's noise
+repeats = ["reference_2.tif"]      # the same state once more: for the camera's noise
 
 [scale]
 pixel_size = {case.imaging.pixel_size:g}                  # [mm/px]
@@ -273,7 +273,7 @@ def compare(
 
 
 def _strain_of(name: str, strains: tuple[float, ...]) -> float:
-    """The strain that a photograph's name tells in hundredths of a per cent."""
+    """The strain in a photograph's name, in hundredths of a per cent."""
     number = int(name.rsplit("_", 1)[-1]) / 1e4
     return min(strains, key=lambda strain: abs(strain - number))
 
@@ -298,7 +298,7 @@ def _frame_rows(
         return rows
     if identifiability(result, inside).unobservable:
         words = f"{name}: wave vectors and v1"
-        return [*rows, TruthRow(words, "no pattern is seen", "asked of one that is", True)]
+        return [*rows, TruthRow(words, "not observable", "asked of one that is", True)]
     x, y = _over(cellular)
     v, at_best = (r.ansatz.v(0, r.unknowns, x, y) for r in (result, best))
     apart = float(np.abs(v - at_best).max() / np.abs(at_best).max())

@@ -1,6 +1,6 @@
 """Parsers that can crash, run in a process apart: ``python child.py KIND FILE TARGET``.
 
-scipy reads MAT files, and meshio meshes, as they tell it to: a damaged one makes scipy read where
+scipy reads MAT files, and meshio meshes, as the file says: a damaged one makes scipy read where
 there is no memory of its own, which ends the process, and meshio fill the memory. What is read goes
 to TARGET, an NPZ of numbers and texts, with their names as ``names``. Imports nothing of
 modeharvest, to start fast.
@@ -56,9 +56,9 @@ KINDS = {"mat": read_mat, "mesh": read_mesh}
 
 def convert(kind: str, path: str, target: str) -> str:
     """Read ``path`` and write ``target``; returns why that failed, or an empty text."""
-    said = StringIO()
+    output = StringIO()
     try:
-        with warnings.catch_warnings(), redirect_stdout(said), redirect_stderr(said):
+        with warnings.catch_warnings(), redirect_stdout(output), redirect_stderr(output):
             warnings.simplefilter("ignore")  # what is doubtful is left out below
             found = {name: np.asarray(values) for name, values in KINDS[kind](path).items()}
         kept = {name: array for name, array in found.items() if array.dtype.kind in "fiubU"}
@@ -66,7 +66,7 @@ def convert(kind: str, path: str, target: str) -> str:
     except (Exception, SystemExit) as error:  # they raise anything, print why, and may exit
         if isinstance(error, MemoryError):
             return "it declares more numbers than a file of its size can hold"
-        return " ".join((said.getvalue() or str(error)).split()) or type(error).__name__
+        return " ".join((output.getvalue() or str(error)).split()) or type(error).__name__
     return ""
 
 
@@ -87,9 +87,9 @@ def main(arguments: Sequence[str]) -> int:
     """Do what the module says; the exit code, after a line on stderr if it isn't 0."""
     kind, path, target = arguments
     limit_memory(path)
-    said = convert(kind, path, target)
-    print(said, file=sys.stderr)
-    return int(bool(said))
+    failure = convert(kind, path, target)
+    print(failure, file=sys.stderr)
+    return int(bool(failure))
 
 
 if __name__ == "__main__":

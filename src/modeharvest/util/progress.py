@@ -1,4 +1,4 @@
-"""How long work tells where it is, without knowing who listens."""
+"""Progress of long work, reported without knowing who listens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def silent(done: float, total: float, what: str) -> None:
 
 
 def named(progress: Progress, name: str) -> Progress:
-    """The same listener, told another name of the step."""
+    """The same listener, with another name for the step."""
 
     def listener(done: float, total: float, what: str) -> None:
         progress(done, total, name)

@@ -301,17 +301,17 @@ def exclusive(folder: Path | str) -> Iterator[None]:
         If another process has it: which, where and since when. If the disk refuses.
     """
     folder = Path(folder).resolve()
-    held: set[Path] = _of_this_thread.__dict__.setdefault("folders", set())
-    if folder in held:
+    mine: set[Path] = _of_this_thread.__dict__.setdefault("folders", set())
+    if folder in mine:
         yield
         return
     lock = _Lock(folder / LOCK)
     on_first(lock.acquire)
-    held.add(folder)
+    mine.add(folder)
     try:
         yield
     finally:
-        held.discard(folder)
+        mine.discard(folder)
         lock.release()
 
 

@@ -428,7 +428,7 @@ def _errors(field: str, symbol: str, title: str, more: str, i: int | None = None
             partial(maps.draw_error, field=field, cause="noise"), of_noise,
         ),
         PhotographPanel(
-            "sure", f"{field}-leftover", f"sd({symbol})", f"{title}, by what is left over", "",
+            "sure", f"{field}-model_error", f"sd({symbol})", f"{title}, by model error", "",
             "One standard deviation by what the ansatz can’t describe, which pushes its unknowns "
             "about from cell to cell; noise included.",
             partial(maps.draw_error, field=field, cause="model_error"), _has_model_error(i),

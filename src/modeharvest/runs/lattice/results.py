@@ -39,7 +39,7 @@ of unit density [N/mm^4]:
 ``notes``
     What a reader should know.
 ``files``
-    Names of the files beside this one, and what they hold.
+    Names of the files beside this one, and what is in them.
 ``versions``
     With which software; what it took is in ``timings.json``.
 """
@@ -258,7 +258,7 @@ _PEAKS = 8
 
 
 def exports_in(folder: Path) -> dict[str, str]:
-    """Files for further use that are in a folder, and what they hold."""
+    """Files for further use that are in a folder, and what is in them."""
     known = {name: text for name, text in _EXPORTS.items() if (folder / name).is_file()}
     index = folder / "families.json"
     families = read_json(index) if index.is_file() else {}

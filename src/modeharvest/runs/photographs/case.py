@@ -115,7 +115,7 @@ class Images:
     reference
         File of the undeformed state.
     deformed
-        Files of the deformed states in the order of the test; a name may hold wildcards, whose
+        Files of the deformed states in the order of the test; a name may have wildcards, whose
         matches come in the order of their names.
     repeats
         Further exposures of the undeformed state, from which the camera's noise is measured.
@@ -183,7 +183,7 @@ class DistortionTable:
         A distortion written by modeharvest (JSON).
     calibration
         Images of a speckle target under rigid shifts of the stage; the first is the one that
-        the others are shifted from. Names may hold wildcards.
+        the others are shifted from. Names may have wildcards.
     shifts
         Their shifts (along columns, along rows) [px], if known, the first (0, 0) included.
     """

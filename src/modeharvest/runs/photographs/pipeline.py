@@ -195,7 +195,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             write_field(field, measured.local)
             measured.result.write(result)
             record = {"fixed": measured.fixed, "blur_px": measured.blur_px}
-            write_json(start, {"failed": "", **record, "said": measured.sentences})
+            write_json(start, {"failed": "", **record, "text": measured.sentences})
             return result, field, start
 
         self.stages.do(f"correlate {name}", key, work)
@@ -214,8 +214,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         reference, mask = prepared.image(), prepared.mask()
         if self.case.correlation.formulation == "updated" and before is not None:
             result = found[before].result
-            reference, seen = pulled_back(prepared.image(before), result, result.order)
-            mask = mask & seen
+            reference, inside = pulled_back(prepared.image(before), result, result.order)
+            mask = mask & inside
         return ImagePair(reference, prepared.image(name), prepared.grid, mask, prepared.mask(name))
 
     def _read(self, name: str) -> MeasuredPhotograph:
@@ -226,7 +226,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             read_field(field),
             bool(record["fixed"]),
             float(record["blur_px"]),
-            tuple(record["said"]),
+            tuple(record["text"]),
         )
 
     def _record(self, name: str) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def calibrate_lens(
     write_distortion(folder / "distortion.json", found.distortion)
     content: dict[str, Any] = {name: getattr(found, name).tolist() for name in _ARRAYS}
     content["trials"] = [asdict(trial) for trial in found.trials]
-    content |= {"noise_sd": found.noise_sd, "fixed": found.fixed, "sentences": found.sentences}
+    content |= {"noise_sd": found.noise_sd, "fixed": found.fixed, "text": found.sentences}
     write_json(folder / "calibration.json", content)
 
 
@@ -187,7 +187,7 @@ def calibrated_lens(folder: Path) -> Optics:
             trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
             noise_sd=float(content["noise_sd"]),
             fixed=int(content["fixed"]),
-            sentences=tuple(map(str, content["sentences"])),
+            sentences=tuple(map(str, content["text"])),
             **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
         )
         return Optics(distortion, calibration)
@@ -213,7 +213,7 @@ def prepare(
     mask = ready.save("reference", reference, _given(base, table.material))
     deformed = named_files(base, images.deformed)
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
-    names, skipped, notes = [], [], list(reference.notes) + ready.sentences
+    names, skipped, notes = [], [], list(reference.notes) + ready.text
     for k, path in enumerate(deformed):
         progress(k, len(deformed), "prepare photographs")
         try:
@@ -250,7 +250,7 @@ class _Maker:
         self, folder: Path, distortion: Distortion | None, options: MaterialOptions
     ) -> None:
         self._folder, self._distortion, self._options = folder, distortion, options
-        self.sentences: list[str] = []
+        self.text: list[str] = []
 
     def save(self, name: str, photograph: Photograph, given: Path | None) -> BoolArray:
         """Write image and mask under a name; returns the photograph's own mask."""
@@ -260,7 +260,7 @@ class _Maker:
         else:
             material = find_material(photograph.image, self._options)
             mask = material.mask
-            self.sentences += [s for s in material.sentences if s not in self.sentences]
+            self.text += [s for s in material.sentences if s not in self.text]
         image, shown = photograph.image, mask
         if self._distortion is not None:
             image, shown = (

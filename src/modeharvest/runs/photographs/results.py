@@ -78,18 +78,18 @@ class HarvestedFrame:
     error_x, error_y
         (p,) and (q,) axes [mm] of the error bars.
     by_noise, by_model_error
-        Error bars on these axes, arrays (q, p, ...), by the images' noise and by what the ansatz
-        leaves over; the latter None if they can't be had.
+        Error bars on these axes, arrays (q, p, ...), by the images' noise and by
+        model error; the latter None if they can't be had.
     noise_covariance, model_error_covariance
-        (n, n) of the unknowns by the images' noise and by what the ansatz leaves over: those
-        that the error bars are made of.
+        (n, n) of the unknowns by the images' noise and by model error: those that the error bars
+        are made of.
     spectrum, pattern
         Of the displacement without its affine part, and what is read off it.
     parts
         The same of every part that has modes of its own, in one order for all photographs.
     local
         Of a local DIC.
-    start_sentences, warnings
+    start_text, warnings
         Where the correlation started from, and what a user should know.
     """
 
@@ -111,7 +111,7 @@ class HarvestedFrame:
     pattern: WavePattern | None = None
     parts: tuple[PartSpectrum, ...] = ()
     local: LocalField | None = None
-    start_sentences: tuple[str, ...] = ()
+    start_text: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -220,7 +220,7 @@ class Harvest:
         Of each photograph [grey levels], and where that is known from.
     full_scale
         Largest grey level of the camera; None if not known.
-    sentences
+    text
         What was done to the photographs and found in them, in words.
     truth
         Of photographs made by a simulation.
@@ -247,7 +247,7 @@ class Harvest:
     calibration: Calibration | None = None
     distortion: Distortion | None = None
     full_scale: float | None = None
-    sentences: tuple[str, ...] = ()
+    text: tuple[str, ...] = ()
     truth: HarvestTruth | None = None
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
@@ -351,7 +351,7 @@ def gather_harvest(
         calibration=optics.calibration,
         distortion=optics.distortion,
         full_scale=float(prepared.info["full_scale"]),
-        sentences=(*prepared.info["notes"], *geometry.region.sentences),
+        text=(*prepared.info["notes"], *geometry.region.sentences),
         truth=truth,
         command=f"modeharvest harvest {source} --out {folder}",
         toml=path.read_text("utf-8") if path.is_file() else "",
@@ -374,7 +374,7 @@ def _frame(
     by_noise, by_model_error, warnings = covariances(
         measured, prepared_pair(prepared, name), noise, cell
     )
-    seen = identifiability(result, prepared.mask())
+    identified = identifiability(result, prepared.mask())
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
     pattern = read_pattern(spectrum)
@@ -385,7 +385,7 @@ def _frame(
         image=image,
         mask=prepared.mask(name),
         result=result,
-        identifiability=seen,
+        identifiability=identified,
         residual_test=residual_test(measured, prepared.image(), image, prepared, noise),
         error_x=x,
         error_y=y,
@@ -399,7 +399,7 @@ def _frame(
         pattern=pattern,
         parts=_parts(measured, geometry, cell),
         local=measured.local if case.local.code != "none" else None,
-        start_sentences=tuple(s for s in measured.sentences if s not in pattern.sentences),
+        start_text=tuple(s for s in measured.sentences if s not in pattern.sentences),
         warnings=warnings,
     )
 
@@ -415,12 +415,12 @@ def _parts(
 
 
 def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
-    seen, px = frame.identifiability, frame.result.grid.pixel_size
+    identified, px = frame.identifiability, frame.result.grid.pixel_size
     return Moment(
         name=frame.name,
         strain=frame.strain_x,
-        amplitude_px=float(np.linalg.norm(seen.amplitude_px)),
-        model_error_px=seen.model_error_px,
+        amplitude_px=float(np.linalg.norm(identified.amplitude_px)),
+        model_error_px=identified.model_error_px,
         noise_px=_inside(frame.by_noise, frame.error_x, frame.error_y, cellular) / px,
     )
 

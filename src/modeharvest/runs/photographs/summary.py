@@ -1,7 +1,7 @@
 """``summary.json`` of measured photographs: every number of the report, for programs to read.
 
 A number that is not known, or infinite, is null. Standard deviations come in pairs: by the
-photographs' noise, and by what the ansatz leaves over (noise included); lengths that follow the
+photographs' noise, and by model error (noise included); lengths that follow the
 images are in px, positions and fields in mm. rms is per component.
 
 ``title``, ``experiment``
@@ -15,12 +15,12 @@ images are in px, positions and fields in mm. rms is per component.
     line) [-, compression positive], ``has_pattern``, ``outcome``, ``outcome_why``,
     ``iterations`` (on the full image), ``iterations_all_levels``, ``pixels``,
     ``residual_rms`` [grey levels], ``residual_of_full_scale``, ``residual_correlation``,
-    ``chi_square``, ``residual_test`` and ``weighting`` (sentences), ``model_error_px`` (of what the
+    ``chi_square``, ``residual_test`` and ``weighting`` (text), ``model_error_px`` (of what the
     ansatz can't describe, estimated from the images), ``condition_number``, ``undetermined``,
-    ``errors_px`` (``noise`` and ``leftover``: rms standard deviation of ``v0``, ``fluctuation``
+    ``errors_px`` (``noise`` and ``model_error``: rms standard deviation of ``v0``, ``fluctuation``
     and ``displacement`` over the part with holes), ``local`` (``source``, ``points``, ``lost``,
     ``w_rms_px``, ``sd_px``, ``w_beyond_noise_px``), ``modes``, ``pattern_reading`` and
-    ``start`` (sentences), ``warnings``.
+    ``start`` (text), ``warnings``.
 ``frames[].modes``
     One for each mode: ``family``, ``fixed``, ``observable``, ``amplitude_px`` (rms of v phi),
     ``largest_px`` (its largest length), ``v_max_mm`` with ``v_max_sd_noise_mm`` and
@@ -32,16 +32,16 @@ images are in px, positions and fields in mm. rms is per component.
     For each frame ``name``, ``strain``, ``amplitude_px``, ``model_error_px``, ``noise_px``,
     ``has_pattern``.
 ``buckling``
-    ``before``, ``after``, ``estimate`` [-], ``sentence``.
+    ``before``, ``after``, ``estimate`` [-], ``text``.
 ``lattice``
     ``kind``, ``holes``, ``missing``, ``extra``, ``misfit_px``, ``pitch_px``, ``diameter_px``,
-    ``vectors_px`` and ``origin_px`` (row, col), ``rotation_deg``, ``sentences``; null without.
+    ``vectors_px`` and ``origin_px`` (row, col), ``rotation_deg``, ``text``; null without.
 ``optics``
     ``max_px`` and ``rms_px`` of the distortion; where it was calibrated ``sd_rms_px``,
     ``degree``, ``trials`` (``degree``, ``unknowns``, ``residual_rms``, ``bic``, ``change_px``,
     ``sd_px``), ``shifts_px`` (row, col) and ``angles_rad`` of the target with ``shifts_sd_px``
-    and ``angles_sd_rad``, ``noise_sd``, ``matches``, ``sentences``; null without.
-``skipped``, ``sentences``
+    and ``angles_sd_rad``, ``noise_sd``, ``matches``, ``text``; null without.
+``skipped``, ``text``
     Photographs not used (``name``, ``reason``); what was done and found, in words.
 ``truth``
     Rows ``quantity``, ``obtained``, ``expected``, ``unit``, ``ok``, where the truth is known.
@@ -68,7 +68,7 @@ _CELLS = 360
 
 def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
     """Describe mode i (from 0) of a frame; keys as in ``summary.json``."""
-    result, seen = frame.result, frame.identifiability
+    result, identified = frame.result, frame.identifiability
     family, part = result.ansatz.modes[i].family, result.ansatz.phi_slice(i)
     noise = frame.noise_covariance[part, part]
     left = (
@@ -78,10 +78,10 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
     return {
         "family": family.name,
         "fixed": family.size == 0,
-        "observable": i not in seen.unobservable,
-        "amplitude_px": seen.amplitude_px[i],
+        "observable": i not in identified.unobservable,
+        "amplitude_px": identified.amplitude_px[i],
         **_largest_values(harvest, frame, i),
-        "overlap": seen.overlap[i],
+        "overlap": identified.overlap[i],
         "parameters": [
             {"name": name, "unit": unit, "value": value, "sd_noise": _item(sd_noise, k),
              "sd_model_error": _item(sd_left, k)}
@@ -172,11 +172,12 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
             for m in harvest.timeline
         ],
         "buckling": None if buckling is None else {
-            k: getattr(buckling, k) for k in ("before", "after", "estimate", "sentence")},
+            "before": buckling.before, "after": buckling.after, "estimate": buckling.estimate,
+            "text": buckling.sentence},
         "lattice": _lattice(harvest),
         "optics": _optics(harvest),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
-        "sentences": harvest.sentences,
+        "text": harvest.text,
         "truth": [] if truth is None else truth.rows,
         "versions": harvest.versions,
     }  # fmt: skip
@@ -185,7 +186,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
 
 
 def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
-    result, seen = frame.result, frame.identifiability
+    result, identified = frame.result, frame.identifiability
     moment = next((m for m in harvest.timeline if m.name == frame.name), None)
     return {
         "name": frame.name,
@@ -205,9 +206,9 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "chi_square": frame.residual_test.chi_square,
         "residual_test": frame.residual_test.sentence,
         "weighting": result.weighting.sentence,
-        "model_error_px": seen.model_error_px,
-        "condition_number": seen.condition_number,
-        "undetermined": seen.undetermined,
+        "model_error_px": identified.model_error_px,
+        "condition_number": identified.condition_number,
+        "undetermined": identified.undetermined,
         "errors_px": {
             "noise": _rms_errors(harvest, frame, frame.by_noise),
             "model_error": _rms_errors(harvest, frame, frame.by_model_error),
@@ -215,17 +216,17 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "local": _local(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
         "pattern_reading": () if frame.pattern is None else frame.pattern.sentences,
-        "start": frame.start_sentences,
+        "start": frame.start_text,
         "warnings": (*_frame_warnings(frame), *frame.warnings),
     }  # fmt: skip
 
 
 def _frame_warnings(frame: HarvestedFrame) -> list[str]:
     """What identifiability warns of, but for modes that are fixed, as it advises."""
-    seen, modes = frame.identifiability, frame.result.ansatz.modes
-    said = dict(zip(seen.unobservable, seen.warnings, strict=False))  # those come first
-    return [w for w in seen.warnings
-            if not any(w == said[i] and not modes[i].family.size for i in said)]  # fmt: skip
+    identified, modes = frame.identifiability, frame.result.ansatz.modes
+    first = zip(identified.unobservable, identified.warnings, strict=False)  # those come first
+    expected = {warning for i, warning in first if not modes[i].family.size}
+    return [warning for warning in identified.warnings if warning not in expected]
 
 
 def _rms_errors(
@@ -279,7 +280,7 @@ def _lattice(harvest: Harvest) -> dict[str, Any] | None:
         "vectors_px": lattice.vectors,
         "origin_px": lattice.origin,
         "rotation_deg": lattice.rotation_deg,
-        "sentences": lattice.sentences,
+        "text": lattice.sentences,
     }
 
 
@@ -303,7 +304,7 @@ def _optics(harvest: Harvest) -> dict[str, Any] | None:
             "angles_sd_rad": found.angles_sd,
             "noise_sd": found.noise_sd,
             "matches": found.matches,
-            "sentences": found.sentences,
+            "text": found.sentences,
         }
     return summary
 
