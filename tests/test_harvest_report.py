@@ -80,7 +80,7 @@ def test_every_panel_is_there_for_every_photograph(harvest: Harvest, text: str) 
     ids = Page(text).ids
     every = photograph_panels(PhotographReportData(harvest))
     assert {"image", "Sxx", "v0y", "v1", "phi1", "fluc1x", "residual", "w", "v0-noise",
-            "fluc1-leftover", "loss"} <= {panel.key for panel in every}  # fmt: skip
+            "fluc1-model_error", "loss"} <= {panel.key for panel in every}  # fmt: skip
     for panel in every:
         assert all(ids[f"{panel.key}-{k}"] == 1 for k in (1, 2))
     for name in ("hero", "keys", "reference", "distortion", "distortion-sd", "distortion-error",
