@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from modeharvest.fem.bloch.dispersion import ZONES, Dispersion, ZoneMap
 from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.field import Mesh
-from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
 from modeharvest.validation.studies.lattice import FirstModeLimit, LatticeModeStudy
 from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
 
@@ -156,7 +156,10 @@ def run(**changes: Any) -> LatticeRun:
         "dispersion": dispersion(),
         "modes": set_of_modes,
         "branches": branches,
-        "patterns": tuple(FoundPattern.of_state(set_of_modes, b, PITCH) for b in branches),
+        "patterns": tuple(
+            PeriodicField.of_branch(set_of_modes, k, one, {}).analysed(PITCH)
+            for k, one in enumerate(branches, start=1)
+        ),
         "study": study(),
         "exports": {"modes.h5": "modes and branches"},
         "notes": ("A note <of the caller>.",),

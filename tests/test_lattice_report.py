@@ -17,7 +17,7 @@ from html_page import Page
 
 from modeharvest.report import lattice as words
 from modeharvest.report.lattice import write_lattice_report
-from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun
+from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
 from modeharvest.util.errors import InputError
 
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
@@ -112,7 +112,8 @@ def test_a_branch_that_could_not_be_followed_has_its_row(tmp_path: Path) -> None
 def test_a_mode_is_no_equilibrium_and_a_small_pattern_is_magnified(tmp_path: Path) -> None:
     run = made_up.run(branches=())
     assert run.modes is not None
-    mode = FoundPattern.of_mode(run.modes, 0, run.pitch)
+    shape = PeriodicField.of_mode(run.modes, 0, {})
+    mode = shape.scaled(0.16 * run.pitch).analysed(run.pitch)
     assert mode.stable is None
     small = replace(mode, displacement=0.1 * mode.displacement, stable=True)
     text = page(replace(run, patterns=(mode, small)), tmp_path)

@@ -321,7 +321,7 @@ def _hero(run: LatticeRun) -> str:
         shape, patterns = run.modes.shapes[0], run.patterns
         if patterns:
             shown = next((p for p in patterns if p.stable), patterns[0])
-            shape = shown.fluctuation(run.modes.mesh.nodes)
+            shape = shown.fluctuation
         drawn = draw_growth(_window(run, 7.0, 5.6), shape, DRAWN_AMPLITUDE * run.pitch, run.pitch)
     return to_svg(drawn, "hero", "The lattice and its pattern")
 
@@ -343,8 +343,7 @@ def _patterns(run: LatticeRun) -> list[dict[str, Any]]:
 def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> Picture:
     """The deformed lattice; a fluctuation that is too small to be seen is magnified."""
     assert run.modes is not None
-    nodes = run.modes.mesh.nodes
-    fluctuation = found.fluctuation(nodes)
+    fluctuation = found.fluctuation
     largest = float(np.linalg.norm(fluctuation, axis=1).max()) / run.pitch
     factor = DRAWN_AMPLITUDE / largest if found.stable is None else max(1.0, VISIBLE / largest)
     u = found.displacement + (factor - 1.0) * fluctuation

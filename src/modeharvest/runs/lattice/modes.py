@@ -8,7 +8,7 @@ the least stable wave (see ``fem.zone.LeastStable``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,21 +17,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.modes import Branch, ModeSet
-from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
-from modeharvest.idic.spectra.lattice_spectrum import lattice_spectrum
 from modeharvest.idic.spectra.mode_family import (
-    mode_family,
     read_family,
     read_spectrum,
     write_family,
 )
 from modeharvest.runs.lattice.case import LatticeCase, ModesPlan, Search
-from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, combination_name
+from modeharvest.runs.lattice.results import (
+    DRAWN_AMPLITUDE,
+    CriticalPoint,
+    FoundPattern,
+    PeriodicField,
+)
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, dolfinx_missing
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, named, silent
+from modeharvest.util.typed import made, to_plain
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
@@ -57,17 +60,13 @@ def find_critical(path: CellPath, search: Search, progress: Progress = silent) -
 def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
     """Write ``critical.json``."""
     point = _in_order(CriticalPoint.of(loading, found))
-    history = [asdict(least) for least in found.history]
-    write_json(path, {"point": asdict(point), "history": history})
+    write_json(path, {"point": to_plain(point), "history": to_plain(found.history)})
 
 
 def read_critical(path: Path) -> CriticalPoint:
     """Read the point in ``critical.json``; InputError if it is damaged."""
     with reading(path, "a critical point", "remove it"):
-        content = read_json(path)["point"]
-        waves = {name: tuple(map(tuple, content[name])) for name in ("waves", "earlier")}
-        signs = {name: tuple(content[name]) for name in ("below", "above")}
-        return CriticalPoint(**{**content, **waves, **signs})
+        return made(CriticalPoint, read_json(path)["point"])
 
 
 def _in_order(point: CriticalPoint) -> CriticalPoint:
@@ -80,45 +79,6 @@ def _in_order(point: CriticalPoint) -> CriticalPoint:
 
 BEYOND = (1.02, 1.1, 1.25, 1.5)
 """Loads at which states of branches are kept, relative to the critical one."""
-
-
-@dataclass(frozen=True, eq=False)
-class PeriodicField:
-    """A periodic field in which a mode family is looked for.
-
-    Parameters
-    ----------
-    file
-        Name of the family's file, such as "family_mode_1.json".
-    name
-        What it is, such as "φ₁ at 8.8 %".
-    mesh, lattice
-        One period [mm], with its (2, 2) lattice vectors as rows [mm].
-    displacement, gradient
-        (n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2).
-    info
-        Load and whatever else must be known of it, as plain JSON values.
-    stable
-        Whether it is a stable equilibrium; None for modes.
-    energy
-        Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches.
-    """
-
-    file: str
-    name: str
-    mesh: Mesh
-    lattice: FloatArray
-    displacement: FloatArray
-    gradient: FloatArray
-    info: Mapping[str, Any]
-    stable: bool | None = None
-    energy: float = 0.0
-
-    @property
-    def values(self) -> FloatArray:
-        """(n, 2) without the affine part."""
-        affine = self.mesh.nodes @ (self.gradient - np.eye(2)).T
-        return np.asarray(self.displacement - affine)
 
 
 def why_no_modes(critical: CriticalPoint, plan: ModesPlan) -> str:
@@ -225,28 +185,10 @@ def periodic_fields(
     """
     found = []
     if modes is not None:
-        found += [_of_mode(modes, k, info) for k in range(len(modes.waves))]
+        found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
         ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
-        found += [_of_branch(modes, k, branch, info) for k, branch in ends]
+        found += [PeriodicField.of_branch(modes, k, branch, info) for k, branch in ends]
     return [*found, _of_primary(path, load, modes, info)]
-
-
-def _of_mode(modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
-    name = combination_name([float(j == k) for j in range(len(modes.waves))])
-    known = {**info, "load": modes.load, "wave": list(modes.waves[k])}
-    place = (modes.mesh, modes.lattice, modes.shapes[k], np.eye(2))
-    return PeriodicField(f"family_mode_{k + 1}.json", f"mode {name}", *place, known)
-
-
-def _of_branch(modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any]) -> PeriodicField:
-    """The last state of a branch."""
-    last = branch.states[-1]
-    name = f"{combination_name(branch.combination)} at {100 * last.load:.4g} %"
-    known = {**info, "load": last.load, "combination": list(branch.combination)}
-    place = (modes.mesh, modes.lattice, last.displacement, last.gradient)
-    energy = last.energy - last.primary_energy
-    stable = last.negative_eigenvalues == 0
-    return PeriodicField(f"family_branch_{k}.json", name, *place, known, stable, energy)
 
 
 def _of_primary(
@@ -259,9 +201,15 @@ def _of_primary(
     known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
     same = cKDTree(known, boxsize=1.0).query(wanted)[1]
     u = w[same] + mesh.nodes @ (state.gradient - np.eye(2)).T
-    name = f"primary path at {100 * load:.4g} %"
     return PeriodicField(
-        "family_primary.json", name, mesh, lattice, u, state.gradient, {**info, "load": load}, True
+        file="family_primary.json",
+        name=f"primary path at {100 * load:.4g} %",
+        mesh=mesh,
+        lattice=lattice,
+        displacement=u,
+        gradient=state.gradient,
+        info={**info, "load": load},
+        stable=True,
     )
 
 
@@ -273,9 +221,8 @@ def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
 
 def find_family(pattern: PeriodicField, pitch: float, folder: Path) -> None:
     """Find the family of a pattern and write it, with its Fourier coefficients, as JSON."""
-    place = (pattern.mesh, pattern.lattice, pattern.values, pitch)
-    found = mode_family(*place, info={**pattern.info, "of": pattern.name})
-    write_family(folder / pattern.file, found, spectrum=lattice_spectrum(*place))
+    found = pattern.analysed(pitch)
+    write_family(folder / pattern.file, found.family, spectrum=found.spectrum)
 
 
 def found_pattern(pattern: PeriodicField, folder: Path) -> FoundPattern:
@@ -290,8 +237,7 @@ def found_pattern(pattern: PeriodicField, folder: Path) -> FoundPattern:
     family, spectrum = read_family(path), read_spectrum(path)
     if spectrum is None:
         raise InputError(f"expected Fourier coefficients in {path}, found none; make it again")
-    place = (pattern.displacement, pattern.gradient, spectrum, family)
-    return FoundPattern(pattern.name, *place, pattern.stable)
+    return FoundPattern(**vars(pattern), spectrum=spectrum, family=family)
 
 
 def to_be_shown(
@@ -301,7 +247,8 @@ def to_be_shown(
     branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
     found = [found_pattern(pattern, folder) for pattern in branches]
     if not found:
-        found = [FoundPattern.of_mode(modes, k, pitch) for k in range(len(modes.waves))]
+        drawn = [mode.scaled(DRAWN_AMPLITUDE * pitch) for mode in every[: len(modes.waves)]]
+        found = [mode.analysed(pitch) for mode in drawn]
     return [*found, found_pattern(every[-1], folder)]
 
 

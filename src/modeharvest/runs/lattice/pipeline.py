@@ -33,7 +33,6 @@ from modeharvest.fem.bloch.modes import (
 from modeharvest.runs.lattice.case import LatticeCase, stage_keys
 from modeharvest.runs.lattice.modes import (
     LatticeModel,
-    PeriodicField,
     find_critical,
     find_family,
     find_modes,
@@ -48,6 +47,7 @@ from modeharvest.runs.lattice.results import (
     CriticalPoint,
     FoundPattern,
     LatticeRun,
+    PeriodicField,
     exports_in,
     summary_of,
 )

@@ -47,14 +47,14 @@ of unit density [N/mm^4]:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from modeharvest.fem.bloch.dispersion import Dispersion
-from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet, Wave
+from modeharvest.fem.bloch.modes import Branch, ModeSet, Wave
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
@@ -131,63 +131,96 @@ class CriticalPoint:
                    found.above, found.earlier, least.value, least.angle)  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class FoundPattern:
-    """A pattern of a lattice on the cell of its modes, its spectrum and its family.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PeriodicField:
+    """A periodic field of a lattice, in which a mode family is looked for.
 
     Parameters
     ----------
+    file
+        Name of the family's file, such as "family_mode_1.json".
     name
-        What it is, e.g. "φ₁ + φ₂ at 8.8 %".
-    displacement
-        (n, 2) of the nodes of ``ModeSet.mesh`` [mm], affine part included.
-    gradient
-        (2, 2) F̄ of that [-].
-    spectrum, family
-        Of the displacement without its affine part.
+        What it is, such as "φ₁ at 8.8 %".
+    mesh, lattice
+        One period [mm], with its (2, 2) lattice vectors as rows [mm].
+    displacement, gradient
+        (n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2).
+    info
+        Load and whatever else must be known of it, as plain JSON values.
     stable
         Whether it is an equilibrium that is stable for fields with the period of its cell; None
         for a mode, which is no equilibrium.
+    energy
+        Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches.
     """
 
+    file: str
     name: str
+    mesh: Mesh
+    lattice: FloatArray
     displacement: FloatArray
     gradient: FloatArray
-    spectrum: LatticeSpectrum
-    family: FoundFamily
+    info: Mapping[str, Any]
     stable: bool | None = None
-
-    def fluctuation(self, nodes: FloatArray) -> FloatArray:
-        """(n, 2) displacement of these nodes without its affine part [mm]."""
-        return np.asarray(self.displacement - nodes @ (self.gradient - np.eye(2)).T)
+    energy: float = 0.0
 
     @classmethod
-    def of_state(
-        cls, modes: ModeSet, branch: Branch, pitch: float, state: BranchState | None = None
-    ) -> FoundPattern:
-        """The pattern of a branch, at its last state unless another is given."""
-        state = state or branch.states[-1]
-        name = f"{combination_name(branch.combination)} at {100 * state.load:.4g} %"
-        stable = state.negative_eigenvalues == 0
-        u, F = state.displacement, state.gradient
-        return cls(
-            name, u, F, *_spectrum_and_family(modes, state.fluctuation(modes.mesh), pitch), stable
+    def of_mode(cls, modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
+        """Mode k (from 0) of a set."""
+        name = combination_name([float(j == k) for j in range(len(modes.waves))])
+        return PeriodicField(
+            file=f"family_mode_{k + 1}.json",
+            name=f"mode {name}",
+            mesh=modes.mesh,
+            lattice=modes.lattice,
+            displacement=modes.shapes[k],
+            gradient=np.eye(2),
+            info={**info, "load": modes.load, "wave": list(modes.waves[k])},
         )
 
     @classmethod
-    def of_mode(cls, modes: ModeSet, k: int, pitch: float) -> FoundPattern:
-        """Mode k (from 0) of a set, drawn by SHAPE l upon the undeformed lattice."""
-        shape = modes.shapes[k]
-        u = DRAWN_AMPLITUDE * pitch / float(np.linalg.norm(shape, axis=1).max()) * shape
-        name = combination_name([float(j == k) for j in range(len(modes.waves))])
-        return cls(f"mode {name}", u, np.eye(2), *_spectrum_and_family(modes, u, pitch))
+    def of_branch(
+        cls, modes: ModeSet, k: int, branch: Branch, info: Mapping[str, Any]
+    ) -> PeriodicField:
+        """The last state of branch k (from 1)."""
+        last = branch.states[-1]
+        return PeriodicField(
+            file=f"family_branch_{k}.json",
+            name=f"{combination_name(branch.combination)} at {100 * last.load:.4g} %",
+            mesh=modes.mesh,
+            lattice=modes.lattice,
+            displacement=last.displacement,
+            gradient=last.gradient,
+            info={**info, "load": last.load, "combination": list(branch.combination)},
+            stable=last.negative_eigenvalues == 0,
+            energy=last.energy - last.primary_energy,
+        )
+
+    @property
+    def fluctuation(self) -> FloatArray:
+        """(n, 2) displacement without the affine part."""
+        affine = self.mesh.nodes @ (self.gradient - np.eye(2)).T
+        return np.asarray(self.displacement - affine)
+
+    def scaled(self, largest: float) -> PeriodicField:
+        """A mode with this largest displacement [mm]."""
+        shape = self.displacement
+        u = largest / float(np.linalg.norm(shape, axis=1).max()) * shape
+        return replace(self, displacement=u)
+
+    def analysed(self, pitch: float) -> FoundPattern:
+        """The same with its spectrum and family; ``pitch``: unit cell size l [mm]."""
+        place = (self.mesh, self.lattice, self.fluctuation, pitch)
+        family = mode_family(*place, info={**self.info, "of": self.name})
+        return FoundPattern(**vars(self), spectrum=lattice_spectrum(*place), family=family)
 
 
-def _spectrum_and_family(
-    modes: ModeSet, field: FloatArray, pitch: float
-) -> tuple[LatticeSpectrum, FoundFamily]:
-    spectrum = lattice_spectrum(modes.mesh, modes.lattice, field, pitch)
-    return spectrum, mode_family(modes.mesh, modes.lattice, field, pitch)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoundPattern(PeriodicField):
+    """A periodic field with the spectrum and the mode family of its fluctuation."""
+
+    spectrum: LatticeSpectrum
+    family: FoundFamily
 
 
 @dataclass(frozen=True, eq=False)
