@@ -29,7 +29,7 @@ from modeharvest.runs.photographs.results import (
     Harvest,
     HarvestedFrame,
     HarvestTruth,
-    TruthRow,
+    TruthCheck,
 )
 from modeharvest.validation.onset import Moment, find_buckling
 
@@ -161,8 +161,8 @@ def harvest(
         for one in frames
     }
     rows = (
-        TruthRow("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
-        TruthRow("distortion, affine part aside", 0.07, 0.05, False, "px"),
+        TruthCheck("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
+        TruthCheck("distortion, affine part aside", 0.07, 0.05, False, "px"),
     )
     return Harvest(
         title="Made up <for tests>",

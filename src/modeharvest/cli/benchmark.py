@@ -19,6 +19,21 @@ from modeharvest.cli.messages import (
 )
 from modeharvest.util.errors import InputError
 
+CodeNames = Annotated[
+    list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
+]
+YAxes = Annotated[
+    list[str] | None,
+    typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
+]
+FirstPixels = Annotated[
+    list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
+]
+
 
 def make(
     case: CaseName,
@@ -53,24 +68,14 @@ def score(
     truth: Annotated[Path, typer.Option("--truth", help="The truth's folder.", metavar="DIR")],
     strain: Annotated[float, typer.Option("--strain", help="Of the image that was measured.")],
     out: OutFolder,
-    name: Annotated[
-        list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
-    ] = None,
+    name: CodeNames = None,
     unit: Annotated[
         list[str] | None,
         typer.Option("--unit", help="px or mm; 'file': as its columns' names say.", metavar="UNIT"),
     ] = None,
-    y_axis: Annotated[
-        list[str] | None,
-        typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
-    ] = None,
-    first_pixel: Annotated[
-        list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
-    ] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
-    ] = None,
+    y_axis: YAxes = None,
+    first_pixel: FirstPixels = None,
+    column: Columns = None,
 ) -> None:
     """Grade displacement fields of any DIC code against the truth of a benchmark, and rank them.
 
@@ -137,20 +142,10 @@ def resolution(
         list[Path] | None,
         typer.Option("--still", help="Measured without motion; once for each FIELD, in order."),
     ] = None,
-    name: Annotated[
-        list[str] | None, typer.Option("--name", help="Of the code; once for each FIELD.")
-    ] = None,
-    y_axis: Annotated[
-        list[str] | None,
-        typer.Option("--y-axis", help="Where y grows and v is positive: down, up or 'file'."),
-    ] = None,
-    first_pixel: Annotated[
-        list[int] | None, typer.Option("--first-pixel", help="Number of the first pixel: 0 or 1.")
-    ] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option("--column", help="u=NAME or u=7; also x, y, v, valid.", metavar="ROLE=NAME"),
-    ] = None,
+    name: CodeNames = None,
+    y_axis: YAxes = None,
+    first_pixel: FirstPixels = None,
+    column: Columns = None,
 ) -> None:
     """Grade fields measured on the star: finest period, noise floor, metrological efficiency.
 

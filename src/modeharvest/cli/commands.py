@@ -228,11 +228,19 @@ def study(
     Leaves table.csv, report.html and summary.json in DIR. Run the same command again after an
     interruption: finished cases are not repeated.
     """
-    from modeharvest.report.terminal import print_study
-    from modeharvest.runs.study import study_with_options
-
-    with bars() as progress:
-        summary = study_with_options(
-            name, out, workers, memory, scheduler, quick, solution, progress
+    if scheduler is not None and workers is not None:
+        raise InputError(
+            "expected --workers or --scheduler, got both: a scheduler has workers of its own"
         )
+    from modeharvest.report.terminal import print_study
+    from modeharvest.runs.study import StudyAnalysis, StudyCase
+    from modeharvest.validation.workers import Workers
+
+    checked = StudyCase.read(name)
+    crew = Workers(2 if workers is None else workers, memory, scheduler)
+    command = f"modeharvest study {name} --out DIR"
+    command += " --quick" * quick + " --solution FILE" * (solution is not None)
+    with bars() as progress:
+        case = checked.quick() if quick else checked
+        summary = StudyAnalysis(case, out, progress, crew, solution, command).all()
     print_study(summary, out)

@@ -39,7 +39,7 @@ from modeharvest.runs.experiment import Run
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json, require_writable, write_json
-from modeharvest.util.progress import Progress, named
+from modeharvest.util.progress import named
 from modeharvest.util.stages import StagedRun, exclusive, versions
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.campaign import Campaign
@@ -50,38 +50,6 @@ from modeharvest.validation.studies.robustness import RobustnessStudy
 from modeharvest.validation.studies.study import ImagePairSpec, Study
 from modeharvest.validation.studies.systematic import SystematicStudy
 from modeharvest.validation.workers import Workers
-
-
-def study_with_options(
-    name: str,
-    out: Path,
-    workers: int | None,
-    memory: str,
-    scheduler: str | None,
-    quick: bool,
-    solution: Path | None,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Run a study as the command line says; returns the content of ``summary.json``.
-
-    Raises
-    ------
-    InputError
-        If options contradict each other, or the study can't be read or run.
-    """
-    if scheduler is not None and workers is not None:
-        raise InputError(
-            "expected --workers or --scheduler, got both: a scheduler has workers of its own"
-        )
-    case = StudyCase.read(name)
-    crew = Workers(2 if workers is None else workers, memory, scheduler)
-    words = ["modeharvest study", name, "--out DIR"]
-    words += ["--quick"] if quick else []
-    words += ["--solution FILE"] if solution else []
-    return StudyAnalysis(
-        case.quick() if quick else case, out, progress, crew, solution, " ".join(words)
-    ).all()
-
 
 KINDS: dict[str, type[Any]] = {
     "robustness": RobustnessStudy,

@@ -43,7 +43,7 @@ from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
-from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthRow
+from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthCheck
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, read_json, write_json
@@ -243,11 +243,11 @@ class TwinRun(StagedRun[Case]):
             twin = self.twin()
             harvesting = self.harvesting(twin)
             results = harvesting.results()
-            truth = compare(twin, harvesting, results, self.progress)
+            truth = compare_with_truth(twin, harvesting, results, self.progress)
             return harvesting.all(truth)
 
 
-def compare(
+def compare_with_truth(
     twin: Twin,
     harvesting: HarvestRun,
     results: Mapping[str, MeasuredPhotograph],
@@ -260,9 +260,8 @@ def compare(
         progress(k, len(results), "compare with the truth")
         strain = _strain_of(name, images.strains)
         true = images.truth(strain).displacement
-        inside = np.asarray(
-            np.isfinite(true).all(axis=-1)
-        )  # the images' own masks are as the lens shows them
+        # Not the images' own masks: those are as the lens shows them.
+        inside = np.asarray(np.isfinite(true).all(axis=-1))
         result = measured.result
         best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
         frames[name] = FrameTruth(true, best)
@@ -285,39 +284,40 @@ def _frame_rows(
     true: FloatArray,
     inside: NDArray[np.bool_],
     cellular: Box,
-) -> list[TruthRow]:
+) -> list[TruthCheck]:
     """What of one photograph was found, against the truth and the best fit of the ansatz."""
     px = result.grid.pixel_size
     found = result.displacement()
     left, lost = (_rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
-        TruthRow(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
-        TruthRow(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
+        TruthCheck(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
+        TruthCheck(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
     ]
     if not result.ansatz.modes or not result.ansatz.modes[0].family.size:
         return rows
     if identifiability(result, inside).unobservable:
         words = f"{name}: wave vectors and v1"
-        return [*rows, TruthRow(words, "not observable", "asked of one that is", True)]
-    x, y = _over(cellular)
+        return [*rows, TruthCheck(words, "not observable", "asked of one that is", True)]
+    x = np.linspace(cellular.x_min, cellular.x_max, 200, dtype=np.float64)
+    y = np.linspace(cellular.y_min, cellular.y_max, 200, dtype=np.float64)
     v, at_best = (r.ansatz.v(0, r.unknowns, x, y) for r in (result, best))
     apart = float(np.abs(v - at_best).max() / np.abs(at_best).max())
     waves = result.ansatz.modes[0].family.waves(result.mode_parameters())[:, 2:4]
     off = float(np.abs(np.abs(waves) - 1.0).max())
     return [
         *rows,
-        TruthRow(
+        TruthCheck(
             f"{name}: wave vectors, largest deviation from (±½, ±½)",
             100 * off, f"≤ {100 * _WAVES:g}", off <= _WAVES, "%",
         ),
-        TruthRow(
+        TruthCheck(
             f"{name}: v1 − v1 of the best fit, largest over the cellular part, of its maximum",
             100 * apart, f"≤ {100 * _AMPLITUDE:g}", apart <= _AMPLITUDE, "%",
         ),
     ]  # fmt: skip
 
 
-def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthRow:
+def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthCheck:
     """Rms difference of two distortions per component, without what is affine in it."""
     row, col = np.linspace(0, grid.rows - 1, 60), np.linspace(0, grid.cols - 1, 75)
     R, C = (axis.ravel() for axis in np.meshgrid(row, col, indexing="ij"))
@@ -326,14 +326,7 @@ def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthRow:
     affine = design @ np.linalg.lstsq(design, apart.T, rcond=None)[0]
     rms = _rms(apart.T - affine)
     words = "distortion of the lens: found − true without the affine part, rms per component"
-    return TruthRow(words, rms, f"≤ {_LENS_PX:g}", rms <= _LENS_PX, "px")
-
-
-def _over(box: Box) -> tuple[FloatArray, FloatArray]:
-    return (
-        np.linspace(box.x_min, box.x_max, 200, dtype=np.float64),
-        np.linspace(box.y_min, box.y_max, 200, dtype=np.float64),
-    )
+    return TruthCheck(words, rms, f"≤ {_LENS_PX:g}", rms <= _LENS_PX, "px")
 
 
 def _rms(values: NDArray[Any]) -> float:

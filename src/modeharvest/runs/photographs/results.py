@@ -130,7 +130,7 @@ class HarvestedFrame:
 
 
 @dataclass(frozen=True)
-class TruthRow:
+class TruthCheck:
     """One line of the table that sets what was found against the truth.
 
     Parameters
@@ -184,7 +184,7 @@ class HarvestTruth:
 
     frames: Mapping[str, FrameTruth]
     distortion: Distortion | None = None
-    rows: tuple[TruthRow, ...] = ()
+    rows: tuple[TruthCheck, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
