@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from known_fields import sampled_field
 from manufactured import image_pair, reference_points, speckle
 from numpy.typing import NDArray
-from sampled import sampled_field
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import FourierMode, square_family

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from known_fields import square_mode
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family, overlap
-from modeharvest.idic.spectra.pattern import square_mode
 from modeharvest.util.errors import InputError
 
 SETTINGS = settings(deadline=None, derandomize=True, max_examples=10)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sampled import sampled_field
+from known_fields import sampled_field, square_mode
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
@@ -23,7 +23,7 @@ from modeharvest.idic.photograph.initial_modes import hole_centres
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
-from modeharvest.idic.spectra.pattern import REFERENCE_MODE, square_mode
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.pair import ImagePair

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import synthetic_benchmark as made
 import tifffile
+from known_fields import square_mode
 from perforated import PITCH, SQUARE, holed_cell
 from PIL import Image
 from scipy.io import savemat
@@ -46,7 +47,6 @@ from modeharvest.idic.spectra.mode_family import (
     read_spectrum,
     write_family,
 )
-from modeharvest.idic.spectra.pattern import square_mode
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from known_fields import square_mode
 
 from modeharvest.idic.spectra.pattern import (
     REFERENCE_MODE,
     mode_deviation,
     mode_equivalent,
-    square_mode,
 )
 
 PITCH = manufactured.UNIT_CELL

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from known_fields import square_mode
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.idic.ansatz import Ansatz
@@ -24,7 +25,6 @@ from modeharvest.idic.spectra.mode_family import (
     read_spectrum,
     write_family,
 )
-from modeharvest.idic.spectra.pattern import square_mode
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.errors import InputError
 

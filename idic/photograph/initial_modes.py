@@ -13,7 +13,7 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.modes import ModeFamily, free_family, square_family
 from modeharvest.idic.photograph.holes import find_holes
 from modeharvest.idic.slow_fields import Box
-from modeharvest.idic.spectra.pattern import WavePattern, mode_equivalent
+from modeharvest.idic.spectra.pattern import WavePattern, nearest_origin
 from modeharvest.idic.spectra.waves import PlaneWave
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
@@ -202,13 +202,7 @@ def modes_of(pattern: WavePattern, cells: Cells) -> list[InitialMode]:
     """
     cell_size = cells.cell_size
     if pattern.start is not None:
-        family = square_family()
-        off = []
-        for origin in ("junction", "hole"):
-            like = square_family(origin)
-            start, sign = mode_equivalent(pattern.start, cell_size, like.start)
-            off.append((float(np.abs(start[5:]).sum()), sign, replace(like, start=start)))
-        _, sign, family = min(off, key=lambda o: round(o[0], 6))
+        family, sign = nearest_origin(pattern.start, cell_size)
         return [InitialMode(replace(family, name="square"), sign * pattern.start_amplitude)]
     groups: list[list[PlaneWave]] = []
     for wave in pattern.waves:
@@ -232,7 +226,7 @@ def _coupled(one: PlaneWave, other: PlaneWave, cells: Cells) -> bool:
 
 
 def _free_mode(waves: list[PlaneWave]) -> InitialMode:
-    rows = np.array([[*w.amplitude, *w.k, w.phase] for w in waves])
+    rows = np.array([w.row for w in waves])
     amplitude = float(np.abs(rows[:, :2]).max())
     rows[:, :2] /= amplitude
     count = "1 wave" if len(waves) == 1 else f"{len(waves)} waves"

@@ -22,7 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeharvest.idic.modes import PER_WAVE, ModeFamily
-from modeharvest.idic.spectra.waves import Selection
+from modeharvest.idic.spectra.pattern import SAME_PHASE
+from modeharvest.idic.spectra.waves import Selection, common_phase
 from modeharvest.util.arrays import FloatArray
 
 SAME_AMPLITUDE = 0.02
@@ -31,8 +32,6 @@ smallest that a correlation would notice; a mesh without symmetry makes less (a 
 IN_PHASE = 0.02
 """Share of a wave that may be out of phase between x and y. A real mode at a wave vector on the
 zone's boundary is in phase to rounding where the cell has an inversion centre."""
-SAME_PHASE = 0.01
-"""Difference of phases [l] that are called equal: a hundredth of a cell."""
 POLARISED = 0.1
 """Sine of the angle up to which a wave is called transverse or longitudinal."""
 
@@ -120,10 +119,9 @@ def real_waves(selection: Selection) -> list[RealWave]:
     waves: list[RealWave] = []
     for xi, cartesian, star in zip(selection.xi, selection.amplitudes, selection.star, strict=True):
         z = local_frame(xi) @ cartesian
-        angle = 0.5 * float(np.angle(np.sum(z**2)))
-        turned = z * np.exp(-1j * angle)
-        if np.linalg.norm(turned.imag) <= IN_PHASE * np.linalg.norm(turned):
-            waves.append(_real_wave(xi, turned.real, angle, star))
+        angle, amplitude, out_of_phase = common_phase(z)
+        if out_of_phase <= IN_PHASE:
+            waves.append(_real_wave(xi, amplitude, angle, star))
             continue
         for component in (0, 1):
             alone = np.where(np.arange(2) == component, np.abs(z), 0.0)

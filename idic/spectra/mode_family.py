@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.modes import ModeFamily, free_family, square_family
+from modeharvest.idic.modes import ModeFamily, free_family
 from modeharvest.idic.spectra.constraints import (
     SAME_AMPLITUDE,
-    SAME_PHASE,
     RealWave,
     Tie,
     as_rows,
@@ -43,7 +42,7 @@ from modeharvest.idic.spectra.lattice_spectrum import (
     lattice_spectrum,
     points_for,
 )
-from modeharvest.idic.spectra.pattern import mode_equivalent
+from modeharvest.idic.spectra.pattern import nearest_origin, square_parameters
 from modeharvest.idic.spectra.waves import GROWTH, select_waves
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -224,8 +223,8 @@ def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
     """The paper's Eq. (mode) with these two waves as its start, if it has them; else None.
 
     Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component
-    and opposite in the other. Turned and shifted (:mod:`modeharvest.idic.spectra.pattern`) to
-    whichever of the paper's starts is nearer: the origin at a junction, or at a hole's centre.
+    and opposite in the other. The origin is at a junction or at a hole's centre, whichever is
+    nearer.
 
     Parameters
     ----------
@@ -236,31 +235,13 @@ def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
     """
     if len(waves) != 2:
         return None
-    amplitudes, k, phases = waves[:, :2], waves[:, 2:4], waves[:, 4].copy()
+    amplitudes, k = waves[:, :2], waves[:, 2:4]
     same = SAME_AMPLITUDE * np.linalg.norm(amplitudes, axis=1).max()
     diagonal = np.all(np.abs(np.abs(k) - 1.0) <= NEAR_DIAGONAL) and k.prod() < 0
     equal = np.all(np.abs(np.diff(np.abs(amplitudes), axis=0)) <= same)
     if not (diagonal and equal and amplitudes.prod() < 0):
         return None
-    # Eq. (mode) has B = 1 and −1; a wave with the other sign is moved by half its length.
-    turned = np.sign(amplitudes[:, 1]) != (1, -1)
-    phases[turned] += pitch
-    signs = np.where(turned, -1.0, 1.0)
-    ratio = -(signs @ amplitudes[:, 0]) / np.abs(amplitudes[:, 1]).sum()
-    return _nearer(np.array([ratio, *k[0], *k[1], *phases]), pitch)
-
-
-def _nearer(mode: FloatArray, pitch: float) -> ModeFamily:
-    """Eq. (mode) with the start that needs the smaller phases."""
-    found = []
-    for origin in ("junction", "hole"):
-        family = square_family(origin)
-        start, _ = mode_equivalent(mode, pitch, family.start)
-        off = float(np.abs(start[5:]).max()) / pitch
-        found.append((round(off, 9), origin, family, start))
-    off, origin, family, start = min(found, key=lambda f: f[0])
-    name = family.name if off <= SAME_PHASE else "square"
-    return ModeFamily(name, family.matrix, family.offset, start, family.names, family.units)
+    return nearest_origin(square_parameters(waves, pitch)[0], pitch)[0]
 
 
 FORMAT = "modeharvest-family-1"

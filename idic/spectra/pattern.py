@@ -18,12 +18,13 @@ Shifting *one* phase by l gives another field: the pattern moved by one cell.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from modeharvest.idic.modes import ModeFamily, square_family
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.idic.spectra.waves import Peak, PlaneWave, explained_share, find_peaks, fit_waves
 from modeharvest.util.arrays import FloatArray
@@ -31,29 +32,6 @@ from modeharvest.util.errors import InputError
 
 REFERENCE_MODE: tuple[float, ...] = (1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0)
 """The ideal square pattern with the origin at a solid junction between four holes."""
-
-
-def square_mode(mode: ArrayLike, pitch: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
-    """Eq. (mode) itself: unscaled and without the taper at the specimen's edge.
-
-    Parameters
-    ----------
-    mode
-        (7,) a₁ … a₅ [-], a₆ and a₇ [mm].
-    pitch
-        Unit cell size l [mm].
-    x, y
-        (...) positions [mm].
-
-    Returns
-    -------
-    (..., 2) components along x and y [-]; the largest possible norm for a₁ = 1 is 2.
-    """
-    a = _checked(mode)
-    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    first = np.sin(np.pi / pitch * (a[1] * x + a[2] * y + a[5]))
-    second = np.sin(np.pi / pitch * (a[3] * x + a[4] * y + a[6]))
-    return np.stack([-a[0] * (first + second), first - second], axis=-1)
 
 
 def mode_equivalent(
@@ -100,6 +78,37 @@ def mode_deviation(
     return 100 * difference
 
 
+def nearest_origin(mode: ArrayLike, pitch: float) -> tuple[ModeFamily, int]:
+    """Eq. (mode) with the start that is a given mode, its origin where the phases are smaller.
+
+    Returns
+    -------
+    The family, and the sign that v₁ takes.
+    """
+    found = []
+    for origin in ("junction", "hole"):
+        family = square_family(origin)
+        start, sign = mode_equivalent(mode, pitch, family.start)
+        off = float(np.abs(start[5:]).max()) / pitch
+        name = family.name if off <= SAME_PHASE else "square"
+        found.append((round(off, 9), replace(family, name=name, start=start), sign))
+    return min(found, key=lambda f: f[0])[1:]
+
+
+def square_parameters(waves: FloatArray, pitch: float) -> tuple[FloatArray, float]:
+    """Eq. (mode)'s seven parameters and v₁ that two waves (2, 5) are nearest to.
+
+    It has the signs (−a₁, 1) and (−a₁, −1); waves with others are moved by half their length.
+    """
+    waves = waves.copy()
+    turned = np.sign(waves[:, 1]) != (1, -1)
+    waves[turned, :2] *= -1.0
+    waves[turned, 4] += pitch
+    v1 = 0.5 * (waves[0, 1] - waves[1, 1])
+    ratio = -0.5 * (waves[0, 0] + waves[1, 0]) / v1
+    return np.array([ratio, *waves[:, 2:4].ravel(), *waves[:, 4]]), float(v1)
+
+
 def _equivalents(a: FloatArray, pitch: float) -> Iterator[tuple[FloatArray, int]]:
     """Go through the 16 equivalents, phases not wrapped."""
     for swap, both, turn1, turn2 in product((False, True), repeat=4):
@@ -123,6 +132,8 @@ def _checked(mode: ArrayLike) -> FloatArray:
     return a
 
 
+SAME_PHASE = 0.01
+"""Difference of phases [l] that are called equal: a hundredth of a cell."""
 SECONDARY_PEAK = 0.05
 """A peak may belong to the pattern if it has this share of the largest one's density. A wave half
 as strong has a quarter; the holes take more away from a wave that changes sign from cell to cell,
@@ -154,7 +165,7 @@ SQUARE = "square, 7 parameters"
 
 @dataclass(frozen=True)
 class WavePattern:
-    """The reading of a spectrum.
+    """The pattern found in a spectrum.
 
     Parameters
     ----------
@@ -188,16 +199,6 @@ class WavePattern:
         """Whether the parametrisation of Eq. (mode) is supported."""
         return self.family == SQUARE
 
-    @property
-    def amplitude_ratio(self) -> tuple[float, float]:
-        """Second over first wave's amplitude in x and in y, absolute [-]; NaN if not two."""
-        return _amplitude_ratio(self.waves)
-
-    @property
-    def relative_sign(self) -> tuple[int, int]:
-        """Sign of the second wave relative to the first in x and in y; 0 if not two waves."""
-        return _relative_sign(self.waves)
-
 
 def read_pattern(spectrum: Spectrum) -> WavePattern:
     """Find the waves of a long-range correlated pattern and check whether Eq. (mode) fits them."""
@@ -224,7 +225,7 @@ def read_pattern(spectrum: Spectrum) -> WavePattern:
 
 
 def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
-    """Take the largest peak, then whichever describes most of what is left (matching pursuit)."""
+    """Take the largest peak, then whichever describes most of the rest (matching pursuit)."""
     chosen, left, share = [peaks[0]], peaks[1:], explained_share(spectrum, peaks[:1])
     while left and len(chosen) < MOST_WAVES:
         shares = [explained_share(spectrum, [*chosen, peak]) for peak in left]
@@ -253,11 +254,12 @@ def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> Wav
     if not all(passed for passed, _ in checks):
         said.append("Eq. (mode) is not supported by these observations.")
         return WavePattern(waves, largest, "unknown", None, 0.0, tuple(said))
-    start, amplitude = _square_start(waves, pitch)
+    mode, v1 = square_parameters(np.array([w.row for w in waves]), pitch)
+    start, sign = mode_equivalent(mode, pitch)
     numbers = ", ".join(f"{value:.2f}" for value in np.round(start, 2) + 0.0)
     said.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
     return WavePattern(
-        waves, largest, SQUARE, tuple(float(v) for v in start), amplitude, tuple(said)
+        waves, largest, SQUARE, tuple(float(v) for v in start), sign * v1, tuple(said)
     )
 
 
@@ -271,8 +273,10 @@ def _directions(waves: tuple[PlaneWave, ...]) -> tuple[bool, str]:
 
 
 def _equality(waves: tuple[PlaneWave, ...]) -> tuple[bool, str]:
-    ratio = _amplitude_ratio(waves)
-    passed = all(1 / SAME_AMPLITUDE <= r <= SAME_AMPLITUDE for r in ratio)  # false for NaN, too
+    first, second = (np.abs(w.amplitude) for w in waves)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = second / first
+    passed = bool(np.all((ratio >= 1 / SAME_AMPLITUDE) & (ratio <= SAME_AMPLITUDE)))  # NaN neither
     return passed, (
         f"Amplitude of the second over the first: {ratio[0]:.2f} in x and {ratio[1]:.2f} in y, "
         f"{'equal' if passed else 'not equal'} within a factor of {SAME_AMPLITUDE}."
@@ -282,7 +286,7 @@ def _equality(waves: tuple[PlaneWave, ...]) -> tuple[bool, str]:
 def _signs(waves: tuple[PlaneWave, ...], pitch: float) -> tuple[bool, str]:
     # Moving one wave by half its length turns both signs, so their product is what counts.
     names = {1: "the same sign", -1: "opposite signs", 0: "no sign"}
-    sx, sy = _relative_sign(waves)
+    sx, sy = (int(sign) for sign in np.sign(np.prod([w.amplitude for w in waves], axis=0)))
     return sx * sy == -1, (
         f"They have {names[sx]} in x and {names[sy]} in y, with phases of "
         f"{round(waves[0].phase / pitch, 2) + 0.0:.2f} l and "
@@ -296,33 +300,3 @@ def _standing(waves: tuple[PlaneWave, ...]) -> tuple[bool, str]:
         f"The x and y components of each wave are {'' if worst <= IN_PHASE else 'not '}in phase "
         f"({100 * worst:.0f} % out of it at most)."
     )
-
-
-def _amplitude_ratio(waves: tuple[PlaneWave, ...]) -> tuple[float, float]:
-    if len(waves) != 2:
-        return float("nan"), float("nan")
-    first, second = (np.abs(w.amplitude) for w in waves)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = second / first
-    return float(ratio[0]), float(ratio[1])
-
-
-def _relative_sign(waves: tuple[PlaneWave, ...]) -> tuple[int, int]:
-    if len(waves) != 2:
-        return 0, 0
-    signs = np.sign(np.prod([w.amplitude for w in waves], axis=0))
-    return int(signs[0]), int(signs[1])
-
-
-def _square_start(waves: tuple[PlaneWave, ...], pitch: float) -> tuple[FloatArray, float]:
-    """Parameters of Eq. (mode): the signs (−a₁, 1) and (−a₁, −1), reached by phases of l."""
-    amplitude = np.array([w.amplitude for w in waves])
-    phase = np.array([w.phase for w in waves])
-    turn = np.sign(amplitude[:, 1]) != (1, -1)
-    amplitude[turn] *= -1
-    phase[turn] += pitch
-    v1 = 0.5 * (amplitude[0, 1] - amplitude[1, 1])
-    ratio = -0.5 * (amplitude[0, 0] + amplitude[1, 0]) / v1
-    mode = np.array([ratio, *waves[0].k, *waves[1].k, *phase])
-    start, sign = mode_equivalent(mode, pitch)
-    return start, float(sign * v1)

@@ -36,7 +36,7 @@ from scipy.optimize import minimize
 
 from modeharvest.idic.spectra.lattice_spectrum import LatticePeak, LatticeSpectrum, MeshQuadrature
 from modeharvest.idic.spectra.spectrum import Spectrum
-from modeharvest.util.arrays import ComplexArray, FloatArray
+from modeharvest.util.arrays import BoolArray, ComplexArray, FloatArray
 from modeharvest.util.errors import InputError
 
 EDGE_LINE_WIDTHS = 2.0
@@ -98,6 +98,11 @@ class PlaneWave:
         """Length of the amplitude vector [mm]."""
         return float(np.hypot(*self.amplitude))
 
+    @property
+    def row(self) -> FloatArray:
+        """(5,) A, B [mm], kx, ky [-] and c [mm]."""
+        return np.array([*self.amplitude, *self.k, self.phase])
+
 
 def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
     """All maxima of S_xx + S_yy outside the edges' lines, largest first."""
@@ -124,7 +129,7 @@ def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
 
 
 def _on_lines(
-    S: FloatArray, maxima: NDArray[np.bool_], xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
+    S: FloatArray, maxima: BoolArray, xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
 ) -> NDArray[np.intp]:
     """(n, 2) indices of maxima on one of the edges' lines, not where two cross, that stand out."""
     lobes = [spectrum.pitch / size for size in spectrum.extent]
@@ -170,15 +175,25 @@ def explained_share(spectrum: Spectrum, waves: Sequence[PlaneWave | Peak]) -> fl
     return _amplitudes(spectrum, _taper(spectrum), np.array([w.xi for w in waves]))[1]
 
 
-def _wave(xi: FloatArray, z: NDArray[np.complex128], pitch: float) -> PlaneWave:
-    """Split off the common phase of both components, and note what it leaves."""
+def common_phase(z: ComplexArray) -> tuple[float, FloatArray, float]:
+    """Split the phase off that both of two complex amplitudes have.
+
+    Returns
+    -------
+    The angle [rad], the (2,) real amplitudes, and the share of z that is out of phase.
+    """
     angle = 0.5 * float(np.angle(np.sum(z**2)))
     turned = z * np.exp(-1j * angle)
+    return angle, turned.real, float(np.linalg.norm(turned.imag) / np.linalg.norm(turned))
+
+
+def _wave(xi: FloatArray, z: ComplexArray, pitch: float) -> PlaneWave:
+    angle, amplitude, out_of_phase = common_phase(z)
     return PlaneWave(
         k=(2 * float(xi[0]), 2 * float(xi[1])),
-        amplitude=(float(turned[0].real), float(turned[1].real)),
+        amplitude=(float(amplitude[0]), float(amplitude[1])),
         phase=angle / np.pi * pitch,
-        out_of_phase=float(np.linalg.norm(turned.imag) / np.linalg.norm(turned)),
+        out_of_phase=out_of_phase,
     )
 
 
@@ -193,7 +208,7 @@ def _taper(spectrum: Spectrum) -> FloatArray:
 
 def _amplitudes(
     spectrum: Spectrum, taper: FloatArray, xi: FloatArray
-) -> tuple[NDArray[np.complex128], float]:
+) -> tuple[ComplexArray, float]:
     """Weighted least squares for given wave vectors.
 
     Returns
@@ -223,13 +238,13 @@ def _amplitudes(
     return solution[: len(xi)] + 1j * solution[len(xi) :], explained
 
 
-def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> NDArray[np.complex128]:
+def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> ComplexArray:
     """(n,) sum over the bins of values (q, p, n) times exp(2πi ξ·x/l)."""
     angle_x, angle_y = 2 * np.pi / spectrum.pitch * xi
     along_x, along_y = np.exp(1j * angle_x * spectrum.x), np.exp(1j * angle_y * spectrum.y)
     # numpy would turn all values into complex ones.
     up = np.stack([along_y.real, along_y.imag]) @ values.reshape(len(values), -1)
-    found: NDArray[np.complex128] = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
+    found: ComplexArray = along_x @ (up[0] + 1j * up[1]).reshape(values.shape[1:])
     return found
 
 

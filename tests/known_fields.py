@@ -1,4 +1,4 @@
-"""A field known at pixels, taken at some of them as a local DIC would measure it."""
+"""Displacement fields that are known: Eq. (mode) of the paper, fields taken at some pixels."""
 
 from __future__ import annotations
 
@@ -16,3 +16,11 @@ def sampled_field(
     row, col = (i[mask[row, col]] for i in (row, col))
     x, y = grid.to_mm(row, col)
     return LocalField(x, y, u[row, col], source=source)
+
+
+def square_mode(mode: object, pitch: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(..., 2) Eq. (mode), unscaled and without taper, of a₁ … a₅ [-], a₆ and a₇ [mm]."""
+    a = np.asarray(mode, dtype=np.float64)
+    first = np.sin(np.pi / pitch * (a[1] * x + a[2] * y + a[5]))
+    second = np.sin(np.pi / pitch * (a[3] * x + a[4] * y + a[6]))
+    return np.stack([-a[0] * (first + second), first - second], axis=-1)
