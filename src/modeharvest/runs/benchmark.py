@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.tables import ALL_ROLES
-from modeharvest.report.grades import write_grading, write_star_grading
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.util.errors import InputError
@@ -85,28 +84,18 @@ def grade_star(
         raise InputError(
             f"expected a --still for each of {len(fields)} fields, or none, got {len(stills)}"
         )
+    from modeharvest.report.grades import write_star_grading
+
     star_set = StarSet.read(folder)
     require_writable(out)
     still_of = dict(zip(fields, stills.items(), strict=bool(stills)))
-    grades: list[StarGrade] = []
-    refused: dict[str, str] = {}
-    for n, (path, declared) in enumerate(fields.items()):
-        progress(n, len(fields) + 1, f"resolution: {path.name}")
-        try:
-            moved = _read_star_field(path, declared, star_set)
-            still = _read_star_field(*still_of[path], star_set) if stills else None
-            grade = StarGrade(star_set.spec.star, moved, still)
-        except InputError as error:
-            refused[str(path)] = str(error)
-            continue
-        if any(grade.name == other.name for other in grades):
-            raise InputError(
-                f"expected fields of different names, got {grade.name} twice; give --name"
-            )
-        grades.append(grade)
-    if not grades:
-        raise InputError("; ".join(refused.values()))
-    progress(len(fields), len(fields) + 1, "resolution: report")
+
+    def grade(path: Path, declared: Declared) -> StarGrade:
+        moved = _read_star_field(path, declared, star_set)
+        still = _read_star_field(*still_of[path], star_set) if stills else None
+        return StarGrade(star_set.spec.star, moved, still)
+
+    grades, refused = _graded(fields, grade, progress, "resolution")
     grading = StarGrading(star_set, tuple(ranked_grades(grades)), refused)
     write_star_grading(out, grading)
     progress(1, 1, "resolution")
@@ -217,33 +206,25 @@ def score(
     InputError
         If no field can be graded, or two have one name.
     """
+    from modeharvest.report.grades import write_grading
+
     every = fields if isinstance(fields, Mapping) else {Path(f): Declared() for f in fields}
-    _require_names(every)
     known = BenchmarkTruth.read(truth)
     require_writable(out)
     grid = known.grid
     labels = regions(known.mask, grid, known.specimen, edge_px)
     true = partial(known.displacement, strain)
     reach_px = REACH_CELLS * known.specimen.pitch / grid.pixel_size
-    scores: list[Score] = []
-    remarks: list[str] = []
-    refused: dict[str, str] = {}
-    for n, (path, declared) in enumerate(every.items()):
-        progress(n, len(every) + 1, f"score: {path.name}")
-        try:
-            field = read_measured(path, grid, known.id, declared)
-            graded = score_field(field, true(field.x, field.y), labels, grid, reach_px)
-            _, notes = check_conventions(field, true, grid)
-        except InputError as error:
-            refused[str(path)] = str(error)
-            continue
-        scores.append(graded)
-        remarks += notes
-    if not scores:
-        raise InputError("; ".join(refused.values()))
-    best_first = ranked(scores)
-    progress(len(every), len(every) + 1, "score: report")
-    spectra = {graded.source: error_spectrum(graded, grid) for graded in best_first}
+
+    def grade(path: Path, declared: Declared) -> tuple[Score, tuple[str, ...]]:
+        field = read_measured(path, grid, known.id, declared)
+        graded = score_field(field, true(field.x, field.y), labels, grid, reach_px)
+        return graded, check_conventions(field, true, grid)[1]
+
+    graded, refused = _graded(every, grade, progress, "score")
+    best_first = ranked([one for one, _ in graded])
+    remarks = [note for _, notes in graded for note in notes]
+    spectra = {one.source: error_spectrum(one, grid) for one in best_first}
     done = Grading(
         known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks), refused
     )
@@ -252,8 +233,19 @@ def score(
     return done
 
 
-def _require_names(fields: Mapping[Path, Declared]) -> None:
-    """Raise InputError if there is no field, or two of one name."""
+def _graded(
+    fields: Mapping[Path, Declared],
+    grade: Callable[[Path, Declared], T],
+    progress: Progress,
+    what: str,
+) -> tuple[list[T], dict[str, str]]:
+    """The grades of the fields that have one, and why others have none.
+
+    Raises
+    ------
+    InputError
+        If there is no field, two have one name, or none can be graded.
+    """
     if not fields:
         raise InputError("expected fields to score, got none")
     names = [declared.name or path.stem for path, declared in fields.items()]
@@ -262,6 +254,18 @@ def _require_names(fields: Mapping[Path, Declared]) -> None:
         raise InputError(
             f"expected fields of different names, got {', '.join(twice)} twice; give each a --name"
         )
+    grades: list[T] = []
+    refused: dict[str, str] = {}
+    for n, (path, declared) in enumerate(fields.items()):
+        progress(n, len(fields) + 1, f"{what}: {path.name}")
+        try:
+            grades.append(grade(path, declared))
+        except InputError as error:
+            refused[str(path)] = str(error)
+    if not grades:
+        raise InputError("; ".join(refused.values()))
+    progress(len(fields), len(fields) + 1, f"{what}: report")
+    return grades, refused
 
 
 def declarations(

@@ -43,12 +43,22 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
-from modeharvest.util.typed import to_plain
+from modeharvest.util.typed import made, to_plain
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
 _CODE = ("fem", "imaging", "idic", "runs")
 """Folders of the package that they depend on; how they are shown is in others."""
+
+
+@dataclass(frozen=True)
+class _StartRecord:
+    """``NAME_start.json``: why a photograph could not be measured, or how its measurement began."""
+
+    failed: str
+    fixed: bool = False
+    blur_px: float = 0.0
+    text: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -116,17 +126,17 @@ class HarvestRun(StagedRun[PhotographCase]):
         key = digest([self._prepared_key(), self._how()])
         for name in prepared.names:
             key = digest([key, name, self._local_digest(name)])
-            self._measure_one(prepared, name, found, key)
-            if not self._record(name)["failed"]:
-                found[name] = self._read(name)
+            measured = self._measured(prepared, name, found, key)
+            if measured is not None:
+                found[name] = measured
         if not found:
-            name = prepared.names[0]
-            raise InputError(f"{name}: {self._record(name)['failed']}")
+            name, reason = self.failures()[0]
+            raise InputError(f"{name}: {reason}")
         return found
 
     def failures(self) -> tuple[tuple[str, str], ...]:
         """Names of the photographs that were read but could not be measured, and why."""
-        reasons = {name: self._record(name)["failed"] for name in self.prepared().names}
+        reasons = {name: self._record(name).failed for name in self.prepared().names}
         return tuple((name, reason) for name, reason in reasons.items() if reason)
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
@@ -167,14 +177,14 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     # -- parts --------------------------------------------------------------------------
 
-    def _measure_one(
+    def _measured(
         self,
         prepared: PreparedPhotographs,
         name: str,
         found: dict[str, MeasuredPhotograph],
         key: str,
-    ) -> None:
-        """Measure a photograph, from the last of those before it that were measured."""
+    ) -> MeasuredPhotograph | None:
+        """A photograph, measured from the last of those before it that were; None if it can't."""
         result, field, start = self._paths(name)
         before = next(reversed(found), None)
 
@@ -190,15 +200,22 @@ class HarvestRun(StagedRun[PhotographCase]):
                     self.progress,
                 )
             except InputError as error:
-                write_json(start, {"failed": str(error)})
+                write_json(start, to_plain(_StartRecord(str(error))))
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            record = {"fixed": measured.fixed, "blur_px": measured.blur_px}
-            write_json(start, {"failed": "", **record, "text": measured.sentences})
+            record = _StartRecord("", measured.fixed, measured.blur_px, measured.sentences)
+            write_json(start, to_plain(record))
             return result, field, start
 
-        self.stages.do(f"correlate {name}", key, work)
+        def read() -> MeasuredPhotograph | None:
+            record = self._record(name)
+            if record.failed:
+                return None
+            outcome = Result.read(result), read_field(field)
+            return MeasuredPhotograph(*outcome, record.fixed, record.blur_px, record.text)
+
+        return self.do(f"correlate {name}", key, work, read)
 
     def _local(self, prepared: PreparedPhotographs, name: str) -> LocalField | None:
         return local_field(self.case, prepared, name, self.optics.distortion)
@@ -218,19 +235,8 @@ class HarvestRun(StagedRun[PhotographCase]):
             mask = mask & inside
         return ImagePair(reference, prepared.image(name), prepared.grid, mask, prepared.mask(name))
 
-    def _read(self, name: str) -> MeasuredPhotograph:
-        result, field, _ = self._paths(name)
-        record = self._record(name)
-        return MeasuredPhotograph(
-            Result.read(result),
-            read_field(field),
-            bool(record["fixed"]),
-            float(record["blur_px"]),
-            tuple(record["text"]),
-        )
-
-    def _record(self, name: str) -> dict[str, Any]:
-        return dict(read_json(self._paths(name)[2]))
+    def _record(self, name: str) -> _StartRecord:
+        return made(_StartRecord, read_json(self._paths(name)[2]))
 
     def _paths(self, name: str) -> tuple[Path, Path, Path]:
         folder = self.folder / "results"
