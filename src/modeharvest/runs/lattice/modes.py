@@ -2,13 +2,13 @@
 
 ``critical.json`` holds ``point``, the fields of
 :class:`modeharvest.runs.lattice.results.CriticalPoint`, and ``history``: for each load looked at
-the least stable wave (see ``fem.zone.LeastStable``).
+the least stable wave (see ``fem.bloch.zone.LeastStable``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,13 +17,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.modes import Branch, ModeSet
-from modeharvest.fem.materials import Material
-from modeharvest.idic.spectra.mode_family import (
-    read_family,
-    read_spectrum,
-    write_family,
-)
-from modeharvest.runs.lattice.case import LatticeCase, ModesPlan, Search
+from modeharvest.idic.spectra.mode_family import read_family, read_spectrum, write_family
+from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
     CriticalPoint,
@@ -41,20 +36,8 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
     from modeharvest.fem.lattice.cells import UnitCell
 
-
-def find_critical(path: CellPath, search: Search, progress: Progress = silent) -> LatticeCritical:
-    """Look for the first critical point over all wave vectors.
-
-    Raises
-    ------
-    InputError
-        If the lattice is a mechanism.
-    """
-    from modeharvest.fem.bloch.critical import first_critical
-    from modeharvest.fem.lattice.options import CriticalSearch
-
-    how = CriticalSearch(**asdict(search))
-    return first_critical(path, how, named(progress, "first critical load"))
+BEYOND = (1.02, 1.1, 1.25, 1.5)
+"""Loads at which states of branches are kept, relative to the critical one."""
 
 
 def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
@@ -77,84 +60,142 @@ def _in_order(point: CriticalPoint) -> CriticalPoint:
     return replace(point, waves=waves, below=below, above=above)
 
 
-BEYOND = (1.02, 1.1, 1.25, 1.5)
-"""Loads at which states of branches are kept, relative to the critical one."""
+@dataclass(frozen=True)
+class LatticeModel:
+    """The finite elements of a case: cell and path are made when they are asked for.
 
-
-def why_no_modes(critical: CriticalPoint, plan: ModesPlan) -> str:
-    """Why there is no wave whose modes could be computed; empty if there is one."""
-    if plan.waves or critical.waves:
-        return ""
-    what = "long waves are modes of no finite cell" if critical.found else "nothing is critical"
-    return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
-
-
-def find_modes(
-    path: CellPath,
-    material: Material,
-    critical: CriticalPoint,
-    plan: ModesPlan,
-    step: float,
-    info: Mapping[str, Any],
-    progress: Progress = silent,
-) -> tuple[ModeSet, tuple[Branch, ...]]:
-    """The modes of a plan as real fields, and the branches that start with critical ones.
-
-    Parameters
-    ----------
-    path
-        The primary path of the primitive cell.
-    material
-        What that is made of.
-    critical
-        Its first critical point.
-    plan
-        Which modes and branches.
-    step
-        Largest step of the load along primary paths [-].
-    info
-        Plain JSON values to keep with the modes.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If a wave doesn't repeat within a dozen cells, the load can't be reached, or combinations
-        don't have one coefficient for each mode.
+    Everything raises InputError if there is no such lattice or its cell isn't periodic, and
+    MissingDependencyError if dolfinx or gmsh is not there.
     """
-    from modeharvest.fem.bloch.real_modes import real_modes
 
-    state = _state(path, plan.load or critical.load)
-    progress(0, 1, "modes")
-    modes = real_modes(path.cell, state, plan.phases or critical.waves, info)
-    progress(1, 1, "modes")
-    if not critical.found or state.load != critical.load:
-        return modes, ()
-    return modes, tuple(_branches(path, material, modes, plan, step, progress))
+    case: LatticeCase
+    progress: Progress = silent
 
+    @cached_property
+    def unit(self) -> UnitCell:
+        """The primitive cell's mesh and lattice vectors."""
+        try:
+            return self.case.lattice.cell()
+        except ImportError as error:
+            raise dolfinx_missing("infinite lattices need") from error
 
-def _branches(
-    path: CellPath,
-    material: Material,
-    modes: ModeSet,
-    plan: ModesPlan,
-    step: float,
-    progress: Progress,
-) -> list[Branch]:
-    """A branch for each combination of modes, on their commensurate cell."""
-    from modeharvest.fem.bloch.postbuckling import follow
-    from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+    @cached_property
+    def cell(self) -> PeriodicCell:
+        """The primitive cell with its material."""
+        unit = self.unit
+        try:
+            from modeharvest.fem.lattice.cell import PeriodicCell
+        except ImportError as error:
+            raise dolfinx_missing("infinite lattices need") from error
+        return PeriodicCell(unit, self.case.material)
 
-    combinations = plan.combinations or default_combinations(len(modes.waves))
-    loads = plan.branch_loads or tuple(factor * modes.load for factor in BEYOND)
-    cell = PeriodicCell(path.cell.cell.enlarged(*modes.info["copies"]), material)
-    found = []
-    for k, combination in enumerate(combinations, start=1):
-        listener = named(progress, f"branch {k} of {len(combinations)}")
-        enlarged = follow_to(CellPath(cell, path.loading), 0.98 * modes.load, step)
-        found.append(follow(enlarged, modes, combination, loads, progress=listener))
-    return found
+    def path(self, load: float = 0.0, cell: PeriodicCell | None = None) -> CellPath:
+        """A new primary path, followed up to a load [-] in steps that jump over no state.
+
+        From the beginning, so that no stage depends on another's steps.
+        """
+        cell = cell or self.cell  # first: without dolfinx it says what is missing
+        from modeharvest.fem.lattice.cell import CellPath
+
+        path, step = CellPath(cell, self.case.loading.macro()), self.case.search.largest_step
+        for k in range(int(load / step) + 1):
+            if path.at(k * step) is None:
+                break
+        return path
+
+    def critical(self) -> LatticeCritical:
+        """The first critical point over all wave vectors; InputError if it is a mechanism."""
+        path = self.path()
+        from modeharvest.fem.bloch.critical import first_critical
+        from modeharvest.fem.lattice.options import CriticalSearch
+
+        search = CriticalSearch(**asdict(self.case.search))
+        return first_critical(path, search, named(self.progress, "first critical load"))
+
+    def why_no_modes(self, critical: CriticalPoint) -> str:
+        """Why there is no wave whose modes could be computed; empty if there is one."""
+        if self.case.modes.waves or critical.waves:
+            return ""
+        what = "long waves are modes of no finite cell" if critical.found else "nothing is critical"
+        return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
+
+    def modes(
+        self, critical: CriticalPoint, info: Mapping[str, Any]
+    ) -> tuple[ModeSet, tuple[Branch, ...]]:
+        """The modes of the plan as real fields, and the branches that start with critical ones.
+
+        ``info``: plain JSON values to keep with the modes.
+
+        Raises
+        ------
+        InputError
+            If a wave doesn't repeat within a dozen cells, the load can't be reached, or
+            combinations don't have one coefficient for each mode.
+        """
+        plan = self.case.modes
+        path = self.path(max(plan.load, critical.load))
+        from modeharvest.fem.bloch.real_modes import real_modes
+
+        state = _state(path, plan.load or critical.load)
+        self.progress(0, 1, "modes")
+        modes = real_modes(path.cell, state, plan.phases or critical.waves, info)
+        self.progress(1, 1, "modes")
+        if not critical.found or state.load != critical.load:
+            return modes, ()
+        return modes, tuple(self._branches(modes))
+
+    def _branches(self, modes: ModeSet) -> list[Branch]:
+        """A branch for each combination of modes, on their commensurate cell."""
+        from modeharvest.fem.bloch.postbuckling import follow
+        from modeharvest.fem.lattice.cell import PeriodicCell
+
+        plan = self.case.modes
+        combinations = plan.combinations or default_combinations(len(modes.waves))
+        loads = plan.branch_loads or tuple(factor * modes.load for factor in BEYOND)
+        cell = PeriodicCell(self.unit.enlarged(*modes.info["copies"]), self.case.material)
+        found = []
+        for k, combination in enumerate(combinations, start=1):
+            listener = named(self.progress, f"branch {k} of {len(combinations)}")
+            path = self.path(0.98 * modes.load, cell)
+            found.append(follow(path, modes, combination, loads, progress=listener))
+        return found
+
+    def fields(
+        self,
+        critical: CriticalPoint,
+        modes: ModeSet | None,
+        branches: Sequence[Branch],
+        info: Mapping[str, Any],
+    ) -> list[PeriodicField]:
+        """All fields in which families are looked for: modes, ends of branches, primary path."""
+        found = []
+        if modes is not None:
+            found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
+            ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
+            found += [PeriodicField.of_branch(modes, k, branch, info) for k, branch in ends]
+        return [*found, self._primary(self.case.modes.load or critical.load, modes, info)]
+
+    def _primary(
+        self, load: float, modes: ModeSet | None, info: Mapping[str, Any]
+    ) -> PeriodicField:
+        """The unbuckled lattice at a load, on the modes' cell where there is one."""
+        path = self.path(load)
+        state, unit = _state(path, load), path.cell.cell
+        mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
+        w = path.cell.displacement(state) - unit.mesh.nodes @ (state.gradient - np.eye(2)).T
+        known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
+        same = cKDTree(known, boxsize=1.0).query(wanted)[1]
+        u = w[same] + mesh.nodes @ (state.gradient - np.eye(2)).T
+        return PeriodicField(
+            file="family_primary.json",
+            name=f"primary path at {100 * load:.4g} %",
+            mesh=mesh,
+            lattice=lattice,
+            displacement=u,
+            gradient=state.gradient,
+            info={**info, "load": load},
+            stable=True,
+        )
 
 
 def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
@@ -163,54 +204,12 @@ def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
     return (*alone, (1.0,) * count) if count > 1 else tuple(alone)
 
 
-def periodic_fields(
-    path: CellPath,
-    load: float,
-    modes: ModeSet | None,
-    branches: Sequence[Branch],
-    info: Mapping[str, Any],
-) -> list[PeriodicField]:
-    """All fields in which families are looked for: modes, ends of branches, the primary path.
-
-    Parameters
-    ----------
-    path
-        The primary path of the primitive cell.
-    load
-        At which its fluctuation is taken [-].
-    modes, branches
-        What was found.
-    info
-        Plain JSON values to keep with each of them.
-    """
-    found = []
-    if modes is not None:
-        found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
-        ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
-        found += [PeriodicField.of_branch(modes, k, branch, info) for k, branch in ends]
-    return [*found, _of_primary(path, load, modes, info)]
-
-
-def _of_primary(
-    path: CellPath, load: float, modes: ModeSet | None, info: Mapping[str, Any]
-) -> PeriodicField:
-    """The unbuckled lattice, on the modes' cell where there is one."""
-    state, unit = _state(path, load), path.cell.cell
-    mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
-    w = path.cell.displacement(state) - unit.mesh.nodes @ (state.gradient - np.eye(2)).T
-    known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
-    same = cKDTree(known, boxsize=1.0).query(wanted)[1]
-    u = w[same] + mesh.nodes @ (state.gradient - np.eye(2)).T
-    return PeriodicField(
-        file="family_primary.json",
-        name=f"primary path at {100 * load:.4g} %",
-        mesh=mesh,
-        lattice=lattice,
-        displacement=u,
-        gradient=state.gradient,
-        info={**info, "load": load},
-        stable=True,
-    )
+def _state(path: CellPath, load: float) -> CellState:
+    """The state at a load; a millionth below where that is critical with the cell's own period."""
+    state = path.at(load) or path.at((1.0 - 1e-6) * load)
+    if state is None:
+        raise InputError(f"modes: expected a load that the lattice's path reaches, got {load:.6g}")
+    return state
 
 
 def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -250,69 +249,3 @@ def to_be_shown(
         drawn = [mode.scaled(DRAWN_AMPLITUDE * pitch) for mode in every[: len(modes.waves)]]
         found = [mode.analysed(pitch) for mode in drawn]
     return [*found, found_pattern(every[-1], folder)]
-
-
-def follow_to(path: CellPath, load: float, step: float) -> CellPath:
-    """The same path with its states up to a load, in steps so small that none is jumped over."""
-    for k in range(int(load / step) + 1):
-        if path.at(k * step) is None:
-            break
-    return path
-
-
-def _state(path: CellPath, load: float) -> CellState:
-    """The state at a load; a millionth below where that is critical with the cell's own period."""
-    state = path.at(load) or path.at((1.0 - 1e-6) * load)
-    if state is None:
-        raise InputError(f"modes: expected a load that the lattice's path reaches, got {load:.6g}")
-    return state
-
-
-class LatticeModel:
-    """Cell and path of a case, made when they are asked for.
-
-    Parameters
-    ----------
-    case
-        The case.
-    """
-
-    def __init__(self, case: LatticeCase) -> None:
-        self.case = case
-
-    @cached_property
-    def unit(self) -> UnitCell:
-        """The primitive cell's mesh and lattice vectors.
-
-        Raises
-        ------
-        InputError
-            If there is no such lattice, or its cell isn't periodic.
-        MissingDependencyError
-            If dolfinx or gmsh is not there.
-        """
-        try:
-            return self.case.lattice.cell()
-        except ImportError as error:
-            raise dolfinx_missing("infinite lattices need") from error
-
-    @cached_property
-    def cell(self) -> PeriodicCell:
-        """The primitive cell with its material; raises as ``unit``."""
-        unit = self.unit
-        try:
-            from modeharvest.fem.lattice.cell import PeriodicCell
-        except ImportError as error:
-            raise dolfinx_missing("infinite lattices need") from error
-        return PeriodicCell(unit, self.case.material)
-
-    def path(self, load: float = 0.0) -> CellPath:
-        """A new primary path, followed up to a load [-]; raises as ``unit``.
-
-        From the beginning, so that no stage depends on another's steps.
-        """
-        cell = self.cell  # first: without dolfinx it says what is missing
-        from modeharvest.fem.lattice.cell import CellPath
-
-        path = CellPath(cell, self.case.loading.macro())
-        return follow_to(path, load, self.case.search.largest_step)

@@ -33,14 +33,10 @@ from modeharvest.fem.bloch.modes import (
 from modeharvest.runs.lattice.case import LatticeCase, stage_keys
 from modeharvest.runs.lattice.modes import (
     LatticeModel,
-    find_critical,
     find_family,
-    find_modes,
     found_pattern,
-    periodic_fields,
     read_critical,
     to_be_shown,
-    why_no_modes,
     write_critical,
 )
 from modeharvest.runs.lattice.results import (
@@ -85,8 +81,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         path = self.folder / "critical.json"
 
         def work() -> tuple[Path, ...]:
-            found = find_critical(self._model.path(), self.case.search, self.progress)
-            write_critical(path, self.case.loading.name, found)
+            write_critical(path, self.case.loading.name, self._model.critical())
             return (path,)
 
         return self.do("critical", self._keys["critical"], work, lambda: read_critical(path))
@@ -119,17 +114,14 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         InputError
             If a wave asked for doesn't repeat within a dozen cells, or a load can't be reached.
         """
-        critical, plan = self.critical(), self.case.modes
-        if why_no_modes(critical, plan):
+        critical = self.critical()
+        if self._model.why_no_modes(critical):
             return None, ()
         path = self.folder / "modes.h5"
         others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
 
         def work() -> tuple[Path, ...]:
-            cell_path = self._model.path(max(plan.load, critical.load))
-            step = self.case.search.largest_step
-            how = (self.case.material, critical, plan, step, self._info(critical))
-            found = find_modes(cell_path, *how, self.progress)
+            found = self._model.modes(critical, self._info(critical))
             write_modes(path, *found)
             for write, other in others.items():
                 write(other, *found)
@@ -229,14 +221,13 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
     @cached_property
     def _model(self) -> LatticeModel:
-        return LatticeModel(self.case)
+        return LatticeModel(self.case, self.progress)
 
     @cached_property
     def _patterns(self) -> list[PeriodicField]:
         """All fields in which families are looked for."""
         critical = self.critical()
-        load = self.case.modes.load or critical.load
-        return periodic_fields(self._model.path(load), load, *self.modes(), self._info(critical))
+        return self._model.fields(critical, *self.modes(), self._info(critical))
 
     def _found_patterns(self) -> list[FoundPattern]:
         return [found_pattern(pattern, self.folder) for pattern in self._patterns]
@@ -261,7 +252,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             branches=branches,
             patterns=self._shown(modes) if modes and "families" in done else (),
             study=self._study() if "study" in done else None,
-            notes=[note for note in (why_no_modes(critical, self.case.modes),) if note],
+            notes=[note for note in (self._model.why_no_modes(critical),) if note],
             exports=exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )
