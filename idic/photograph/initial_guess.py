@@ -29,53 +29,72 @@ from modeharvest.idic.local.motion import (
     first_motion,
     fit_unknowns,
 )
-from modeharvest.idic.modes import ModeFamily, Taper, square_family
+from modeharvest.idic.modes import ModeFamily, Taper, free_family, square_family
 from modeharvest.idic.photograph.geometry import Geometry
-from modeharvest.idic.photograph.initial_modes import (
-    SAME_WAVE,
-    Cells,
-    InitialMode,
-    fixed_square,
-    modes_of,
-    require_cell_size,
-)
-from modeharvest.idic.photograph.region import box_of, junction
+from modeharvest.idic.photograph.region import WRONG_CELL, Cells, box_of, junction
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.slow_fields import Box, Brightness
-from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
-from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
+from modeharvest.idic.spectra.pattern import WavePattern, nearest_origin, read_pattern
+from modeharvest.idic.spectra.spectrum import measured_spectrum
+from modeharvest.idic.spectra.waves import PlaneWave
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 
-_Placed = tuple[InitialMode, Box]
-"""A mode and its region."""
-
+DIAGONAL = 0.1
+"""Difference of |kx| and |ky|, relative, up to which a wave lies along a diagonal."""
+SAME_WAVE = 0.15
+"""Distance [1/l] within which two wave vectors are one, up to a reciprocal lattice vector."""
 AMPLITUDE_DEGREE = 2
-"""Total degree of every v_i at the start: strongest in the middle, weaker at clamped edges."""
+"""Total degree of every v_i at first: strongest in the middle, weaker at clamped edges."""
 FIXED_AMPLITUDE = 1.0
-"""v_i where no pattern is seen [mm]; as the paper's start, 40 um with max ||phi|| = 0.04."""
+"""v_i where no pattern is observable [mm]; the paper's: 40 um with max ||phi|| = 0.04."""
+
+
+@dataclass(frozen=True, eq=False)
+class InitialMode:
+    """A mode of an initial guess.
+
+    Parameters
+    ----------
+    family
+        Its start is the pattern.
+    amplitude
+        What the family's waves at its start are to be multiplied by, with sign [mm].
+    box
+        The region [mm].
+    """
+
+    family: ModeFamily
+    amplitude: float
+    box: Box
 
 
 @dataclass(frozen=True, eq=False)
 class RegionPattern:
-    """A part of the specimen with a pattern of its own.
+    """The pattern of a part of the specimen, and the modes made of it.
 
     Parameters
     ----------
-    box
-        Where [mm].
-    spectrum
-        Of the field there.
     pattern
-        What the spectrum shows.
+        What the spectrum of the field there shows.
     modes
-        Indices of the ansatz's modes that belong to it.
+        Of the ansatz; those of all regions follow one another.
     """
 
-    box: Box
-    spectrum: Spectrum
     pattern: WavePattern
-    modes: tuple[int, ...]
+    modes: tuple[InitialMode, ...]
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """What was found."""
+        if len(self.modes) < 2:
+            return self.pattern.sentences
+        return (
+            *self.pattern.sentences,
+            f"The waves share no vector of the reciprocal lattice: {len(self.modes)} modes, each "
+            "with an amplitude of its own.",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +108,13 @@ class InitialGuess:
     unknowns
         (size,) for :func:`modeharvest.idic.correlate.correlate`.
     regions
-        One or more, with their spectra.
+        One or more, with their patterns.
     local
-        The field that the start was read from.
+        The field that it was found from.
     fixed
-        Whether the modes are fixed because no pattern is seen.
-    sentences
-        What was found, in words.
+        Whether the modes are fixed because no pattern is observable.
+    text
+        What was found.
     """
 
     ansatz: Ansatz
@@ -103,17 +122,12 @@ class InitialGuess:
     regions: tuple[RegionPattern, ...]
     local: LocalField
     fixed: bool
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
     @property
     def family(self) -> str:
         """Names of the modes' families."""
         return " and ".join(mode.family.name for mode in self.ansatz.modes) or "none"
-
-    @property
-    def spectrum(self) -> Spectrum:
-        """Of the first region."""
-        return self.regions[0].spectrum
 
     @property
     def pattern(self) -> WavePattern:
@@ -163,82 +177,121 @@ def initial_guess(
     if domain is None:
         domain = Box(*pair.grid.extent) if pair.mask is None else box_of(pair.mask, pair.grid)
     cells = Cells.found(cell_size, lattice, pair, boxes, holes)
-    said: list[str] = []
     if local is None:
-        known, sentence = first_motion(domain, pair, holes)
+        known, motion_text = first_motion(domain, pair, holes)
         local = coarse_field(pair, cell_size, known)
-        said += [sentence, f"Without a local DIC: {local.x.size} points of {local.source}."]
+        text = [motion_text, f"Without a local DIC: {local.x.size} points of {local.source}."]
     else:
         share = 100 * local.valid_share
-        said.append(f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid.")
-    regions, modes = _read_regions(local, boxes, cells, said)
+        text = [f"Local field {local.source}: {local.x.size} points, {share:.1f} % valid."]
+    regions = tuple(_region_pattern(local, box, cells) for box in boxes)
+    modes = [mode for region in regions for mode in region.modes]
+    text += [line for region in regions for line in region.text]
     fixed = not modes
-    if fixed:
-        modes = _fixed_mode(boxes[0], cells, said)
+    if fixed and cells.square:
+        modes = [InitialMode(fixed_square(cells), 0.0, boxes[0])]
+        text.append(
+            "The mode is fixed at the square pattern that the lattice of holes allows: without a "
+            "pattern, its parameters can't be seen."
+        )
+    elif fixed:
+        text.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
     ansatz, a = _assembled(modes, cell_size, domain, options)
     fit = _fitted(ansatz, a, local, fixed)
-    said.append(_fit_words(ansatz, fit, fixed))
-    return InitialGuess(ansatz, fit.coefficients, regions, local, fixed, tuple(said))
+    fitted = " and ".join(["v0", *(f"v{i + 1}" for i in range(0 if fixed else len(modes)))])
+    text.append(
+        f"{fitted} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
+        "aside."
+    )
+    return InitialGuess(ansatz, fit.coefficients, regions, local, fixed, tuple(text))
 
 
-def _read_regions(
-    local: LocalField, boxes: Sequence[Box], cells: Cells, said: list[str]
-) -> tuple[tuple[RegionPattern, ...], list[_Placed]]:
-    """The regions, and the modes of all of them."""
-    regions: list[RegionPattern] = []
-    modes: list[_Placed] = []
-    for box in boxes:
-        region, found = _read_region(local, box, cells, len(modes), said)
-        regions.append(region)
-        modes += found
-    return tuple(regions), modes
-
-
-def _read_region(
-    local: LocalField, box: Box, cells: Cells, first: int, said: list[str]
-) -> tuple[RegionPattern, list[_Placed]]:
-    """Read the spectrum of one region, and make its modes, numbered from ``first``."""
-    spectrum = measured_spectrum(local, cells.cell_size, box)
-    pattern = read_pattern(spectrum)
-    said += pattern.sentences
+def _region_pattern(local: LocalField, box: Box, cells: Cells) -> RegionPattern:
+    """Find the pattern of one region in the field's spectrum there, and make its modes."""
+    pattern = read_pattern(measured_spectrum(local, cells.cell_size, box))
     if not cells.given:
         require_cell_size(pattern, cells.cell_size)
-    modes = modes_of(pattern, cells) if pattern.waves else []
-    if len(modes) > 1:
-        said.append(
-            f"The waves share no vector of the reciprocal lattice: {len(modes)} modes, each with "
-            "an amplitude of its own."
+    return RegionPattern(pattern, tuple(modes_of(pattern, cells, box)))
+
+
+def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
+    """Raise InputError if a pattern's waves are those of a square lattice of another cell size.
+
+    Two waves along both diagonals, equally long, are what the square pattern looks like with a
+    wrong cell size: at |ξ| = l / 2l₀ along each axis, where l₀ is the right one.
+    """
+    k = np.abs([w.k for w in pattern.waves])
+    if len(k) != 2 or np.ptp(k) > DIAGONAL * k.mean():
+        return
+    found = cell_size / float(k.mean())
+    if abs(found - cell_size) > WRONG_CELL * cell_size:
+        xi = 0.5 * float(k.mean())
+        raise InputError(
+            f"automatic start: expected the spectrum's peaks at ξ = (±0.50, ±0.50) for a cell of "
+            f"{cell_size:g} mm, got (±{xi:.2f}, ±{xi:.2f}), which belong to a cell of {found:.3g} "
+            f"mm; give that cell size, or the lattice of the holes if the pattern isn't theirs"
         )
-    numbers = tuple(range(first, first + len(modes)))
-    return RegionPattern(box, spectrum, pattern, numbers), [(mode, box) for mode in modes]
 
 
-def _fixed_mode(box: Box, cells: Cells, said: list[str]) -> list[_Placed]:
-    """The pattern that a square lattice allows; none on others, of which we don't know it."""
-    if not cells.square:
-        said.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
-        return []
-    said.append(
-        "The mode is fixed at the square pattern that the lattice of holes allows: without a "
-        "pattern, its parameters can't be seen."
-    )
-    return [(InitialMode(fixed_square(cells), 0.0), box)]
+def modes_of(pattern: WavePattern, cells: Cells, box: Box) -> list[InitialMode]:
+    """Modes for the waves of a pattern: the paper's family if it is the square one, else free ones.
+
+    Waves whose vectors differ by one of the reciprocal lattice are coupled by the holes, and make
+    one mode; any others share nothing, and each group has a mode, and an amplitude v, of its own.
+    """
+    if pattern.start is not None:
+        family, sign = nearest_origin(pattern.start, cells.cell_size)
+        amplitude = sign * pattern.start_amplitude
+        return [InitialMode(replace(family, name="square"), amplitude, box)]
+    groups: list[list[PlaneWave]] = []
+    for wave in pattern.waves:
+        group = next((g for g in groups if _coupled(g[0], wave, cells)), None)
+        if group is None:
+            groups.append([wave])
+        else:
+            group.append(wave)
+    return [_free_mode(group, box) for group in groups]
+
+
+def _coupled(one: PlaneWave, other: PlaneWave, cells: Cells) -> bool:
+    """Whether two wave vectors, or one and the other's opposite, differ by a reciprocal vector."""
+    for sign in (1.0, -1.0):
+        apart = (np.array(other.xi) - sign * np.array(one.xi)) / cells.cell_size
+        periods = cells.vectors @ apart
+        rest = np.linalg.solve(cells.vectors, periods - np.round(periods)) * cells.cell_size
+        if np.linalg.norm(rest) <= SAME_WAVE:
+            return True
+    return False
+
+
+def _free_mode(waves: list[PlaneWave], box: Box) -> InitialMode:
+    rows = np.array([w.row for w in waves])
+    amplitude = float(np.abs(rows[:, :2]).max())
+    rows[:, :2] /= amplitude
+    count = "1 wave" if len(waves) == 1 else f"{len(waves)} waves"
+    return InitialMode(free_family(rows, f"{count}, free"), amplitude, box)
+
+
+def fixed_square(cells: Cells) -> ModeFamily:
+    """The square pattern that the holes allow, without parameters: for images that show none."""
+    first, second = cells.cell_size * np.linalg.inv(cells.vectors).T
+    start = np.array([1.0, *(first + second), *(second - first), 0.0, 0.0])
+    return replace(square_family(), start=start).moved(cells.junction).fixed()
 
 
 def _assembled(
-    modes: Sequence[_Placed], cell_size: float, domain: Box, options: AnsatzOptions
+    modes: Sequence[InitialMode], cell_size: float, domain: Box, options: AnsatzOptions
 ) -> tuple[Ansatz, FloatArray]:
     """The ansatz, and unknowns in which every v_i is a constant."""
-    families = [(mode.family, box) for mode, box in modes]
-    ansatz = Ansatz.on(domain, families, cell_size, options)
+    ansatz = Ansatz.on(domain, [(m.family, m.box) for m in modes], cell_size, options)
     a = ansatz.initial_guess()
-    for i, (mode, _) in enumerate(modes):
+    for i, mode in enumerate(modes):
         a[ansatz.v_slice(i)][0] = mode.amplitude / ansatz.modes[i].scale or FIXED_AMPLITUDE
     return ansatz, a
 
 
 def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, fixed: bool) -> RobustFit:
-    """v0 and every v_i through the field; a mode that can't be seen isn't fitted."""
+    """v0 and every v_i through the field; a mode that isn't observable isn't fitted."""
     slow = min(SLOW_DEGREE, ansatz.v0_degree)
     if not fixed:
         return fit_unknowns(ansatz, a, local, slow, min(AMPLITUDE_DEGREE, ansatz.v_degree))
@@ -247,27 +300,24 @@ def _fitted(ansatz: Ansatz, a: FloatArray, local: LocalField, fixed: bool) -> Ro
     return replace(fit, coefficients=np.concatenate([fit.coefficients, a[alone.size :]]))
 
 
-def _fit_words(ansatz: Ansatz, fit: RobustFit, fixed: bool) -> str:
-    modes = () if fixed else ansatz.modes
-    what = " and ".join(["v0", *(f"v{i + 1}" for i in range(len(modes)))])
-    return (
-        f"{what} through the field: leaves {1e3 * fit.sd:.0f} µm, {fit.outliers} components set "
-        "aside."
-    )
-
-
 def chosen_modes(
-    start: InitialGuess, geometry: Geometry, cell_size: float, how: PhotographOptions
+    guess: InitialGuess, geometry: Geometry, cell_size: float, how: PhotographOptions
 ) -> tuple[Ansatz, FloatArray, bool]:
-    """The start's ansatz and unknowns with the specified family, its modes fixed or not."""
-    ansatz, unknowns, fixed = start.ansatz, start.unknowns, start.fixed
+    """The guess's ansatz and unknowns with the specified family, its modes fixed or not."""
+    ansatz, unknowns, fixed = guess.ansatz, guess.unknowns, guess.fixed
     wants_square = how.family == "square" and geometry.lattice is not None
-    if (wants_square and "square" not in start.family) or (fixed and how.fixed_mode is False):
-        family = _square(geometry)
-        ansatz, unknowns = _in_every_part(family, ansatz, unknowns, geometry, cell_size)
+    family: ModeFamily | None = None
+    if (wants_square and "square" not in guess.family) or (fixed and how.fixed_mode is False):
+        if geometry.lattice is None:
+            raise InputError(
+                "correlation: expected fixed_mode true or 'auto' where no pattern and no lattice of "
+                "holes are found, got false"
+            )
+        family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
         fixed = False
     elif fixed and ansatz.modes and len(geometry.parts) > 1:
         family = ansatz.modes[0].family
+    if family is not None:
         ansatz, unknowns = _in_every_part(family, ansatz, unknowns, geometry, cell_size)
     if how.fixed_mode is True and not fixed:
         ansatz, unknowns = with_fixed_modes(ansatz, unknowns)
@@ -306,7 +356,7 @@ def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray
 
 
 def _same(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two wave vectors are one, or each other's opposite, up to what is read off."""
+    """Whether two wave vectors are one, or each other's opposite."""
     apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
     return bool(0.5 * apart <= SAME_WAVE)
 
@@ -325,9 +375,3 @@ def _in_every_part(
     slow = 2 * ansatz.v0_space.size
     a[:slow] = unknowns[:slow]
     return made, a
-
-
-def _square(geometry: Geometry) -> ModeFamily:
-    """The paper's Eq. (mode) with its origin on a junction."""
-    assert geometry.lattice is not None
-    return square_family("junction").moved(junction(geometry.lattice, geometry.grid))

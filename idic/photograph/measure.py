@@ -227,12 +227,12 @@ def measure(
         said += " v0 starts from the photograph before. "
         said += confirmed_by_speckle(pair, partial(_moved_to, before.result))
     boxes = [part.box for part in geometry.parts]
-    start = initial_guess(
+    guess = initial_guess(
         pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=how,
     )  # fmt: skip
-    ansatz, unknowns, fixed = chosen_modes(start, geometry, cell_size, how)
-    sentences = (said, *_guess_sentences(start, ansatz, geometry))
+    ansatz, unknowns, fixed = chosen_modes(guess, geometry, cell_size, how)
+    sentences = (said, *_guess_text(guess, ansatz, geometry))
     if before is not None and _goes_on(before, ansatz, unknowns, fixed):
         found, finish = correlated(
             pair, geometry, *_with_brightness(before.result, how), how, progress
@@ -240,10 +240,10 @@ def measure(
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
             said_all = (*sentences, words, finish.sentence)
-            return MeasuredPhotograph(found, start.local, before.fixed, finish.blur_px, said_all)
+            return MeasuredPhotograph(found, guess.local, before.fixed, finish.blur_px, said_all)
     found, finish = correlated(pair, geometry, ansatz, unknowns, how, progress)
     return MeasuredPhotograph(
-        found, start.local, fixed, finish.blur_px, (*sentences, finish.sentence)
+        found, guess.local, fixed, finish.blur_px, (*sentences, finish.sentence)
     )
 
 
@@ -307,17 +307,17 @@ def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, f
     return not shows_more(ansatz, unknowns, result.ansatz, result.unknowns)
 
 
-def _guess_sentences(start: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:
-    """The start's sentences; those about a spectrum name its part, where there are several."""
+def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tuple[str, ...]:
+    """The initial guess's text; lines about a spectrum name its part, where there are several."""
     if len(geometry.parts) == 1:
-        return start.sentences
-    read = {sentence for region in start.regions for sentence in region.pattern.sentences}
-    said = [sentence for sentence in start.sentences if sentence not in read]
-    for part, region in zip(geometry.parts, start.regions, strict=True):
+        return guess.text
+    read = {line for region in guess.regions for line in region.pattern.sentences}
+    text = [line for line in guess.text if line not in read]
+    for part, region in zip(geometry.parts, guess.regions, strict=True):
         own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == part.box]
         modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
-        said.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.sentences)}")
-    return tuple(said)
+        text.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.sentences)}")
+    return tuple(text)
 
 
 def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:

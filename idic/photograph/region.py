@@ -1,4 +1,4 @@
-"""The cellular region of a specimen, and the boxes that an ansatz needs.
+"""The cellular region of a specimen, the lattice of its holes in mm, and boxes for an ansatz.
 
 The cellular part comes from the lattice of the holes, from a polygon drawn by hand, or from a
 mask image; modes live there. The domain of v0 is the whole specimen as far as the image shows it.
@@ -6,17 +6,20 @@ mask image; modes live there. The domain of v0 is the whole specimen as far as t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import find_objects, label
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 from skimage.draw import polygon2mask
 
-from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.photograph.holes import HoleLattice, find_holes
 from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
@@ -160,24 +163,12 @@ def _region(
 ) -> Region:
     low, high = _bounds(_largest_part(np.asarray(mask, dtype=np.bool_)))
     domain = _box(low, high, grid)
-    cut = (
-        low[1] < 0.5,
-        high[1] > grid.cols - 1.5,
-        high[0] > grid.rows - 1.5,
-        low[0] < 0.5,
-    )
-    widths = (
-        box.x_min - domain.x_min,
-        domain.x_max - box.x_max,
-        box.y_min - domain.y_min,
-        domain.y_max - box.y_max,
-    )
-    margins = tuple(
-        float("nan") if outside else float(w) for outside, w in zip(cut, widths, strict=True)
-    )
-    unseen = [side for side, outside in zip(SIDES, cut, strict=True) if outside]
-    if unseen:
-        said = (*said, f"The specimen leaves the image at the {', '.join(unseen)}.")
+    cut = (low[1] < 0.5, high[1] > grid.cols - 1.5, high[0] > grid.rows - 1.5, low[0] < 0.5)
+    widths = np.abs(np.subtract(astuple(box), astuple(domain)))
+    left, right, bottom, top = np.where(cut, np.nan, widths)
+    if any(cut):
+        sides = ", ".join(side for side, outside in zip(SIDES, cut, strict=True) if outside)
+        said = (*said, f"The specimen leaves the image at the {sides}.")
     # Half a cell of rounding or of a crooked edge must not make the domain the smaller one.
     domain = Box(
         min(box.x_min, domain.x_min),
@@ -185,7 +176,7 @@ def _region(
         min(box.y_min, domain.y_min),
         max(box.y_max, domain.y_max),
     )
-    return Region(box, domain, polygon, (margins[0], margins[1], margins[2], margins[3]), said)
+    return Region(box, domain, polygon, (left, right, bottom, top), said)
 
 
 def box_of(mask: BoolArray, grid: PixelGrid) -> Box:
@@ -247,3 +238,131 @@ def _unlike_box(inside: BoolArray, low: FloatArray, high: FloatArray) -> list[st
     if share >= _FILLED:
         return []
     return [f"It fills {100 * share:.0f} % of its bounding box, on which the modes are set up."]
+
+
+NEARLY_SQUARE = 0.05
+"""Relative difference of lengths, and cosine between directions, of a square lattice's vectors."""
+WRONG_CELL = 0.07
+"""Relative difference of a cell size given from one found, beyond which they contradict each
+other: over the paper's six cells the phase of its mode drifts by 1.3 rad, and a correlation may
+settle in a local minimum. A measured field's peaks are known to a few hundredths."""
+_FEWEST_HOLES = 4
+_SMALLEST_HOLE = 0.01
+"""Area of a hole [cells] below which it is a speck in the mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The lattice of holes.
+
+    Parameters
+    ----------
+    cell_size
+        l, the distance of neighbouring holes [mm].
+    vectors
+        (2, 2) lattice vectors as rows [mm].
+    given
+        Whether they were given, or are square for want of better knowledge.
+    hole
+        (2,) centre of one hole [mm].
+    """
+
+    cell_size: float
+    vectors: FloatArray
+    given: bool
+    hole: FloatArray
+
+    @classmethod
+    def found(
+        cls,
+        cell_size: float,
+        lattice: ArrayLike | None,
+        pair: ImagePair,
+        boxes: Sequence[Box],
+        holes: LocalField | None,
+    ) -> Cells:
+        """Take what is given, and the rest from the mask; raises InputError if they differ."""
+        if not cell_size > 0:
+            raise InputError(f"automatic start: expected a positive cell size, got {cell_size} mm")
+        vectors = lattice_vectors(cell_size, lattice)
+        centres = np.zeros((0, 2)) if holes is None else np.column_stack([holes.x, holes.y])
+        if holes is None and pair.mask is not None and not pair.mask.all():
+            centres = hole_centres(pair, boxes, cell_size)
+        centres = centres[np.isfinite(centres).all(axis=1)]
+        require_hole_distance(centres, cell_size)
+        corner = np.array([boxes[0].x_min, boxes[0].y_min])
+        hole = _middle_hole(centres, vectors) if len(centres) else corner + vectors.sum(axis=0) / 2
+        return cls(cell_size, vectors, lattice is not None, hole)
+
+    @property
+    def square(self) -> bool:
+        """Whether the lattice vectors are as long as each other, and at right angles."""
+        a, b = np.linalg.norm(self.vectors, axis=1)
+        cosine = abs(self.vectors[0] @ self.vectors[1]) / (a * b)
+        return bool(abs(a - b) <= NEARLY_SQUARE * a and cosine <= NEARLY_SQUARE)
+
+    @property
+    def junction(self) -> FloatArray:
+        """(2,) the middle of the solid between four holes [mm]."""
+        return np.asarray(self.hole - 0.5 * self.vectors.sum(axis=0))
+
+
+def hole_centres(pair: ImagePair, boxes: Sequence[Box], cell_size: float) -> FloatArray:
+    """(n, 2) centres of the holes of the reference that lie in boxes [mm]; specks are left out."""
+    holes = find_holes(pair.masks[0], _SMALLEST_HOLE * (cell_size / pair.grid.pixel_size) ** 2)
+    x, y = pair.grid.to_mm(*holes.centres.T)
+    inside = [
+        (x > box.x_min) & (x < box.x_max) & (y > box.y_min) & (y < box.y_max) for box in boxes
+    ]
+    return np.vstack([np.column_stack([x, y])[within] for within in inside])
+
+
+def require_hole_distance(centres: FloatArray, cell_size: float) -> None:
+    """Raise InputError if neighbouring holes are not a cell size apart; few holes say nothing."""
+    if len(centres) < _FEWEST_HOLES:
+        return
+    apart = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
+    if abs(apart - cell_size) > WRONG_CELL * cell_size:
+        raise InputError(
+            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got "
+            f"{apart:.3g} mm between neighbours of {len(centres)} holes; give cell size "
+            f"{apart:.3g} mm, or check the pixel size"
+        )
+
+
+def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(2,) where the hole in the middle should be, by itself and its neighbours [mm]."""
+    middle = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
+    steps = np.linalg.solve(vectors.T, (centres - middle).T).T
+    near = np.abs(steps).max(axis=1) < 1.5
+    return np.asarray((centres - np.round(steps) @ vectors)[near].mean(axis=0))
+
+
+def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
+    """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
+
+    Raises
+    ------
+    InputError
+        If the lattice given isn't one, or its shortest distance isn't the cell size within 7 %.
+    """
+    if lattice is None:
+        return cell_size * np.eye(2)
+    vectors = np.asarray(lattice, dtype=np.float64)
+    if vectors.shape != (2, 2) or not abs(np.linalg.det(vectors)) > 1e-6 * np.sum(vectors**2):
+        raise InputError(
+            f"automatic start: expected two lattice vectors [mm] as rows, got {vectors.tolist()}"
+        )
+    i = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
+    lengths = np.linalg.norm(i[np.any(i != 0, axis=1)] @ vectors, axis=1)
+    shortest = float(lengths.min())
+    if abs(shortest - cell_size) > WRONG_CELL * cell_size:
+        raise InputError(
+            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got a "
+            f"lattice of holes {shortest:.3g} mm apart; give cell size {shortest:.3g} mm, or check "
+            "the pixel size"
+        )
+    if np.prod(np.abs(np.diag(vectors[::-1]))) > np.prod(np.abs(np.diag(vectors))):
+        vectors = vectors[::-1]
+    signs = np.where(np.diag(vectors) < 0, -1.0, 1.0)
+    return np.asarray(vectors * signs[:, None])
