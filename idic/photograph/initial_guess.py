@@ -310,8 +310,8 @@ def chosen_modes(
     if (wants_square and "square" not in guess.family) or (fixed and how.fixed_mode is False):
         if geometry.lattice is None:
             raise InputError(
-                "correlation: expected fixed_mode true or 'auto' where no pattern and no lattice of "
-                "holes are found, got false"
+                "correlation: expected fixed_mode true or 'auto' where no pattern and no lattice "
+                "of holes are found, got false"
             )
         family = square_family("junction").moved(junction(geometry.lattice, geometry.grid))
         fixed = False
