@@ -36,6 +36,7 @@ from modeharvest.idic.solver.assembly import Assembly, residual
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.idic.solver.pyramid import blurred
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 
 HEIGHT_MM, ASPECT, STRAIN = 22.07, 0.8, 0.05
@@ -76,7 +77,10 @@ class Pair:
     def correlate(self, options: CorrelationOptions | None = None) -> Result:
         """Start to end."""
         return correlate(
-            self.f, self.g, self.grid, self.ansatz, self.start, self.mask, None, options
+            ImagePair(self.f, self.g, self.grid, self.mask),
+            self.ansatz,
+            guess=self.start,
+            options=options,
         )
 
     def peak_images(self) -> float:

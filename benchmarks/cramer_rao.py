@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL
-from modeharvest.idic.uncertainty.noise import ImageNoise
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.validation.studies.noise_statistics import Estimate, PairedErrors
 
@@ -161,7 +162,12 @@ def measure(truth: Truth, noise: Noise, seed: int, standard_start: bool) -> Real
     f, g = truth.images(speckle)
     n_f, n_g = noise.draw(f, g, seed)
     plus, minus = (
-        correlate(f + s * n_f, g + s * n_g, GRID, ansatz, start, truth.mask, options=options)
+        correlate(
+            ImagePair(f + s * n_f, g + s * n_g, GRID, truth.mask),
+            ansatz,
+            guess=start,
+            options=options,
+        )
         for s in (1, -1)
     )
     return Realisation(truth.bound(speckle, noise.in_f, noise.in_g), (plus, minus))

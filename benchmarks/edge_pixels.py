@@ -14,6 +14,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
 
 STRAIN = 0.128
@@ -33,7 +34,9 @@ def main() -> None:
     print("edge_px [px]  pixels   IDIC - best fit, rms per component [px]  of the length [px]")
     for edge_px in (0, 1, 2, 3, 5):
         options = CorrelationOptions(edge_px=edge_px)
-        result = correlate(f, g, grid, ansatz, start, mask, g_mask, options)
+        result = correlate(
+            ImagePair(f, g, grid, mask, g_mask), ansatz, guess=start, options=options
+        )
         off = (result.displacement() - best)[mask] / grid.pixel_size
         rms = float(np.sqrt(np.mean(off**2)))
         print(f"{edge_px:12d}  {result.pixels:7d}  {rms:39.3f}  {rms * 2**0.5:18.3f}")

@@ -29,6 +29,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.assembly import Assembly
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, sample_points
 from modeharvest.util.scaled_eigen import ScaledEigen
 
@@ -105,7 +106,12 @@ def peak_memory(ansatz: Ansatz, f: Image, g: Image, mask: NDArray[np.bool_]) -> 
     options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
     images = f.astype(np.float32), g.astype(np.float32)
     tracemalloc.start()
-    correlate(*images, GRID, ansatz, ansatz.initial_guess(0.001, 0.1), mask, mask, options)
+    correlate(
+        ImagePair(*images, GRID, mask, mask),
+        ansatz,
+        guess=ansatz.initial_guess(0.001, 0.1),
+        options=options,
+    )
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak / images[0].nbytes

@@ -22,6 +22,7 @@ from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.pyramid import FULL, eroded
 from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.errors import InputError
 
@@ -60,10 +61,12 @@ def distances(pair: ImageSet, seeds: int) -> Iterator[tuple[float, str, float]]:
         for seed in range(seeds):
             noise = sd * np.random.default_rng([seed, 1]).normal(size=(2, *grid.shape))
             noisy = f + noise[0], g + noise[1]
-            first = correlate(*noisy, grid, ansatz, start, *masks)
+            first = correlate(ImagePair(*noisy, grid, *masks), ansatz, guess=start)
             for name, how in WEIGHTED.items():
                 options = CorrelationOptions((FULL,), **how)  # type: ignore[arg-type]
-                result = correlate(*noisy, grid, ansatz, first.unknowns, *masks, options)
+                result = correlate(
+                    ImagePair(*noisy, grid, *masks), ansatz, guess=first.unknowns, options=options
+                )
                 off = (result.displacement() - best.displacement())[used]
                 found[name].append(np.sqrt((off**2).sum(axis=-1).mean()) / grid.pixel_size)
         for name, values in found.items():

@@ -89,12 +89,11 @@ def main() -> None:
         spec = ImagingSpec(pixel_size=options.pixel_size)
         images = make_images(solution, spec, folder, options.strains)
         for strain in images.strains:
-            f, g = images.reference(camera=True), images.deformed(strain, camera=True)
-            masks = images.mask(), images.deformed_mask(strain)
+            pair = images.pair(strain, camera=True)
             measured = local(images, strain, subsets)
             for field in (None,) if measured is None else (None, measured):
-                start = initial_guess(images.pair(strain, camera=True), CELL, CELLULAR, local=field)
-                found = correlate(f, g, images.grid, start.ansatz, start.unknowns, *masks)
+                start = initial_guess(pair, CELL, CELLULAR, local=field)
+                found = correlate(pair, start.ansatz, guess=start.unknowns)
                 tell(images, strain, start.local, start, found)
 
 

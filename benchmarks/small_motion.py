@@ -34,9 +34,10 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, eroded
-from modeharvest.idic.uncertainty.noise import ImageNoise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
@@ -217,8 +218,10 @@ def measure(row: Row, motion: tuple[float, float, float], pairs: int) -> Measure
         efficient.append(inverse @ push)
         found = [
             correlate(
-                f + sign * row.in_f * noise[0], g + sign * row.in_g * noise[1], GRID, ansatz,
-                np.zeros(ansatz.size), mask, options=options,
+                ImagePair(
+                    f + sign * row.in_f * noise[0], g + sign * row.in_g * noise[1], GRID, mask
+                ),
+                ansatz, guess=np.zeros(ansatz.size), options=options,
             )
             for sign in (1, -1)
         ]  # fmt: skip

@@ -29,6 +29,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.report.figures.style import BLUE, GREEN, RED, figure
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.files import atomic, read_json, write_json
@@ -109,7 +110,12 @@ class Map:
         """Correlate as the case says, from another start."""
         f, g, mask, deformed_mask = self._input
         options = self.how.options()
-        return correlate(f, g, self.grid, self.ansatz, start, mask, deformed_mask, options)
+        return correlate(
+            ImagePair(f, g, self.grid, mask, deformed_mask),
+            self.ansatz,
+            guess=start,
+            options=options,
+        )
 
     def disturbed(self, radius: float, corner: bool, seed: int) -> FloatArray:
         """Put the mode's parameters off; the same directions for every radius."""

@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.photograph.measure import covariances, noise_of, prepared_pair
+from modeharvest.idic.photograph.measure import image_noise
 from modeharvest.idic.result import Result
-from modeharvest.idic.solver.final_smoothing import blurred_pair
-from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors
+from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, field_errors
 from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
@@ -117,13 +116,10 @@ class _CoverageSetup:
 
     def measured(self, images: tuple[FloatImage, FloatImage]) -> Result:
         """Correlate as the harvest finished, from the harvest's result on."""
-        masks = self.pair.masks
-        if self.blur_px > 0.0:
-            images = blurred_pair(*images, *masks, self.blur_px)
         options = self.harvesting.case.correlation.options()
-        fine = replace(options, levels=options.levels[-1:])
-        start = self.start
-        return correlate(*images, start.grid, start.ansatz, start.unknowns, *masks, fine)
+        finest = replace(options, levels=options.levels[-1:], final_smoothing_px=self.blur_px)
+        pair, start = self.pair.with_images(*images), self.start
+        return correlate(pair, start.ansatz, guess=start.unknowns, options=finest)
 
 
 @lru_cache(maxsize=1)
@@ -132,16 +128,18 @@ def _setup(folder: Path, name: str) -> _CoverageSetup:
     case = PhotographCase.read(twin.experiment)
     harvesting = HarvestRun(case, folder / "harvest")
     prepared, measured = harvesting.prepared(), harvesting.results()[name]
-    pair = prepared_pair(prepared, name)
+    pair = prepared.pair(name)
     box = harvesting.geometry.region.cellular
     x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)
     y = np.linspace(box.y_min, box.y_max, _POINTS, dtype=np.float64)
-    noise, cell = noise_of(prepared, name), case.specimen.cell_size
-    by_noise, _, _ = covariances(measured, pair, noise, cell)
-    errors = field_errors(measured.result, x, y, by_noise)
-    blank = measured.result
+    result, noise = measured.result, image_noise(pair, prepared.noise)
+    cell, edge_px = case.specimen.cell_size, case.correlation.edge_px
+    by_noise = covariance(result, pair, noise, cell, edge_px).by_noise
+    errors = field_errors(result, x, y, by_noise)
+    assert result.final_smoothing is not None
+    blur_px = result.final_smoothing.blur_px
     setup = _CoverageSetup(
-        twin, harvesting, pair, name, measured.blur_px, blank, blank, errors, x, y
+        twin, harvesting, pair, name, blur_px, result, result, errors, x, y
     )  # fmt: skip
     return replace(setup, clean=setup.measured(setup.photographs(None)))
 

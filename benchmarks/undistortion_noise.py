@@ -20,10 +20,12 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import Level
+from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.imaging.distortion.calibration.result import sampled_correlations
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
@@ -70,7 +72,7 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
             noisy = [undistorted(image, lens) for image in noisy]
         if blur > 0.0:
             noisy = [ndimage.gaussian_filter(image, blur) for image in noisy]
-        result = correlate(*noisy, GRID, ANSATZ, unknowns, mask, None, options)
+        result = correlate(ImagePair(*noisy, GRID, mask), ANSATZ, guess=unknowns, options=options)
         found.append(result.unknowns)
         residual.append(result.residual_rms**2 / (2 * noise**2))
     x, y = GRID.x[INNER][::5], GRID.y[INNER][::5]
@@ -79,7 +81,8 @@ def trial(lens: CameraDistortion | None, noise: float, blur: float, size_mm: flo
     mean_error = np.sqrt(np.mean((fields.mean(axis=0) - truth) ** 2))
     scatter = np.sqrt(np.mean(fields.var(axis=0, ddof=1)))
     # The engine predicts for white noise; blurred, it isn't.
-    predicted = np.sqrt(np.mean(result.displacement_sd(x, y, noise) ** 2)) / GRID.pixel_size
+    sd = field_errors(result, x, y, result.covariance(noise)).displacement
+    predicted = np.sqrt(np.mean(sd**2)) / GRID.pixel_size
     words = "" if blur > 0.0 else f"{predicted:.4f}"
     name = "lens" if lens else "perfect"
     return (
@@ -115,7 +118,7 @@ def noise_free(lens: CameraDistortion | None) -> float:
     mask = np.zeros(GRID.shape, dtype=np.bool_)
     mask[INNER, INNER] = True
     options = CorrelationOptions(levels=(Level(1, 0.0),))
-    result = correlate(*images, GRID, ANSATZ, unknowns, mask, None, options)
+    result = correlate(ImagePair(*images, GRID, mask), ANSATZ, guess=unknowns, options=options)
     off = ANSATZ.displacement(result.unknowns - unknowns, GRID.x[INNER], GRID.y[INNER])
     return float(np.sqrt(np.mean(off**2)) / GRID.pixel_size)
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.pair import CheckedImages
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Brightness
 from modeharvest.idic.solver.assembly import Assembly, residual
-from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.solver.final_smoothing import FinalSmoothing, smoothed_pair, speckle_size
 from modeharvest.idic.solver.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -25,7 +23,14 @@ from modeharvest.idic.solver.gauss_newton import (
     minimise,
 )
 from modeharvest.idic.solver.level_search import LevelSearch, step_length
-from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, level_pair
+from modeharvest.idic.solver.noise import NoiseTransfer
+from modeharvest.idic.solver.pyramid import FULL, Level, level_pair
+from modeharvest.idic.solver.residual_test import (
+    MOST_DECORRELATED,
+    autocorrelation,
+    decorrelated_fraction,
+    lags_for,
+)
 from modeharvest.idic.solver.weighting import (
     LEAST_BLUR_PX,
     Gradient,
@@ -34,15 +39,8 @@ from modeharvest.idic.solver.weighting import (
     best_blur,
     instrument,
 )
-from modeharvest.idic.uncertainty.noise import NoiseTransfer
-from modeharvest.idic.uncertainty.residual_test import (
-    MOST_DECORRELATED,
-    autocorrelation,
-    decorrelated_fraction,
-    lags_for,
-)
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.pair import checked_mask, location_of
+from modeharvest.imaging.pair import ImagePair, Truth, checked_mask, location_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -53,18 +51,16 @@ _FINE_PX = 6.5
 _EIGENVALUE_CUTOFF = 1e-3
 """On coarse levels, directions with an eigenvalue below this share of the largest one wait for
 the finest level: what a blur does to the images would send them into other valleys."""
-
-"""Blur of a gradient, rim of the material: wider than any ligament that speckle is seen on."""
+WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
+"""Outcomes with nothing to assess."""
 
 
 def correlate(
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    grid: PixelGrid,
+    pair: ImagePair,
     ansatz: Ansatz,
-    start: ArrayLike,
-    mask: ArrayLike | None = None,
-    deformed_mask: ArrayLike | None = None,
+    *,
+    strain: float | None = None,
+    guess: ArrayLike | None = None,
     options: CorrelationOptions | None = None,
     progress: Progress = silent,
 ) -> Result:
@@ -75,69 +71,112 @@ def correlate(
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels f and g.
-    grid
-        Where their pixels are.
+    pair
+        Of images. Without a mask every pixel counts; without a deformed mask g is taken as it is.
     ansatz
         The kinematics.
-    start
-        (size,) unknowns to start from; see :meth:`Ansatz.start`.
-    mask, deformed_mask
-        (rows, cols) True on material, in f and in g. Without a mask every pixel counts;
-        without a deformed mask g is taken as it is.
+    strain
+        Nominal compression along x that the initial guess has, see :meth:`Ansatz.initial_guess`
+        [-]; by default the pair's, or 0 where that isn't known.
+    guess
+        (size,) unknowns to begin with, instead.
     options
         How to correlate.
     progress
-        Told about every iteration.
+        Listener.
 
     Raises
     ------
     InputError
-        If sizes differ, a mask is empty, or an image holds NaN or is constant.
+        If both strain and guess are given, or the guess isn't one for the ansatz.
     """
     options = options or CorrelationOptions()
-    clock = _Clock()
-    images = CheckedImages.checked(reference, deformed, grid, mask, deformed_mask)
-    width_px = speckle_size(images.f, images.f_mask)
-    order = options.order or (5 if width_px >= _FINE_PX else 11)
-    a = before = _initial_gain_and_offset(ansatz, ansatz.checked(start), *images.grey)
-    clock.lap("check")
-    levels = _useful(options.levels, ansatz, grid)
+    clock, levels = _Clock(), options.levels
+    a = _with_gain_and_offset(ansatz, _initial_guess(pair, ansatz, strain, guess), pair)
+    smoothing: FinalSmoothing | None = None
     history: tuple[Iteration, ...] = ()
-    for k, level in enumerate(levels):
-        report = _reporter(progress, k, len(levels), options.gauss_newton)
-        search = _level_search(images, ansatz, level, level is levels[-1], order, options, report)
-        clock.lap(f"prepare level {level.factor}")
-        n = search.ansatz.size
-        before = np.append(search.better(a[:n], before[:n]), a[n:])
-        found, assembly = search.minimum(before[:n])
-        clock.lap(f"iterate level {level.factor}")
-        history += found.history
-        a = np.append(found.unknowns, a[n:])
-        if found.outcome in WITHOUT_RESULT:
-            break
-    result = assess(search.ansatz, search.pair, found, assembly, width_px)
-    clock.lap("judge the residual")
-    gradient = None if options.gradient is None else Gradient(options.gradient)
-    weighting = weighting_for(result, width_px, gradient, options.gradient_blur_px)
-    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
-    if level == FULL and result.outcome not in without and not weighting.is_least_squares:
-        weights = instrument(weighting, images, search.pair, assembly, found.unknowns)
-        found, how = search.reweighed(found, assembly, weights)
-        history += found.history
-        weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
-        result = assess(search.ansatz, search.pair, found, assembly, width_px, *weighted)
-        clock.lap("weigh anew")
-    progress(len(levels), len(levels), "correlate")
-    return replace(result, history=history, timings_s=clock.laps)
+    if options.final_smoothing_px is None and len(levels) > 1:
+        coarse = _useful(levels[:-1], ansatz, pair.grid)
+        steps = _Steps(progress, len(coarse) + 1, options.gauss_newton)
+        rough = _coarse_to_fine(pair, ansatz, a, coarse, options.order or 5, options, steps, clock)
+        binned = rough.search.pair.grid.pixel_size / pair.grid.pixel_size
+        found = make_result(rough.search.ansatz, rough.search.pair.grid, rough.found)
+        smoothing = FinalSmoothing.of(pair, binned * found.model_error_px)
+        a, history, levels = rough.unknowns, rough.found.history, levels[-1:]
+        steps = replace(steps, first=len(coarse))
+    else:
+        levels = _useful(levels, ansatz, pair.grid)
+        steps = _Steps(progress, len(levels), options.gauss_newton)
+        if options.final_smoothing_px:
+            smoothing = FinalSmoothing.given(pair, options.final_smoothing_px)
+    if smoothing is not None and smoothing.blur_px > 0.0:
+        pair = smoothed_pair(pair, smoothing.blur_px)
+        ansatz = replace(ansatz, brightness=Brightness())  # which local normalisation takes away
+    size_px = speckle_size(pair.reference, pair.mask)
+    order = options.order or (5 if size_px >= _FINE_PX else 11)
+    clock.lap("check")
+    reached = _coarse_to_fine(pair, ansatz, a[: ansatz.size], levels, order, options, steps, clock)
+    result, reweighted = _assessed(reached, pair, size_px, options, clock)
+    progress(steps.count, steps.count, "correlate")
+    history = (*history, *reached.found.history, *reweighted)
+    return replace(result, final_smoothing=smoothing, history=history, timings_s=clock.laps)
+
+
+def best_fit(
+    truth: Truth,
+    result: Result,
+    *,
+    guesses: Sequence[FloatArray] = (),
+    progress: Progress = silent,
+) -> Result:
+    """Fit a result's ansatz to the true displacement: what the measurement could find at best.
+
+    The best that is reached from the result and from other guesses. Which that is, and most of
+    the way there, is found on some tens of thousands of pixels: the ansatz is smooth, and its
+    minima are far apart.
+
+    Parameters
+    ----------
+    truth
+        Whose displacement counts where it isn't NaN.
+    result
+        The measurement, of the same pixels.
+    guesses
+        (n,) unknowns each, besides the result's.
+    progress
+        Listener.
+    """
+    grid, ansatz, displacement = result.grid, result.ansatz, truth.displacement
+    mask = np.isfinite(displacement[..., 0])
+    every = max(1, int(np.sqrt(mask.sum() / _ENOUGH)))
+    # As far from the first row and column as from the last: a symmetric field stays symmetric.
+    top, left = ((size - 1) % every // 2 for size in grid.shape)
+    few = np.s_[top::every, left::every]
+    rows, cols = mask[few].shape
+    (x,), (y,) = grid.to_mm([top], [left])
+    coarse = PixelGrid(rows, cols, every * grid.pixel_size, x, y)
+    reached = min(
+        (
+            fit_displacement(displacement[few], coarse, ansatz, a, mask[few], _CLOSE)
+            for a in (result.unknowns, *guesses)
+        ),
+        key=lambda fit: fit.residual_rms,
+    )
+    begin = np.append(reached.unknowns, result.unknowns[reached.unknowns.size :])
+    return fit_displacement(displacement, grid, ansatz, begin, mask, _CLOSE, progress)
+
+
+_ENOUGH = 40_000
+"""Pixels of material that tell one minimum of the best fit from another."""
+_CLOSE = GaussNewtonOptions(tolerance_px=1e-5)
+"""A tenth of a correlation's tolerance: the best fit is what that is measured by."""
 
 
 def fit_displacement(
     displacement: ArrayLike,
     grid: PixelGrid,
     ansatz: Ansatz,
-    start: ArrayLike,
+    guess: ArrayLike,
     mask: ArrayLike | None = None,
     options: GaussNewtonOptions | None = None,
     progress: Progress = silent,
@@ -152,14 +191,14 @@ def fit_displacement(
         (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
     grid
         Where the pixels are.
-    ansatz, start
-        The kinematics, and (size,) unknowns to start from.
+    ansatz, guess
+        The kinematics, and (size,) unknowns to begin with.
     mask
         (rows, cols) True where the displacement counts; everywhere by default.
     options
         Tolerances and limits.
     progress
-        Told about every iteration.
+        Listener.
 
     Returns
     -------
@@ -173,7 +212,7 @@ def fit_displacement(
     """
     options = options or GaussNewtonOptions()
     clock = _Clock()
-    start = ansatz.checked(start)
+    guess = ansatz.checked(guess)
     ansatz = replace(ansatz, brightness=Brightness())  # of which a displacement says nothing
     target = np.asarray(displacement, dtype=np.float64)
     if target.shape != (*grid.shape, 2):
@@ -189,17 +228,93 @@ def fit_displacement(
     found = minimise(
         lambda a, with_matrix: assembly.displacement(a, target, with_matrix),
         step_length(ansatz, grid, inside, 1),
-        start[: ansatz.size],
+        guess[: ansatz.size],
         options,
         options.tolerance_px,
-        on_iteration=_reporter(progress, 0, 1, options),
+        on_iteration=_Steps(progress, 1, options).on(0),
     )
     clock.lap("iterate")
     return replace(make_result(ansatz, grid, found), history=found.history, timings_s=clock.laps)
 
 
+def _initial_guess(
+    pair: ImagePair, ansatz: Ansatz, strain: float | None, guess: ArrayLike | None
+) -> FloatArray:
+    """The unknowns given, or those of a homogeneous strain."""
+    if guess is None:
+        known = pair.strain if strain is None else strain
+        return ansatz.initial_guess(0.0 if np.isnan(known) else known)
+    if strain is not None:
+        raise InputError("expected a strain or a guess of all unknowns, got both")
+    return ansatz.checked(guess)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reached:
+    """Where some levels have led.
+
+    Parameters
+    ----------
+    search, found, used
+        The last level, the minimum there with all levels' history, and its pixels.
+    unknowns
+        (size,) of the whole ansatz.
+    """
+
+    search: LevelSearch
+    level: Level
+    found: Minimum
+    used: Assembly
+    unknowns: FloatArray
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Reports progress; ``first`` of ``count`` levels are done."""
+
+    progress: Progress
+    count: int
+    options: GaussNewtonOptions
+    first: int = 0
+
+    def on(self, level: int) -> Callable[[int], None]:
+        """What is called with the number of each iteration on a level."""
+        most = self.options.max_iterations + 1
+        done = self.first + level
+        return lambda number: self.progress(done + number / most, self.count, "correlate")
+
+
+def _coarse_to_fine(
+    pair: ImagePair,
+    ansatz: Ansatz,
+    a: FloatArray,
+    levels: tuple[Level, ...],
+    order: int,
+    options: CorrelationOptions,
+    steps: _Steps,
+    clock: _Clock,
+) -> _Reached:
+    """Go through levels; on the last one all unknowns are sought, and found as closely as asked."""
+    before = a
+    history: tuple[Iteration, ...] = ()
+    for k, level in enumerate(levels):
+        search = _level_search(
+            pair, ansatz, level, level is levels[-1], order, options, steps.on(k)
+        )
+        clock.lap(f"prepare level {level.factor}")
+        n = search.ansatz.size
+        before = np.append(search.lower_cost(a[:n], before[:n]), a[n:])
+        found, used = search.minimum(before[:n])
+        clock.lap(f"iterate level {level.factor}")
+        history += found.history
+        a = np.append(found.unknowns, a[n:])
+        if found.outcome in WITHOUT_RESULT:
+            break
+    return _Reached(search, level, replace(found, history=history), used, a)
+
+
 def _level_search(
-    images: CheckedImages,
+    pair: ImagePair,
     ansatz: Ansatz,
     level: Level,
     finest: bool,
@@ -209,17 +324,16 @@ def _level_search(
 ) -> LevelSearch:
     """Prepare a level of the images, and what to look for there.
 
-    Coarse levels see images that are lit alike: what the brightness could absorb there is much
-    of the blurred speckle itself.
+    Where gain or offset are unknowns, coarse levels see locally normalised images: what the
+    brightness could absorb there is much of the blurred speckle itself.
     """
-    levelled = ansatz.brightness.size > 0 and not finest
-    pair = level_pair(
-        images.f, images.g, images.grid, images.f_mask, images.g_mask, level, options.edge_px,
-        order if level == FULL else min(order, 5), levelled,
-    )  # fmt: skip
+    normalised = ansatz.brightness.size > 0 and not finest
     coarse_px = options.gauss_newton.coarse_tolerance_px * level.factor
     return LevelSearch(
-        pair,
+        level_pair(
+            pair, level, options.edge_px, order if level == FULL else min(order, 5),
+            normalised=normalised,
+        ),
         ansatz if finest else replace(ansatz, brightness=Brightness()),
         level.factor,
         0.0 if finest else _EIGENVALUE_CUTOFF,
@@ -227,7 +341,7 @@ def _level_search(
         coarse_px,
         options.gauss_newton,
         report,
-    )
+    )  # fmt: skip
 
 
 def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple[Level, ...]:
@@ -242,35 +356,24 @@ def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple
     return (*(level for level in levels[:-1] if keeps(level)), levels[-1])
 
 
-def _reporter(
-    progress: Progress, level: int, levels: int, options: GaussNewtonOptions
-) -> Callable[[int], None]:
-    def report(number: int) -> None:
-        progress(level + number / (options.max_iterations + 1), levels, "correlate")
-
-    return report
-
-
-def _initial_gain_and_offset(
-    ansatz: Ansatz, start: FloatArray, f: NDArray[Any], g: NDArray[Any]
-) -> FloatArray:
-    """Start with a gain and an offset that give both images one mean and one contrast.
+def _with_gain_and_offset(ansatz: Ansatz, guess: FloatArray, pair: ImagePair) -> FloatArray:
+    """Begin with a gain and an offset that give both images one mean and one contrast.
 
     Far from the solution, where the images don't match yet, a fit would sooner wipe out the
-    contrast than find the displacement. A start that has gain or offset already is kept.
+    contrast than find the displacement. A guess that has gain or offset already is kept.
     """
     first = ansatz.phi_offset(len(ansatz.modes))
-    if start[first:].any():
-        return start
-    start, names = start.copy(), ansatz.names
+    if first == ansatz.size or guess[first:].any():
+        return guess
+    guess, names, (f, g) = guess.copy(), ansatz.names, pair.grey
     gain = 1.0
     if "gain[0,0]" in names:
         gain = float(f.std(dtype=np.float64) / g.std(dtype=np.float64))
-        start[names.index("gain[0,0]")] = gain - 1.0
+        guess[names.index("gain[0,0]")] = gain - 1.0
     if "offset[0,0]" in names:
         difference = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
-        start[names.index("offset[0,0]")] = float(difference)
-    return start
+        guess[names.index("offset[0,0]")] = float(difference)
+    return guess
 
 
 class _Clock:
@@ -286,20 +389,15 @@ class _Clock:
         self._last = now
 
 
-WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
-"""Outcomes with nothing to judge."""
-
-
 def make_result(
     ansatz: Ansatz, grid: PixelGrid, found: Minimum, how: Propagation | None = None
 ) -> Result:
-    """Make a result of a minimum, or of a root; of the residual it knows its size alone."""
+    """Make a result of a minimum, or of a root; of the residual it knows the size alone."""
     matrix = found.equations.matrix
     eigen = ScaledEigen.of(matrix if how is None else how.slope)
     inverse, weight = eigen.inverse(), matrix if how is None else how.weight
     if how is not None:
-        lost = np.isinf(np.diag(inverse))
-        known = np.where(lost[:, None] | lost[None, :], 0.0, inverse)
+        known, lost = determined_part(inverse)
         inverse = known @ weight @ known
         inverse[lost, lost] = np.inf
     constants = [ansatz.v0_slice(c).start for c in (0, 1)]
@@ -319,28 +417,53 @@ def make_result(
     )
 
 
-def assess(
-    ansatz: Ansatz,
-    pair: LevelPair,
-    found: Minimum,
-    used: Assembly,
-    width_px: float,
-    weighting: Weighting | None = None,
-    how: Propagation | None = None,
-) -> Result:
-    """Make a result of a minimum of a pair of images, and judge its residual.
+def _assessed(
+    reached: _Reached, pair: ImagePair, size_px: float, options: CorrelationOptions, clock: _Clock
+) -> tuple[Result, tuple[Iteration, ...]]:
+    """Test the residual, and move on to where another gradient weighs it, if it is to.
 
     Parameters
     ----------
-    ansatz, pair, found, used
-        Kinematics and images of a level, where the iteration ended there, and its pixels.
-    width_px
+    reached, pair
+        The least-squares minimum on the last level, and the whole images.
+    size_px
         Of the speckle [px].
-    weighting, how
-        What weighed the residual, and how its noise propagates; least squares by default.
+    options
+        How to correlate.
+    clock
+        Of the laps.
+
+    Returns
+    -------
+    result, history
+        The further steps alone.
     """
+    result = _result(reached, reached.found, size_px)
+    clock.lap("assess the residual")
+    weighting = _weighting(result, size_px, options)
+    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
+    if reached.level != FULL or result.outcome in without or weighting.is_least_squares:
+        return result, ()
+    search, used, found = reached.search, reached.used, reached.found
+    weights = instrument(weighting, pair, search.pair, used, found.unknowns)
+    found, how = search.reweighed(found, used, weights)
+    weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
+    result = _result(reached, found, size_px, *weighted)
+    clock.lap("reweight")
+    return result, found.history
+
+
+def _result(
+    reached: _Reached,
+    found: Minimum,
+    size_px: float,
+    weighting: Weighting | None = None,
+    how: Propagation | None = None,
+) -> Result:
+    """Make a result with its residual test; by default that of least squares."""
+    ansatz, pair, used = reached.search.ansatz, reached.search.pair, reached.used
     left = residual(used, found.unknowns, pair.reference, pair.deformed)
-    lost, lags_px = decorrelated_fraction(pair.reference, left), lags_for(width_px)
+    lost, lags_px = decorrelated_fraction(pair.reference, left), lags_for(size_px)
     if lost > MOST_DECORRELATED and found.outcome not in WITHOUT_RESULT:
         found = replace(found, outcome=Outcome.LOCAL_MINIMUM)
     order = pair.deformed.order
@@ -351,33 +474,26 @@ def assess(
         residual_correlation=autocorrelation(left, lags_px),
         residual_lags_px=lags_px,
         decorrelated_fraction=lost,
-        weighting=weighting or Weighting(width_px=width_px),
+        weighting=weighting or Weighting(speckle_size_px=size_px),
     )
 
 
-def weighting_for(
-    result: Result, width_px: float, gradient: Gradient | None, blur_px: float | None
-) -> Weighting:
-    """Choose what is to weigh the residual.
+def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> Weighting:
+    """What is to weigh the residual: as specified, or as the noise asks for.
 
-    Parameters
-    ----------
-    result
-        The least-squares minimum.
-    width_px
-        Of the speckle [px].
-    gradient, blur_px
-        As specified; None is as the noise asks for, if the residual is noise, and otherwise the
-        deformed image's gradient, and no blur.
+    The reference's gradient if the residual is noise, blurred as makes the unknowns' variance
+    smallest; otherwise the deformed image's.
     """
-    is_noise = result.residual_test().is_white
-    if gradient is None:
+    is_noise, blur_px = result.residual_test().is_white, options.gradient_blur_px
+    if options.gradient is not None:
+        gradient = Gradient(options.gradient)
+    else:
         gradient = Gradient.REFERENCE if is_noise else Gradient.DEFORMED
     if blur_px is None:
-        blur_px = best_blur(result.noise_to_slope, width_px, result.order) if is_noise else 0.0
-        if is_noise and width_px < _FINEST_PX:
+        blur_px = best_blur(result.noise_to_slope, size_px, result.order) if is_noise else 0.0
+        if is_noise and size_px < _FINEST_PX:
             blur_px = max(blur_px, LEAST_BLUR_PX)
-    return Weighting(gradient, blur_px, width_px)
+    return Weighting(gradient, blur_px, size_px)
 
 
 _FINEST_PX = 4.0

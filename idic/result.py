@@ -11,20 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.solver.final_smoothing import FinalSmoothing
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
+from modeharvest.idic.solver.residual_test import LAGS_PX, ResidualTest
 from modeharvest.idic.solver.weighting import Gradient, Weighting
-from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer, slope_noise
-from modeharvest.idic.uncertainty.residual_test import LAGS_PX, ResidualTest
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, write_json
 
-FORMAT = "modeharvest-result-4"
+FORMAT = "modeharvest-result-5"
 
 _MOST_NOISE = 0.8
 """Of a mean square slope no more is taken for noise: where noise is all there is, the estimate of
@@ -67,8 +68,8 @@ class Result:
     residual_lags_px
         How far apart it was taken [px].
     decorrelated_fraction
-        Share of the image in which f and g(x + u) have little to do with each other [-]; above
-        0.1 the outcome is TRAPPED. NaN for a fit to a displacement.
+        Of the image, where f and g(x + u) have little to do with each other [-]; above 0.1 the
+        outcome is LOCAL_MINIMUM. NaN for a fit to a displacement.
     weighting
         Which gradient weighed the residual.
     slope_square, weight_square
@@ -78,6 +79,8 @@ class Result:
         What of the deformed image's noise reaches the residual.
     order
         Of the spline.
+    final_smoothing
+        Of the images on the finest level; None where there was none to choose.
     """
 
     ansatz: Ansatz
@@ -99,6 +102,7 @@ class Result:
     weight_square: float = 0.0
     noise_transfer: NoiseTransfer = field(default_factory=NoiseTransfer)
     order: int = 5
+    final_smoothing: FinalSmoothing | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unknowns", self.ansatz.checked(self.unknowns))
@@ -125,6 +129,12 @@ class Result:
         """Names of the unknowns that the images say nothing about."""
         lost = np.isinf(np.diag(self.inverse))
         return tuple(name for name, is_lost in zip(self.names, lost, strict=True) if is_lost)
+
+    @property
+    def model_error_px(self) -> float:
+        """Estimate, rms per component: residual over rms gradient [px of :attr:`grid`]."""
+        gradient = np.sqrt(2.0 * self.slope_square)
+        return float(self.residual_rms / gradient) if gradient else np.inf
 
     @property
     def noise_sd(self) -> float:
@@ -218,29 +228,6 @@ class Result:
         """(n,): square roots of the diagonal of :meth:`covariance`."""
         return np.sqrt(np.diag(self.covariance(noise)))
 
-    def displacement_sd(
-        self, x: ArrayLike, y: ArrayLike, noise: ImageNoise | float | None = None
-    ) -> FloatArray:
-        """(..., 2): predicted standard deviation of u_x and u_y [mm] at positions [mm].
-
-        Infinite where it depends on unknowns that the images say nothing about.
-
-        Parameters
-        ----------
-        x, y
-            Positions that broadcast together, or two axes; for maps take every tenth pixel or
-            so: it is as smooth as the ansatz.
-        noise
-            As for :meth:`covariance`.
-        """
-        S = self.ansatz.sensitivities(self.unknowns, x, y)
-        covariance = self.covariance(noise)
-        lost = np.isinf(np.diag(covariance))
-        covariance[np.ix_(lost, lost)] = 0.0
-        variance = np.einsum("...n,nm,...m->...", S, covariance, S, optimize=True)
-        touched = np.any(S[..., lost] != 0.0, axis=-1)
-        return np.asarray(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
-
     def mode_parameters(self, i: int = 0) -> FloatArray:
         """(m,): the parameters of the mode number i (from 0)."""
         return self.unknowns[self.ansatz.phi_slice(i)]
@@ -265,30 +252,25 @@ class Result:
         """(rows, cols, 2): v_i phi_i of the mode number i (from 0) [mm]."""
         return self.ansatz.fluctuation(i, self.unknowns, *_axes(grid or self.grid))
 
-    def residual(
-        self, reference: NDArray[Any], deformed: NDArray[Any], order: int = 5
-    ) -> FloatArray:
+    def residual(self, pair: ImagePair, order: int = 5) -> FloatArray:
         """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN off the image.
 
         Gain and offset are applied to g if they were unknowns.
 
         Parameters
         ----------
-        reference, deformed
-            (rows, cols) f and g, on :attr:`grid`.
+        pair
+            Of images on :attr:`grid`.
         order
             Of the spline.
         """
-        if reference.shape != self.grid.shape or deformed.shape != self.grid.shape:
-            raise InputError(
-                f"expected two images of {self.grid.shape} px, got {reference.shape} and "
-                f"{deformed.shape}"
-            )
+        if pair.grid.shape != self.grid.shape:
+            raise InputError(f"expected images of {self.grid.shape} px, got {pair.grid.shape}")
         u = self.displacement() / self.grid.pixel_size
         row, col = np.indices(self.grid.shape)
-        value, _, _ = SplineImage.of(deformed, order).sample(row - u[..., 1], col + u[..., 0])
+        value, _, _ = SplineImage.of(pair.deformed, order).sample(row - u[..., 1], col + u[..., 0])
         gain, offset = self.ansatz.gain_and_offset(self.unknowns, *_axes(self.grid))
-        return np.asarray(reference - gain * value - offset)
+        return np.asarray(pair.reference - gain * value - offset)
 
     def write(self, path: Path | str) -> None:
         """Write JSON, atomically; every number comes back as it was."""
@@ -308,13 +290,19 @@ class Result:
             return cls(**result_fields(read_record(path, FORMAT, what, remedy)))
 
 
+def determined_part(matrix: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """A covariance with zeros for what is undetermined, and (n,) what that is."""
+    lost = np.isinf(np.diag(matrix))
+    return np.where(lost[:, None] | lost[None, :], 0.0, matrix), lost
+
+
 def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
     return grid.x, grid.y
 
 
 def result_to_dict(result: Result) -> dict[str, Any]:
     """Everything a result holds, and what it means in words."""
-    weighting = result.weighting
+    weighting, smoothing = result.weighting, result.final_smoothing
     return {
         "outcome": result.outcome.value,
         "explanation": result.outcome.explanation,
@@ -331,13 +319,14 @@ def result_to_dict(result: Result) -> dict[str, Any]:
         "weighting": {
             "gradient": weighting.gradient.value,
             "blur_px": weighting.blur_px,
-            "width_px": _finite(weighting.width_px),
+            "speckle_size_px": _finite(weighting.speckle_size_px),
             "explanation": weighting.sentence,
         },
         "slope_square": _finite(result.slope_square),
         "weight_square": _finite(result.weight_square),
         "noise_transfer": vars(result.noise_transfer),
         "order": result.order,
+        "final_smoothing": smoothing and {k: _finite(v) for k, v in vars(smoothing).items()},
         "grid": vars(result.grid),
         "ansatz": ansatz_to_dict(result.ansatz),
         "inverse": [[_finite(float(v)) for v in row] for row in result.inverse],
@@ -346,7 +335,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
 
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
-    weighting = content["weighting"]
+    weighting, smoothing = content["weighting"], content["final_smoothing"]
     plain = ("pixels", "outside_image", "order")
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
     return {
@@ -368,8 +357,10 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
         "weighting": Weighting(
             Gradient(weighting["gradient"]),
             weighting["blur_px"],
-            _or(np.inf, weighting["width_px"]),
+            _or(np.inf, weighting["speckle_size_px"]),
         ),
+        "final_smoothing": smoothing
+        and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),
     }
 
 

@@ -42,6 +42,10 @@ class CorrelationOptions:
         Blur of the image that this gradient is taken of, on the finest level [px]. By default
         none, unless the residual is noise: then the blur that makes the unknowns' variance
         smallest.
+    final_smoothing_px
+        Blur of both images, locally normalised [px]; None for as the model error on the last
+        coarse level asks for, which is how photographs are correlated, and then on the finest
+        level alone. See :mod:`modeharvest.idic.solver.final_smoothing`.
     """
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
@@ -50,6 +54,7 @@ class CorrelationOptions:
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
     gradient: str | None = None
     gradient_blur_px: float | None = None
+    final_smoothing_px: float | None = 0.0
 
     def __post_init__(self) -> None:
         known = [gradient.value for gradient in Gradient]
@@ -58,6 +63,10 @@ class CorrelationOptions:
             raise InputError(
                 f"expected a gradient among {known} and a blur of it of 0 to {_WIDEST_PX} px, got "
                 f"{self.gradient!r} and {self.gradient_blur_px}"
+            )
+        if not 0.0 <= (self.final_smoothing_px or 0.0) <= _WIDEST_PX:
+            raise InputError(
+                f"expected a final smoothing of 0 to {_WIDEST_PX} px, got {self.final_smoothing_px}"
             )
         if not self.levels:
             raise InputError("expected at least one level from coarse to fine, got none")
@@ -113,7 +122,7 @@ class PhotographOptions(AnsatzOptions):
 
     def options(self) -> CorrelationOptions:
         """How to correlate."""
-        return CorrelationOptions(edge_px=self.edge_px, order=self.order)
+        return CorrelationOptions(edge_px=self.edge_px, order=self.order, final_smoothing_px=None)
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,16 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size
-from modeharvest.idic.uncertainty.identifiability import identifiability
-from modeharvest.idic.uncertainty.residual_test import (
+from modeharvest.idic.solver.residual_test import (
     LAGS_PX,
     ResidualTest,
     autocorrelation,
     decorrelated_fraction,
     lags_for,
 )
+from modeharvest.idic.uncertainty.covariance import field_errors
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.errors import InputError
@@ -40,7 +42,9 @@ def noisy(v0_degree: int = 5) -> Result:
     ansatz = replace(ansatz, v0_degree=v0_degree)
     noise = NOISE * np.random.default_rng(5).normal(size=(2, *GRID.shape))
     return correlate(
-        f + noise[0], g + noise[1], GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK
+        ImagePair(f + noise[0], g + noise[1], GRID, MASK),
+        ansatz,
+        guess=ansatz.initial_guess(STRAIN, 1.0),
     )
 
 
@@ -56,7 +60,7 @@ def test_a_wrong_noise_is_recognised() -> None:
     test = noisy().residual_test(1.3 * NOISE)
     assert test.is_white
     assert not test.is_predicted
-    assert "not what it is said to be" in test.sentence
+    assert "not the given one" in test.sentence
 
 
 def test_a_displacement_that_the_ansatz_lacks_is_recognised_without_knowing_the_noise() -> None:
@@ -137,7 +141,7 @@ def test_standard_deviation_of_the_displacement_is_the_covariance_through_the_se
     None
 ):
     result = noisy()
-    sd = result.displacement_sd(GRID.x[::40], GRID.y[::40], NOISE)
+    sd = field_errors(result, GRID.x[::40], GRID.y[::40], result.covariance(NOISE)).displacement
     S = result.ansatz.sensitivities(result.unknowns, GRID.x[None, ::40], GRID.y[::40, None])
     half = np.linalg.cholesky(result.covariance(NOISE))
     np.testing.assert_allclose(sd, np.linalg.norm(S @ half, axis=-1), rtol=1e-6)
@@ -180,7 +184,7 @@ def test_without_a_pattern_the_mode_is_said_to_be_unobservable() -> None:
     f, g = manufactured.image_pair(manufactured.speckle(), cubic, truth)
     low = replace(ansatz, v0_degree=1, v_degree=0)
     mask = manufactured.inner_mask(0.1)
-    result = correlate(f, g, GRID, low, low.initial_guess(0.03, 0.1), mask)
+    result = correlate(ImagePair(f, g, GRID, mask), low, guess=low.initial_guess(0.03, 0.1))
     seen = identifiability(result, mask)
     assert seen.unobservable == (0,)
     assert "phi1 is not observable" in seen.warnings[0]
@@ -198,7 +202,8 @@ def test_unknowns_without_information_are_named() -> None:
     seen = identifiability(still, MASK)
     assert seen.undetermined == still.names[-7:]
     assert "nothing about 7 unknowns: phi1.a1" in seen.warnings[-1]
-    assert np.isfinite(still.displacement_sd(GRID.x[::80], GRID.y[::80])).all()  # v1 is 0 there
+    errors = field_errors(still, GRID.x[::80], GRID.y[::80], still.covariance())
+    assert np.isfinite(errors.displacement).all()  # v1 is 0 there
 
 
 def test_mask_of_another_size() -> None:

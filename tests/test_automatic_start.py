@@ -49,10 +49,7 @@ def start_of(images: ImageSet, strain: float, **more: object) -> InitialGuess:
 
 
 def correlated(images: ImageSet, strain: float, ansatz, unknowns):
-    return correlate(
-        images.reference(), images.deformed(strain), images.grid, ansatz, unknowns,
-        images.mask(), images.deformed_mask(strain),
-    )  # fmt: skip
+    return correlate(images.pair(strain), ansatz, guess=unknowns)
 
 
 def fluctuation(start: InitialGuess, points: np.ndarray) -> np.ndarray:
@@ -112,9 +109,11 @@ def test_hole_centres_are_used_and_strays_set_aside(images: ImageSet) -> None:
     assert len(centres) == 60
     x, y = np.meshgrid(grid.x, grid.y)
     u = np.array(
-        [np.nanmean(images.truth(0.128).displacement[np.hypot(x - a, y - b) < 0.9], axis=0)
-         for a, b in centres]
-    )  # fmt: skip
+        [
+            np.nanmean(images.truth(0.128).displacement[np.hypot(x - a, y - b) < 0.9], axis=0)
+            for a, b in centres
+        ]
+    )
     u[7] += 3.0  # a hole taken for another
     u[9] = np.nan
     domain = Box.centred(15.2, 20.8)

@@ -18,6 +18,7 @@ from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Brightness
 from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -43,7 +44,7 @@ def lit_differently() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 def found(brightness: Brightness) -> Result:
     f, g, _, _ = lit_differently()
     ansatz = replace(case()[0], brightness=brightness)
-    return correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    return correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
 
 
 def test_slowly_varying_gain_and_offset_are_recovered() -> None:
@@ -62,7 +63,7 @@ def test_slowly_varying_gain_and_offset_are_recovered() -> None:
         *("offset[2,0]", "offset[1,1]", "offset[0,2]"),
     )
     f, g, _, _ = lit_differently()
-    inside = np.abs(result.residual(f, g))[MASK]
+    inside = np.abs(result.residual(ImagePair(f, g, GRID)))[MASK]
     assert np.sqrt((inside**2).mean()) == pytest.approx(result.residual_rms, abs=3e-7)
 
 
@@ -75,7 +76,7 @@ def test_left_out_they_spoil_the_displacement() -> None:
 def test_asked_for_without_need_they_are_one_and_zero() -> None:
     ansatz, truth, f, g = case()
     ansatz = replace(ansatz, brightness=Brightness(0, 0))
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
     np.testing.assert_allclose(result.unknowns[-2:], 0.0, atol=1e-6)
     assert error_px(result, np.concatenate([truth, [0.0, 0.0]])) < 1e-5
 

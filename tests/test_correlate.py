@@ -20,6 +20,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level, eroded
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -64,7 +65,7 @@ def noisy(images: Images) -> Images:
 
 @pytest.fixture(scope="module")
 def found(images: Images, ansatz: Ansatz) -> Result:
-    return correlate(*images, GRID, ansatz, ansatz.initial_guess(0.03), MASK)
+    return correlate(ImagePair(*images, GRID, MASK), ansatz, guess=ansatz.initial_guess(0.03))
 
 
 def test_manufactured_ansatz_is_recovered(found: Result, ansatz: Ansatz) -> None:
@@ -83,7 +84,7 @@ def test_two_modes_are_recovered() -> None:
     a = truth(ansatz)
     f, g = manufactured.image_pair(CosinePattern.random(1), ansatz, a)
     mask = manufactured.inner_mask()
-    found = correlate(f, g, GRID, ansatz, near(ansatz), mask)
+    found = correlate(ImagePair(f, g, GRID, mask), ansatz, guess=near(ansatz))
     assert found.outcome is Outcome.CONVERGED
     true = ansatz.displacement(a, GRID.x, GRID.y)
     # The kinks of two tapers are too dense to be left out: the spline is off by up to 1e-3 of
@@ -96,7 +97,7 @@ def test_history_and_sums_are_consistent(found: Result, images: Images) -> None:
     assert found.history[-1].step_px <= GaussNewtonOptions().tolerance_px
     assert found.iterations == sum(s.factor == 1 for s in found.history)
     assert found.pixels == eroded(MASK, CorrelationOptions().edge_px).sum()
-    residual = found.residual(*images)[eroded(MASK, 3)]
+    residual = found.residual(ImagePair(*images, GRID))[eroded(MASK, 3)]
     # The kernel's own f and g are stored in float32: 6e-8 of the grey levels each.
     assert np.sqrt((residual**2).mean()) == pytest.approx(found.residual_rms, abs=3e-7)
     assert found.undetermined == ()
@@ -123,11 +124,11 @@ def test_damaged_result_file(found: Result, tmp_path: Path) -> None:
     path.write_text(path.read_text()[:-300])
     with pytest.raises(InputError, match="JSON"):
         Result.read(path)
-    path.write_text('{"format": "modeharvest-result-4"}')
+    path.write_text('{"format": "modeharvest-result-5"}')
     with pytest.raises(InputError, match="complete"):
         Result.read(path)
     path.write_text('{"format": "other"}')
-    with pytest.raises(InputError, match="modeharvest-result-4"):
+    with pytest.raises(InputError, match="modeharvest-result-5"):
         Result.read(path)
 
 
@@ -139,7 +140,10 @@ def test_covariance_against_monte_carlo(images: Images, ansatz: Ansatz) -> None:
     for _ in range(runs):
         noise = sd * rng.normal(size=(2, *f.shape))
         found = correlate(
-            f + noise[0], g + noise[1], GRID, ansatz, truth(ansatz), MASK, options=options
+            ImagePair(f + noise[0], g + noise[1], GRID, MASK),
+            ansatz,
+            guess=truth(ansatz),
+            options=options,
         )
         errors.append(found.unknowns - truth(ansatz))
     covariance = found.covariance(sd)
@@ -158,8 +162,10 @@ def test_covariance_against_monte_carlo(images: Images, ansatz: Ansatz) -> None:
 def test_grey_levels_do_not_matter(noisy: Images, ansatz: Ansatz) -> None:
     f, g = noisy
     start = truth(ansatz)
-    plain = correlate(f, g, GRID, ansatz, start, MASK, options=FINE_ONLY)
-    scaled = correlate(60 * f + 128, 60 * g + 128, GRID, ansatz, start, MASK, options=FINE_ONLY)
+    plain = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start, options=FINE_ONLY)
+    scaled = correlate(
+        ImagePair(60 * f + 128, 60 * g + 128, GRID, MASK), ansatz, guess=start, options=FINE_ONLY
+    )
     # float32 keeps 128 + 60 f to 1e-5, i.e. f to 2e-7: far below the tolerance of 1e-4 px.
     assert rms_px(plain.displacement(), scaled.displacement()) < 1e-5
     assert scaled.residual_rms == pytest.approx(60 * plain.residual_rms, rel=1e-5)
@@ -167,8 +173,10 @@ def test_grey_levels_do_not_matter(noisy: Images, ansatz: Ansatz) -> None:
 
 def test_mirror_of_both_images(noisy: Images, ansatz: Ansatz) -> None:
     f, g = noisy
-    plain = correlate(f, g, GRID, ansatz, near(ansatz), MASK)
-    mirrored = correlate(f[:, ::-1], g[:, ::-1], GRID, ansatz, near(ansatz), MASK[:, ::-1])
+    plain = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=near(ansatz))
+    mirrored = correlate(
+        ImagePair(f[:, ::-1], g[:, ::-1], GRID, MASK[:, ::-1]), ansatz, guess=near(ansatz)
+    )
     back = mirrored.displacement()[:, ::-1] * [-1, 1]
     assert rms_px(back, plain.displacement()) < 2e-4  # twice the tolerance of the iteration
     assert mirrored.residual_rms == pytest.approx(plain.residual_rms, rel=1e-6)
@@ -183,8 +191,8 @@ def test_transpose_of_both_images(noisy: Images, ansatz: Ansatz) -> None:
     start = turned.initial_guess(0.0, 0.8)
     start[turned.v0_slice(1)][2] = -0.03 * turned.domain.half[1]  # now compressed along y
     grid = PixelGrid.centred(GRID.cols, GRID.rows, PIXEL)
-    plain = correlate(f, g, GRID, ansatz, near(ansatz), MASK)
-    other = correlate(f.T, g.T, grid, turned, start, MASK.T)
+    plain = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=near(ansatz))
+    other = correlate(ImagePair(f.T, g.T, grid, MASK.T), turned, guess=start)
     back = -np.swapaxes(other.displacement(), 0, 1)[..., ::-1]
     assert rms_px(back, plain.displacement()) < 2e-4
 
@@ -226,19 +234,19 @@ def test_holes_are_kept_out_of_blur_and_sampling(images: Images, ansatz: Ansatz)
 
     mask, g_mask = solid(x, y) & MASK, solid(origin[..., 0], origin[..., 1])
     f, g = (np.where(m, im, -9.0) for m, im in zip((mask, g_mask), images, strict=True))
-    found = correlate(f, g, GRID, ansatz, ansatz.initial_guess(0.03), mask, g_mask)
+    found = correlate(ImagePair(f, g, GRID, mask, g_mask), ansatz, guess=ansatz.initial_guess(0.03))
     assert found.outcome is Outcome.CONVERGED
     # Grey level -9 is 13 sd away. 3 px from a hole's edge the smooth continuation behind it
     # still rings by about 0.43^3 of a misfit below 1 sd, for one pixel in ten.
     assert rms_px(found.displacement(), true, mask) < 0.02
-    naive = correlate(f, g, GRID, ansatz, truth(ansatz), options=FINE_ONLY)
+    naive = correlate(ImagePair(f, g, GRID), ansatz, guess=truth(ansatz), options=FINE_ONLY)
     assert rms_px(naive.displacement(), true, mask) > rms_px(found.displacement(), true, mask)
 
 
 def test_start_far_outside_the_image_is_an_outcome(images: Images, ansatz: Ansatz) -> None:
     start = ansatz.initial_guess()
     start[0] = 2.0  # 200 of 320 px
-    found = correlate(*images, GRID, ansatz, start, MASK)
+    found = correlate(ImagePair(*images, GRID, MASK), ansatz, guess=start)
     assert found.outcome is Outcome.OUTSIDE_IMAGE
     np.testing.assert_array_equal(found.unknowns, start)
 
@@ -253,17 +261,17 @@ def test_bad_input_is_named(images: Images, ansatz: Ansatz) -> None:
     f, g = images
     start = ansatz.initial_guess()
     with pytest.raises(InputError, match=r"deformed image of 360 x 320.*\(359, 320\)"):
-        correlate(f, g[1:], GRID, ansatz, start)
+        correlate(ImagePair(f, g[1:], GRID), ansatz, guess=start)
     with pytest.raises(InputError, match=r"reference image, got NaN.*2 px.*row 7, column 9"):
-        correlate(spoiled(f), g, GRID, ansatz, start)
+        correlate(ImagePair(spoiled(f), g, GRID), ansatz, guess=start)
     with pytest.raises(InputError, match="mask of 360 x 320"):
-        correlate(f, g, GRID, ansatz, start, MASK[1:])
+        correlate(ImagePair(f, g, GRID, MASK[1:]), ansatz, guess=start)
     with pytest.raises(InputError, match="deformed mask, got one that is False everywhere"):
-        correlate(f, g, GRID, ansatz, start, MASK, np.zeros_like(MASK))
+        correlate(ImagePair(f, g, GRID, MASK, np.zeros_like(MASK)), ansatz, guess=start)
     with pytest.raises(InputError, match="constant grey level"):
-        correlate(f, np.full(GRID.shape, 3.0), GRID, ansatz, start)
+        correlate(ImagePair(f, np.full(GRID.shape, 3.0), GRID), ansatz, guess=start)
     with pytest.raises(InputError, match="expected 77 unknowns"):
-        correlate(f, g, GRID, ansatz, np.zeros(5))
+        correlate(ImagePair(f, g, GRID), ansatz, guess=np.zeros(5))
     u = np.zeros((*GRID.shape, 2))
     with pytest.raises(InputError, match="displacement of shape"):
         fit_displacement(u[1:], GRID, ansatz, start)

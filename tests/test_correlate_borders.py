@@ -17,6 +17,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -67,11 +68,15 @@ def test_without_those_that_land_at_the_border_the_error_is_that_of_float_images
 ) -> None:
     """A spline feels the border by 0.43 a pixel: 1e-4 of it are left after 10 px."""
     mask = landing() > 10
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), mask)
+    found = correlate(
+        ImagePair(*images(seed), GRID, mask), ANSATZ, guess=ANSATZ.initial_guess(STRAIN)
+    )
     assert found.outcome is Outcome.CONVERGED
     assert found.outside_image == 0
     assert error_px(found.displacement(), mask) < 1e-4  # GaussNewtonOptions.tolerance_px
-    tight = correlate(*images(seed), GRID, ANSATZ, found.unknowns, mask, options=TIGHT)
+    tight = correlate(
+        ImagePair(*images(seed), GRID, mask), ANSATZ, guess=found.unknowns, options=TIGHT
+    )
     assert error_px(tight.displacement(), mask) < FLOAT_PX
 
 
@@ -82,7 +87,9 @@ def test_a_strip_that_leaves_the_image_does_not_pull(seed: int) -> None:
     Pixels that land within 8 px of the border would be sampled from a spline that feels the
     mirror image beyond it: with them the displacement was off by 4e-3 to 5e-3 px.
     """
-    found = correlate(*images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), options=TIGHT)
+    found = correlate(
+        ImagePair(*images(seed), GRID), ANSATZ, guess=ANSATZ.initial_guess(STRAIN), options=TIGHT
+    )
     assert found.outcome is Outcome.CONVERGED
     left, at_border = landing() < 0, (landing() >= 0) & (landing() < 7.5)
     assert 0.05 * GRID.rows * GRID.cols < left.sum()
@@ -104,7 +111,7 @@ def test_what_is_behind_a_mask_is_never_looked_at(seed: int) -> None:
                           else rng.normal(size=GRID.shape) for _ in range(2))  # fmt: skip
         filled = np.where(f_mask, f, f_rest), np.where(g_mask, g, g_rest)
         start = ANSATZ.initial_guess(STRAIN)
-        found.append(correlate(*filled, GRID, ANSATZ, start, f_mask, g_mask))
+        found.append(correlate(ImagePair(*filled, GRID, f_mask, g_mask), ANSATZ, guess=start))
     for other in found[1:]:
         np.testing.assert_array_equal(other.unknowns, found[0].unknowns)
         np.testing.assert_array_equal(other.inverse, found[0].inverse)
@@ -120,7 +127,9 @@ def test_holes_of_another_grey_level_do_not_pull(seed: int) -> None:
     errors = {}
     for edge_px in (2, 6, 10):
         options = CorrelationOptions(TIGHT.levels, edge_px, 5, TIGHT.gauss_newton)
-        found = correlate(f, g, GRID, ANSATZ, truth(), f_mask, g_mask, options)
+        found = correlate(
+            ImagePair(f, g, GRID, f_mask, g_mask), ANSATZ, guess=truth(), options=options
+        )
         errors[edge_px] = error_px(found.displacement(), f_mask)
     assert errors[2] < 0.02
     # From pixels at least edge_px - 1 from a hole in g to those 4 px farther: 0.43^4 = 0.034.

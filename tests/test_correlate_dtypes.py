@@ -24,6 +24,7 @@ from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.solver.passes import accumulate
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 
 FloatArray = NDArray[np.float64]
 Array = NDArray[Any]
@@ -52,7 +53,9 @@ def mask() -> NDArray[np.bool_]:
 
 def correlated(f: Array, g: Array, f_mask: Array | None = None) -> Result:
     f_mask = mask() if f_mask is None else f_mask
-    return correlate(f, g, GRID, ANSATZ, ANSATZ.initial_guess(STRAIN), f_mask, f_mask)
+    return correlate(
+        ImagePair(f, g, GRID, f_mask, f_mask), ANSATZ, guess=ANSATZ.initial_guess(STRAIN)
+    )
 
 
 @cache
@@ -160,7 +163,7 @@ def test_nothing_is_written_into_what_was_given(dtype: str) -> None:
     f, g = (image.astype(dtype) for image in images())
     given = f, g, mask().copy(), ANSATZ.initial_guess(STRAIN)
     before = [array.copy() for array in given]
-    correlate(f, g, GRID, ANSATZ, given[3], given[2], given[2])
+    correlate(ImagePair(f, g, GRID, given[2], given[2]), ANSATZ, guess=given[3])
     for array, copy in zip(given, before, strict=True):
         np.testing.assert_array_equal(array, copy)
 
@@ -187,7 +190,7 @@ def test_images_of_64_px(rows: int) -> None:
     f, g = manufactured.image_pair(manufactured.speckle(rows, grid), ansatz, truth, grid)
     inner = np.zeros(grid.shape, dtype=np.bool_)
     inner[12:-12, 12:-12] = True
-    found = correlate(f, g, grid, ansatz, ansatz.initial_guess(), inner)
+    found = correlate(ImagePair(f, g, grid, inner), ansatz, guess=ansatz.initial_guess())
     assert found.outcome is Outcome.CONVERGED
     assert {step.factor for step in found.history} == {2, 1}
     u = ansatz.displacement(truth, grid.x, grid.y)
@@ -208,7 +211,11 @@ def test_a_pixel_more_on_the_margin_changes_nothing() -> None:
         wide = np.pad(mask(), width)
         options = CorrelationOptions(levels=(Level(1, 0.0),))
         start = expected().unknowns
-        found = correlate(*framed, grid, ANSATZ, start, wide, wide, options)
-        alone = correlate(f, g, GRID, ANSATZ, start, mask(), mask(), options)
+        found = correlate(
+            ImagePair(*framed, grid, wide, wide), ANSATZ, guess=start, options=options
+        )
+        alone = correlate(
+            ImagePair(f, g, GRID, mask(), mask()), ANSATZ, guess=start, options=options
+        )
         # float32 coefficients, rounded differently: 1e-7 of 255 over a slope of 10 per px.
         np.testing.assert_allclose(found.unknowns, alone.unknowns, atol=1e-5 * PIXEL)

@@ -18,9 +18,10 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import Level
-from modeharvest.idic.uncertainty.noise import ImageNoise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 
 FloatArray = NDArray[np.float64]
 
@@ -31,14 +32,16 @@ def test_a_kink_where_the_taper_ends_costs_little() -> None:
     ansatz = manufactured.one_mode()
     truth = disturbed(ansatz, 1.5)
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-3
 
 
 def test_cubic_and_quintic_agree_to_the_error_of_the_cubic() -> None:
     ansatz, truth, f, g = case()
-    cubic = correlate(f, g, GRID, ansatz, truth, MASK, options=CorrelationOptions(order=3))
+    cubic = correlate(
+        ImagePair(f, g, GRID, MASK), ansatz, guess=truth, options=CorrelationOptions(order=3)
+    )
     # A cubic is off by 6e-5 of full scale on this speckle, whose gradient is 0.05 per px rms.
     assert 1e-6 < error_px(cubic, truth) < 2e-3
 
@@ -46,7 +49,9 @@ def test_cubic_and_quintic_agree_to_the_error_of_the_cubic() -> None:
 def test_8_bit_images_are_as_good_as_quantisation_allows() -> None:
     ansatz, truth, f, g = case()
     f8, g8 = np.round(255 * f), np.round(255 * g)
-    result = correlate(f8, g8, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(
+        ImagePair(f8, g8, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0)
+    )
     assert result.outcome is Outcome.CONVERGED
     # Mean square error of the displacement: a quadratic form of Gaussian unknowns, with mean
     # tr(K) and variance 2 tr(K^2); 4 standard deviations leave 1 in 10^4.
@@ -71,14 +76,17 @@ def test_covariance_against_monte_carlo(in_f: int, in_g: int) -> None:
     f, g = manufactured.image_pair(manufactured.speckle(2, SMALL), ansatz, truth, SMALL)
     options = CorrelationOptions(levels=(Level(1, 0.0),))
     mask = np.pad(np.ones((110, 100), dtype=np.bool_), 20)
-    clean = correlate(f, g, SMALL, ansatz, truth, mask, options=options)
+    clean = correlate(ImagePair(f, g, SMALL, mask), ansatz, guess=truth, options=options)
     covariance = clean.covariance(ImageNoise(in_f * NOISE, in_g * NOISE))
     rng = np.random.default_rng(7)
     found, sds = [], []
     for _ in range(SEEDS):
         noise = NOISE * rng.normal(size=(2, *SMALL.shape))
         result = correlate(
-            f + in_f * noise[0], g + in_g * noise[1], SMALL, ansatz, truth, mask, options=options
+            ImagePair(f + in_f * noise[0], g + in_g * noise[1], SMALL, mask),
+            ansatz,
+            guess=truth,
+            options=options,
         )
         found.append(result.unknowns - clean.unknowns)
         sds.append(result.noise_sd)
@@ -117,7 +125,9 @@ def noisy() -> tuple[Ansatz, FloatArray, FloatArray, Result]:
     ansatz, _, f, g = case()
     rng = np.random.default_rng(3)
     f, g = (image + 0.01 * rng.normal(size=image.shape) for image in (f, g))
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK, options=TIGHT)
+    result = correlate(
+        ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0), options=TIGHT
+    )
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, case()[1]) > 1e-3
     return ansatz, f, g, result
@@ -135,7 +145,9 @@ def test_pixel_size() -> None:
     mode = FourierMode.scaled(square_family("junction"), s, taper)
     large = Ansatz(Box(*(s * np.array([b.x_min, b.x_max, b.y_min, b.y_max]))), (mode,))
     grid = PixelGrid.centred(*GRID.shape, s * PIXEL)
-    result = correlate(f, g, grid, large, large.initial_guess(STRAIN, s), MASK, options=TIGHT)
+    result = correlate(
+        ImagePair(f, g, grid, MASK), large, guess=large.initial_guess(STRAIN, s), options=TIGHT
+    )
     assert rms_px(result.displacement() / s, expected.displacement()) < SAME_PX
     in_mm = np.array([unit == "mm" for unit in ansatz.units])
     np.testing.assert_allclose(
@@ -153,5 +165,5 @@ def test_translation_of_the_frame() -> None:
     grid = PixelGrid(*GRID.shape, PIXEL, GRID.x0 + dx, GRID.y0 + dy)
     start = moved.initial_guess(STRAIN, 1.0)
     start[moved.phi_slice(0)][5:] = -(dx + dy), -(-dx + dy)
-    result = correlate(f, g, grid, moved, start, MASK, options=TIGHT)
+    result = correlate(ImagePair(f, g, grid, MASK), moved, guess=start, options=TIGHT)
     assert rms_px(result.displacement(), expected.displacement()) < SAME_PX

@@ -16,6 +16,7 @@ from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level, eroded
 from modeharvest.idic.spectra.pattern import mode_equivalent
+from modeharvest.imaging.pair import ImagePair
 
 FloatArray = NDArray[np.float64]
 
@@ -32,12 +33,12 @@ def test_the_standard_start_finds_the_truth() -> None:
     start = ansatz.initial_guess(STRAIN, 1.0)
     u = ansatz.displacement(truth, GRID.x, GRID.y)
     assert rms_px(u, ansatz.displacement(start, GRID.x, GRID.y)) > 1.5
-    result = correlate(f, g, GRID, ansatz, start, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
     # float32 pixels are rounded by 3e-8 and a quintic amplifies that by up to 56.
     assert result.residual_rms < 2e-6
-    assert abs(result.residual(f, g)[MASK]).max() < 1e-4
+    assert abs(result.residual(ImagePair(f, g, GRID))[MASK]).max() < 1e-4
     assert result.pixels == eroded(MASK, CorrelationOptions().edge_px).sum()
     assert result.outside_image == 0
     # Unknowns, too: those of the mode to the displacement's error over v1 max||phi|| = 6 px.
@@ -49,7 +50,7 @@ def test_a_wave_shifted_by_part_of_a_cell_slides_home(cells: float) -> None:
     ansatz, truth, f, g = case()
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[ansatz.phi_slice(0)][5] += cells
-    assert error_px(correlate(f, g, GRID, ansatz, start, MASK), truth) < 1e-5
+    assert error_px(correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start), truth) < 1e-5
 
 
 @pytest.mark.parametrize("phases", [[1, 1, 1, 1, -1, 0, 0], [1, -1, -1, -1, 1, 0, 0]])
@@ -58,7 +59,7 @@ def test_the_wrong_phase_finds_the_truth(phases: list[float]) -> None:
     ansatz, truth, f, g = case(0.6)
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[ansatz.phi_slice(0)] = phases
-    result = correlate(f, g, GRID, ansatz, start, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
     mode, _ = mode_equivalent(result.mode_parameters(), 0.6)
@@ -70,7 +71,9 @@ def test_the_wrong_phase_finds_the_truth(phases: list[float]) -> None:
 @pytest.mark.parametrize("strain", [0.05, 0.1])
 def test_amplitude_and_sign_of_the_start_do_not_matter(amplitude: float, strain: float) -> None:
     ansatz, truth, f, g = case()
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(strain, amplitude), MASK)
+    result = correlate(
+        ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(strain, amplitude)
+    )
     assert error_px(result, truth) < 1e-5
 
 
@@ -80,7 +83,7 @@ def test_every_mode_parameter_10_percent_off(seed: int) -> None:
     start = ansatz.initial_guess(STRAIN, 1.0)
     off = 0.1 * np.random.default_rng(seed).choice([-1.0, 1.0], 7)
     start[ansatz.phi_slice(0)] += off  # the phases by 10 % of the unit cell, 1 mm
-    result = correlate(f, g, GRID, ansatz, start, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
 
@@ -90,7 +93,7 @@ def test_two_modes(seed: int) -> None:
     ansatz = square_and_wave()
     truth = disturbed(ansatz, 1.2, seed)
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
     np.testing.assert_allclose(result.mode_parameters(1), truth[-4:], atol=1e-5)
@@ -101,10 +104,10 @@ def test_a_trapped_iteration_says_so() -> None:
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[ansatz.v0_slice(1)][0] += 0.25  # 25 px, two speckles and a half
     fine = CorrelationOptions(levels=(Level(1, 0.0),))
-    result = correlate(f, g, GRID, ansatz, start, MASK, options=fine)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start, options=fine)
     assert error_px(result, truth) > 5.0
     assert result.outcome is Outcome.LOCAL_MINIMUM
-    found = correlate(f, g, GRID, ansatz, truth, MASK, options=fine)
+    found = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth, options=fine)
     assert found.outcome is Outcome.CONVERGED
     assert found.decorrelated_fraction == 0.0
 
@@ -115,7 +118,7 @@ def test_before_buckling_the_mode_stays_small() -> None:
     truth = disturbed(ansatz, 1.0)
     truth[ansatz.v_slice(0)] = 0.0
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
     assert error_px(result, truth) < 1e-3
     assert abs(result.fluctuation()[MASK]).max() < 0.01 * PIXEL
     assert np.isfinite(result.unknowns).all()
@@ -123,7 +126,7 @@ def test_before_buckling_the_mode_stays_small() -> None:
 
 def test_a_start_without_the_mode_does_not_see_it() -> None:
     ansatz, truth, f, g = case()
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 0.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 0.0))
     # With v1 = 0 the first step leaves the mode's parameters alone, and makes v1 non-zero:
     # from then on they count. All is as if it had started with a small v1.
     assert result.outcome is Outcome.CONVERGED
@@ -140,7 +143,7 @@ def test_stripes_say_nothing_about_the_motion_along_them() -> None:
     f, g = manufactured.image_pair(stripes, ansatz, truth)
     start = np.zeros(6)
     start[3] = 0.013
-    result = correlate(f, g, GRID, ansatz, start, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
     assert result.undetermined == ("v0y[0,0]", "v0y[1,0]", "v0y[0,1]")
     assert result.condition_number == np.inf
     np.testing.assert_allclose(result.unknowns[:3], truth[:3], atol=1e-6)
@@ -154,7 +157,9 @@ def test_no_pixel_lands_on_material() -> None:
     mask[40:150], deformed_mask[250:340] = True, True
     options = CorrelationOptions(levels=(Level(1, 0.0),))
     start = ansatz.initial_guess(0.0, 0.1)
-    result = correlate(f, g, GRID, ansatz, start, mask, deformed_mask, options)
+    result = correlate(
+        ImagePair(f, g, GRID, mask, deformed_mask), ansatz, guess=start, options=options
+    )
     assert result.outcome is Outcome.SINGULAR
     assert result.pixels == 0
     assert result.undetermined == ansatz.names
@@ -165,7 +170,7 @@ def test_a_start_off_the_image_is_not_iterated() -> None:
     ansatz, _, f, g = case()
     start = ansatz.initial_guess(STRAIN, 1.0)
     start[0] = 2.0  # 200 of 320 px to the right
-    result = correlate(f, g, GRID, ansatz, start, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
     assert result.outcome is Outcome.OUTSIDE_IMAGE
     assert "outside the deformed image" in result.outcome.explanation
     assert result.outside_image > 0.2 * (result.pixels + result.outside_image)
@@ -175,7 +180,12 @@ def test_a_start_off_the_image_is_not_iterated() -> None:
 def test_too_few_iterations_are_admitted() -> None:
     ansatz, _, f, g = case()
     options = CorrelationOptions(gauss_newton=GaussNewtonOptions(max_iterations=1))
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK, options=options)
+    result = correlate(
+        ImagePair(f, g, GRID, MASK),
+        ansatz,
+        guess=ansatz.initial_guess(STRAIN, 1.0),
+        options=options,
+    )
     assert result.outcome is Outcome.MAX_ITERATIONS
     assert "start closer, or allow more iterations" in result.outcome.explanation
     assert result.iterations == 1
@@ -185,7 +195,9 @@ def test_levels_that_would_blur_the_mode_away_are_skipped() -> None:
     """A unit cell of 60 px bears a blur of 15 px, which leaves out binning by 8 and 24 px."""
     for unit_cell, factors in ((1.0, {8, 4, 2, 1}), (0.6, {4, 2, 1})):
         ansatz, _, f, g = case(unit_cell)
-        result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+        result = correlate(
+            ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0)
+        )
         assert {step.factor for step in result.history} == factors
 
 
@@ -197,6 +209,6 @@ def test_progress_goes_one_way_from_0_to_1() -> None:
         assert what == "correlate"
         seen.append(done / total)
 
-    correlate(f, g, GRID, ansatz, truth, MASK, progress=listen)
+    correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth, progress=listen)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0

@@ -23,6 +23,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +66,10 @@ def images(seed: int) -> tuple[FloatArray, FloatArray]:
 @cache
 def expected(seed: int) -> Result:
     found = correlate(
-        *images(seed), GRID, ANSATZ, ANSATZ.initial_guess(STRAIN, 1.0), MASK, options=TIGHT
+        ImagePair(*images(seed), GRID, MASK),
+        ANSATZ,
+        guess=ANSATZ.initial_guess(STRAIN, 1.0),
+        options=TIGHT,
     )
     assert found.outcome is Outcome.CONVERGED
     return found
@@ -87,7 +91,9 @@ def test_grey_levels(seed: int, gain: float, negative: bool, offset: float) -> N
     """Any unit of grey levels, and the negative: the same displacement, the same error bars."""
     gain = -gain if negative else gain
     f, g = (gain * (image + offset) for image in images(seed))
-    found = correlate(f, g, GRID, ANSATZ, ANSATZ.initial_guess(STRAIN, 1.0), MASK, options=TIGHT)
+    found = correlate(
+        ImagePair(f, g, GRID, MASK), ANSATZ, guess=ANSATZ.initial_guess(STRAIN, 1.0), options=TIGHT
+    )
     assert apart_px(found.displacement(), expected(seed).displacement()) < SAME_PX
     assert found.residual_rms == pytest.approx(abs(gain) * expected(seed).residual_rms, rel=1e-5)
     errors, theirs = found.standard_errors(), expected(seed).standard_errors()
@@ -104,7 +110,10 @@ def test_pixel_size(seed: int, s: float) -> None:
     ansatz = square_ansatz(Box.centred(1.3 * s, 1.4 * s), s)
     grid = PixelGrid.centred(*GRID.shape, s * PIXEL)
     found = correlate(
-        *images(seed), grid, ansatz, ansatz.initial_guess(STRAIN, s), MASK, options=TIGHT
+        ImagePair(*images(seed), grid, MASK),
+        ansatz,
+        guess=ansatz.initial_guess(STRAIN, s),
+        options=TIGHT,
     )
     assert apart_px(found.displacement() / s, expected(seed).displacement()) < SAME_PX
     assert found.condition_number == pytest.approx(expected(seed).condition_number, rel=1e-2)
@@ -127,7 +136,10 @@ def test_translation_of_the_frame(seed: int, dx: float, dy: float) -> None:
     moved = replace(ANSATZ, domain=domain, modes=(mode,))
     grid = replace(GRID, x0=GRID.x0 + dx, y0=GRID.y0 + dy)
     found = correlate(
-        *images(seed), grid, moved, moved.initial_guess(STRAIN, 1.0), MASK, options=TIGHT
+        ImagePair(*images(seed), grid, MASK),
+        moved,
+        guess=moved.initial_guess(STRAIN, 1.0),
+        options=TIGHT,
     )
     assert apart_px(found.displacement(), expected(seed).displacement()) < SAME_PX
 
@@ -141,9 +153,9 @@ def test_translation_of_both_images(seed: int, down: int, right: int) -> None:
     grid = PixelGrid(*f.shape, PIXEL, GRID.x[6 + right], GRID.y[6 + down])
     fine = replace(TIGHT, levels=(Level(1, 0.0),))  # bins would hold other pixels
     start = expected(seed).unknowns + 1e-3
-    found = correlate(f, g, grid, ANSATZ, start, MASK[window], options=fine)
+    found = correlate(ImagePair(f, g, grid, MASK[window]), ANSATZ, guess=start, options=fine)
     # Pixels land 8 px or more from the window's border, which the spline feels by 0.43 a pixel.
-    inner = correlate(*images(seed), GRID, ANSATZ, start, MASK, options=fine)
+    inner = correlate(ImagePair(*images(seed), GRID, MASK), ANSATZ, guess=start, options=fine)
     assert found.pixels == inner.pixels
     assert apart_px(found.displacement(GRID), inner.displacement()) < 1e-4
 
@@ -157,7 +169,7 @@ def test_translation_of_the_deformed_image(seed: int, down: int, right: int) -> 
     start = ANSATZ.initial_guess(STRAIN, 1.0)
     for c, by in enumerate((right, -down)):
         start[ANSATZ.v0_slice(c)][0] += by * PIXEL
-    found = correlate(f, moved, GRID, ANSATZ, start, MASK, options=TIGHT)
+    found = correlate(ImagePair(f, moved, GRID, MASK), ANSATZ, guess=start, options=TIGHT)
     by_mm = PIXEL * np.array([right, -down])
     # The seam is at least 10 px from where pixels land: 0.43^10 of a grey level.
     assert apart_px(found.displacement() - by_mm, expected(seed).displacement()) < 1e-4
@@ -185,7 +197,7 @@ def test_turns_and_mirrors(seed: int, quarters: int, mirrored: bool) -> None:
     along = int(abs(Q[1, 0]))  # now compressed along this axis: T_1 of x is third, of y second
     start[ansatz.v0_slice(along)] = _compression(ansatz, along)
     f, g = (turned(image) for image in images(seed))
-    found = correlate(f, g, grid, ansatz, start, turned(MASK), options=TIGHT)
+    found = correlate(ImagePair(f, g, grid, turned(MASK)), ansatz, guess=start, options=TIGHT)
     assert found.outcome is Outcome.CONVERGED
     u = found.displacement() @ Q  # Q' u, in the old frame's components
     u = u[:, ::-1] if mirrored else u

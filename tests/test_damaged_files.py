@@ -38,7 +38,6 @@ from modeharvest.fem.field import Solution, read_any_mesh, read_meshio
 from modeharvest.idic.local import tables
 from modeharvest.idic.local.field import read_field
 from modeharvest.idic.local.tables import read_mat
-from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.lattice_spectrum import lattice_spectrum
 from modeharvest.idic.spectra.mode_family import (
@@ -58,6 +57,7 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import Case, case_text
 from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading

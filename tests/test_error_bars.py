@@ -14,13 +14,8 @@ from numpy.typing import NDArray
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.pyramid import eroded
-from modeharvest.idic.uncertainty.covariance import (
-    field_errors,
-    hessian_corrected_covariance,
-    inverse_hessian,
-    noise_covariance,
-    sandwich_covariance,
-)
+from modeharvest.idic.uncertainty.covariance import MatchedImages, field_errors
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -31,18 +26,24 @@ X, Y = np.linspace(-1.0, 1.0, 7), np.linspace(-1.2, 1.2, 6)
 
 @cache
 def noisy(
-    leftover: float = 0.0, seed: int | None = 5, noise: float = NOISE
+    model_error: float = 0.0, seed: int | None = 5, noise: float = NOISE
 ) -> tuple[Result, FloatArray, FloatArray]:
-    """A correlation of noisy images; ``leftover`` [mm] of a displacement is not in the ansatz."""
+    """A correlation of noisy images; ``model_error`` [mm] of the motion is not in the ansatz."""
     ansatz, truth, f, g = case()
-    if leftover:
-        wavy = leftover * np.sin(2 * np.pi * GRID.x / 0.5)[None, :] * np.ones((GRID.rows, 1))
+    if model_error:
+        wavy = model_error * np.sin(2 * np.pi * GRID.x / 0.5)[None, :] * np.ones((GRID.rows, 1))
         slope = np.gradient(g, axis=1) / GRID.pixel_size
         g = g - wavy * slope
     if seed is not None:
         rng = np.random.default_rng(seed)
         f, g = (image + noise * rng.normal(size=image.shape) for image in (f, g))
-    return correlate(f, g, GRID, ansatz, truth, MASK), f, g
+    return correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth), f, g
+
+
+def matched(
+    result: Result, f: FloatArray, g: FloatArray, used: NDArray[np.bool_] = MASK
+) -> MatchedImages:
+    return MatchedImages(result, f.astype(np.float32), g.astype(np.float32), used)
 
 
 def test_errors_are_those_of_unknowns_drawn_from_the_covariance() -> None:
@@ -66,7 +67,7 @@ def test_errors_are_those_of_unknowns_drawn_from_the_covariance() -> None:
 def test_no_mode_no_error_of_a_mode() -> None:
     result, _, _ = noisy()
     plain = replace(result.ansatz, modes=())
-    fit = correlate(*noisy()[1:], GRID, plain, plain.initial_guess(0.03), MASK)
+    fit = correlate(ImagePair(*noisy()[1:], GRID, MASK), plain, guess=plain.initial_guess(0.03))
     errors = field_errors(fit, X, Y, fit.covariance(NOISE))
     assert errors.v.shape == (0, 6, 7)
     assert errors.fluctuation.shape == (0, 6, 7, 2)
@@ -85,33 +86,33 @@ def test_unknowns_without_information_make_their_fields_infinite() -> None:
 
 def test_where_all_is_noise_the_blocks_say_what_the_noise_predicts() -> None:
     result, f, g = noisy()
-    leftover = sandwich_covariance(result, f, g, MASK, block=0.25)
+    found = matched(result, f, g).sandwich_covariance(0.25)
     predicted = result.covariance(NOISE)
     # n unknowns have used up n of about 150 blocks' freedom; and the spline smooths g's noise.
-    ratio = np.trace(np.linalg.solve(predicted, leftover)) / len(predicted)
+    ratio = np.trace(np.linalg.solve(predicted, found)) / len(predicted)
     assert 0.3 < ratio < 1.1
 
 
-def test_what_the_ansatz_leaves_over_shows() -> None:
+def test_a_model_error_shows() -> None:
     plain, f, g = noisy()
     wavy, f2, g2 = noisy(0.01)
-    with_w = field_errors(wavy, X, Y, sandwich_covariance(wavy, f2, g2, MASK, 0.25))
-    without = field_errors(plain, X, Y, sandwich_covariance(plain, f, g, MASK, 0.25))
+    with_w = field_errors(wavy, X, Y, matched(wavy, f2, g2).sandwich_covariance(0.25))
+    without = field_errors(plain, X, Y, matched(plain, f, g).sandwich_covariance(0.25))
     assert np.median(with_w.displacement[..., 0]) > 1.5 * np.median(without.displacement[..., 0])
 
 
 def test_too_few_blocks_are_refused() -> None:
     result, f, g = noisy()
     with pytest.raises(InputError, match="expected at least 8 blocks"):
-        sandwich_covariance(result, f, g, MASK, block=2.0)
+        matched(result, f, g).sandwich_covariance(2.0)
 
 
 def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
     little = 0.2 * NOISE  # more of it bends the cost of so small an image by itself
     result, f, g = noisy(noise=little)
     rng = np.random.default_rng(8)
-    examples = [little * rng.normal(size=(2, *f.shape)) for _ in range(12)]
-    covariance = noise_covariance(result, f, g, ((n[0], n[1]) for n in examples), MASK, 0.25)
+    examples = [np.float32(little * rng.normal(size=(2, *f.shape))) for _ in range(12)]
+    covariance = matched(result, f, g).noise_covariance(((n[0], n[1]) for n in examples), 0.25)
     told, bound = (
         field_errors(result, X, Y, c).displacement for c in (covariance, result.covariance(little))
     )
@@ -120,17 +121,19 @@ def test_examples_of_white_noise_give_the_cramer_rao_bound() -> None:
 
 
 @pytest.mark.parametrize(("model_error", "sd"), [(0.0, 0.01), (0.01, 0.02)])
-def test_seeds_of_noise_scatter_as_the_curvature_predicts(leftover: float, sd: float) -> None:
-    result, f, g = noisy(leftover, noise=sd)
-    assert result.weighting.is_least_squares == (leftover > 0.0)
-    predicted = hessian_corrected_covariance(result, sd, inverse_hessian(result, f, g, USED))
-    quiet = noisy(leftover, seed=None)[1:]
+def test_seeds_of_noise_scatter_as_the_curvature_predicts(model_error: float, sd: float) -> None:
+    result, f, g = noisy(model_error, noise=sd)
+    assert result.weighting.is_least_squares == (model_error > 0.0)
+    predicted = matched(result, f, g, USED).hessian_corrected_covariance(sd)
+    quiet = noisy(model_error, seed=None)[1:]
     rng = np.random.default_rng(4)
     ends = []
     for _ in range(20):
         noise = sd * rng.normal(size=(2, *f.shape))
         images = quiet[0] + noise[0], quiet[1] + noise[1]
-        ends.append(correlate(*images, GRID, result.ansatz, result.unknowns, MASK).unknowns)
+        ends.append(
+            correlate(ImagePair(*images, GRID, MASK), result.ansatz, guess=result.unknowns).unknowns
+        )
     told, seen = (
         np.sqrt(np.mean(field_errors(result, X, Y, c).displacement ** 2))
         for c in (predicted, np.cov(np.array(ends).T))
@@ -140,11 +143,11 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(leftover: float, sd: f
     assert told == pytest.approx(seen, rel=0.2)
 
 
-def test_a_leftover_makes_the_cost_softer() -> None:
-    stiff, soft = (
+def test_a_model_error_lowers_the_curvature() -> None:
+    without, with_w = (
         np.linalg.eigvals(
-            inverse_hessian(result, f, g, USED) @ np.linalg.inv(result.inverse)
+            matched(result, f, g, USED).inverse_hessian @ np.linalg.inv(result.inverse)
         ).real.max()
         for result, f, g in (noisy(), noisy(0.01))
     )
-    assert soft > 1.2 * stiff
+    assert with_w > 1.2 * without

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,19 +13,20 @@ from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.final_smoothing import (
     WIDTHS,
-    blurred_pair,
+    FinalSmoothing,
     contrast_after,
-    final_smoothing,
+    smoothed_pair,
     speckle_size,
 )
-from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]
 FWHM = np.sqrt(8 * np.log(2))
 SHAPE = (512, 480)
 EVERYWHERE = np.ones(SHAPE, dtype=np.bool_)
+PLAIN = PixelGrid.centred(*SHAPE, 1.0)
 
 
 def blurred_noise(sd: float, seed: int = 0) -> FloatArray:
@@ -71,25 +70,26 @@ def test_the_paper_s_speckle_is_as_wide_as_its_pixels_differences_say() -> None:
     assert speckle_size(image, EVERYWHERE) == pytest.approx(independent, rel=0.05)
 
 
-def test_a_small_leftover_needs_no_blur() -> None:
+def test_a_small_model_error_needs_no_blur() -> None:
     """10 px speckles and w of 2 px, as in the paper's virtual experiment."""
     image = Speckle(SpeckleSpec(), SHAPE).image()
-    finish = final_smoothing(image, EVERYWHERE, 2.0)
+    finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), 2.0)
     assert finish.blur_px == 0.0
-    assert "on the images as they are" in finish.sentence
+    assert "on the unfiltered images" in finish.sentence
 
 
 def test_a_blur_makes_speckles_as_wide_as_the_rule_says() -> None:
-    image, leftover = blurred_noise(1.5), 2.0
-    finish = final_smoothing(image, EVERYWHERE, leftover)
+    image, model_error = blurred_noise(1.5), 2.0
+    finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), model_error)
     after = speckle_size(ndimage.gaussian_filter(image, finish.blur_px), EVERYWHERE)
-    assert after == pytest.approx(WIDTHS * leftover, rel=0.05)
+    assert after == pytest.approx(WIDTHS * model_error, rel=0.05)
     assert f"blurred by {finish.blur_px:.1f} px" in finish.sentence
 
 
 def test_a_blurred_pair_has_the_contrast_of_the_blurred_reference() -> None:
     image, mask = 40.0 * blurred_noise(1.5) + 100.0, with_holes()
-    f, g = blurred_pair(image, 2.0 * image + 30.0, mask, mask, 3.0)
+    pair = smoothed_pair(ImagePair(image, 2.0 * image + 30.0, PLAIN, mask, mask), 3.0)
+    f, g = pair.reference, pair.deformed
     # Level and contrast of the second image, lit otherwise, are gone: the two are one.
     inside = ndimage.binary_erosion(mask, iterations=6)
     assert np.abs(f - g)[inside].max() < 1e-3 * f[inside].std()
@@ -125,21 +125,19 @@ def test_a_blurred_finish_comes_nearer_to_the_best_fit(
     f, g = speckle.image(), speckle(*GRID.to_px(came_from[..., 0], came_from[..., 1]))
     mask = np.zeros(GRID.shape, dtype=np.bool_)
     mask[30:-30, 30:-30] = True
-    options = CorrelationOptions()
-    coarse = replace(options, levels=options.levels[:-1])
-    fine = replace(options, levels=options.levels[-1:])
-    rough = correlate(f, g, GRID, ansatz, np.zeros(ansatz.size), mask, None, coarse)
-    binned = rough.grid.pixel_size / PIXEL
-    finish = final_smoothing(f, mask, binned * identifiability(rough).model_error_px)
-    assert finish.width_px == pytest.approx(5.0, abs=0.5)
+    pair, guess = ImagePair(f, g, GRID, mask), np.zeros(ansatz.size)
+    plain, smooth = (
+        correlate(pair, ansatz, guess=guess, options=CorrelationOptions(final_smoothing_px=blur))
+        for blur in (0.0, None)
+    )
+    finish = smooth.final_smoothing
+    assert finish is not None
+    assert finish.speckle_size_px == pytest.approx(5.0, abs=0.5)
     assert finish.blur_px > 2.0
     best = fit_displacement(displacement(at), GRID, ansatz, a, mask)
-    blurred = blurred_pair(f, g, mask, np.ones_like(mask), finish.blur_px)
-    off = []
-    for one, other in ((f, g), blurred):
-        found = correlate(one, other, GRID, ansatz, rough.unknowns, mask, None, fine)
-        apart = (found.displacement() - best.displacement())[mask]
-        off.append(np.sqrt(np.mean(apart**2)) / PIXEL)
-    as_they_are, as_blurred = off
+    unfiltered, smoothed = (
+        np.sqrt(np.mean((found.displacement() - best.displacement())[mask] ** 2)) / PIXEL
+        for found in (plain, smooth)
+    )
     # 0.37 to 2.2 px as they are, 0.23 to 0.44 px blurred.
-    assert as_blurred < 0.75 * as_they_are
+    assert smoothed < 0.75 * unfiltered

@@ -16,7 +16,7 @@ from modeharvest.cli.root import main
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.slow_fields import Box
-from modeharvest.idic.uncertainty.noise import measured_noise
+from modeharvest.idic.solver.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun

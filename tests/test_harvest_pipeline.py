@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from modeharvest.cli.root import app
 from modeharvest.fem.field import Solution
 from modeharvest.idic.result import Result
-from modeharvest.idic.uncertainty.noise import estimated_noise, measured_noise
+from modeharvest.idic.solver.noise import estimated_noise, measured_noise
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec

@@ -13,6 +13,7 @@ from manufactured import GRID, PIXEL
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.imaging.pair import ImagePair
 
 PAGE = Path(__file__).parents[1] / "docs" / "idic.md"
 
@@ -27,7 +28,9 @@ def test_the_printed_family_is_recovered() -> None:
     truth[ansatz.phi_slice(0)] += [0.02, 0.03, -0.04, 0.05]
     f, g = manufactured.image_pair(manufactured.speckle(), ansatz, truth)
     mask = manufactured.inner_mask(0.1)
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(strain=0.04, amplitude=1.0), mask)
+    result = correlate(
+        ImagePair(f, g, GRID, mask), ansatz, guess=ansatz.initial_guess(strain=0.04, amplitude=1.0)
+    )
     assert result.outcome is Outcome.CONVERGED
     error = (result.displacement() - ansatz.displacement(truth, GRID.x, GRID.y))[mask] / PIXEL
     assert np.sqrt((error**2).sum(axis=-1).mean()) < 1e-5

@@ -22,6 +22,7 @@ from modeharvest.idic.solver.assembly import Assembly, residual, valid_pixels
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.solver.level_search import step_length
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +49,7 @@ def simple() -> tuple[Ansatz, FloatArray, FloatArray, FloatArray]:
 
 def found() -> Result:
     ansatz, start, f, g = simple()
-    return correlate(f, g, GRID, ansatz, start, MASK, None)
+    return correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=start)
 
 
 def test_few_rows_lead_to_the_minimum_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,7 +98,7 @@ def test_on_two_cells_the_coarse_levels_do_not_wander(unit_cell: float) -> None:
     the 50 that are allowed.
     """
     ansatz, truth, f, g = case(unit_cell)
-    result = correlate(f, g, GRID, ansatz, ansatz.initial_guess(STRAIN, 1.0), MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=ansatz.initial_guess(STRAIN, 1.0))
     assert result.condition_number > 5e4
     assert result.outcome is Outcome.CONVERGED
     assert error_px(result, truth) < 1e-5
@@ -160,12 +161,14 @@ def test_the_smallest_images(size: int) -> None:
     # f is g's spline at x + u, so that the truth is exact.
     warped = spline.sample(r - u[..., 1], c + u[..., 0])[0]
     inside = np.isfinite(warped)
-    result = correlate(np.nan_to_num(warped), part, grid, slow, slow.initial_guess(0.0), inside)
+    result = correlate(
+        ImagePair(np.nan_to_num(warped), part, grid, inside), slow, guess=slow.initial_guess(0.0)
+    )
     assert result.outcome is Outcome.CONVERGED
     assert rms_px(result.displacement(), u * PIXEL, inside) < 1e-4
     whole, shown = Ansatz.on(box, [(square_family(), box)], 0.4), np.nan_to_num(warped)
     start = whole.initial_guess(0.01, 0.1)
-    result = correlate(shown, part, grid, whole, start, inside)
+    result = correlate(ImagePair(shown, part, grid, inside), whole, guess=start)
     assert result.outcome in (Outcome.CONVERGED, Outcome.MAX_ITERATIONS)
     begun = residual(Assembly(whole, grid, inside), start, shown.astype(np.float32), spline)
     assert result.residual_rms < np.sqrt(np.nanmean(begun**2))

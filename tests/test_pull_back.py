@@ -10,11 +10,12 @@ from manufactured import GRID
 
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.photograph.measure import pulled_back
+from modeharvest.imaging.pair import ImagePair
 
 
 def test_the_truth_brings_the_reference_back() -> None:
     ansatz, truth, f, g = case()
-    result = correlate(f, g, GRID, ansatz, truth, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth)
     back, seen = pulled_back(g, result)
     assert seen[MASK].all()
     # The spline's own error on this speckle, docs/idic.md.
@@ -23,15 +24,17 @@ def test_the_truth_brings_the_reference_back() -> None:
 
 def test_an_image_against_the_pulled_back_one_gives_the_whole_displacement() -> None:
     ansatz, truth, f, g = case()
-    first = correlate(f, g, GRID, ansatz, truth, MASK)
+    first = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth)
     back, seen = pulled_back(g, first)
-    again = correlate(back, g, GRID, ansatz, ansatz.initial_guess(0.05, 1.0), MASK & seen)
+    again = correlate(
+        ImagePair(back, g, GRID, MASK & seen), ansatz, guess=ansatz.initial_guess(0.05, 1.0)
+    )
     assert error_px(again, truth) < 1e-4
 
 
 def test_pixels_off_the_image_are_told() -> None:
     ansatz, truth, f, g = case()
-    result = correlate(f, g, GRID, ansatz, truth, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=truth)
     shifted = ansatz.initial_guess()
     shifted[ansatz.v0_slice(0)][0] = 20.5 * GRID.pixel_size
     shifted[ansatz.v_slice(0)] = 0.0

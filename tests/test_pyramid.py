@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.solver.pyramid import COARSE_TO_FINE, Level, LevelPair, eroded, level_pair
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 GRID = PixelGrid(203, 165, 0.013, -0.9, 1.4)  # divisible by none of the binnings
@@ -32,7 +33,7 @@ def coarse(
     mask: NDArray[np.bool_] | None = None,
     g_mask: NDArray[np.bool_] | None = None,
 ) -> LevelPair:
-    return level_pair(f, g, GRID, mask, g_mask, level, edge_px=3, order=5)
+    return level_pair(ImagePair(f, g, GRID, mask, g_mask), level, edge_px=3, order=5)
 
 
 def seen(pair: LevelPair) -> NDArray[np.float64]:
@@ -47,7 +48,9 @@ def test_a_constant_material_stays_constant_whatever_is_outside(
     level: Level, outside: float
 ) -> None:
     mask, g_mask = perforated(), perforated(4)
-    pair = coarse(np.where(mask, 0.7, outside), np.where(g_mask, 0.7, outside), level, mask, g_mask)
+    material = 0.7 * (1.0 + 1e-7 * (np.indices(GRID.shape).sum(axis=0) % 2))  # no pair is blank
+    f, g = (np.where(m, material, outside) for m in (mask, g_mask))
+    pair = coarse(f, g, level, mask, g_mask)
     np.testing.assert_allclose(pair.reference[pair.mask], 0.7, rtol=FLOAT32)
     # In g the holes are filled, so it is constant everywhere.
     np.testing.assert_allclose(seen(pair), 0.7, rtol=60 * FLOAT32)  # quintic coefficients
@@ -69,7 +72,7 @@ def test_nothing_depends_on_grey_levels_outside_the_material(level: Level) -> No
 def test_a_linear_image_stays_linear(level: Level) -> None:
     grid = PixelGrid(403, 365, 0.006, -0.9, 1.4)
     f = 0.3 + 0.2 * grid.x + 0.5 * grid.y[:, None]
-    pair = level_pair(f, 2 * f, grid, None, None, level, edge_px=3, order=5)
+    pair = level_pair(ImagePair(f, 2 * f, grid), level, edge_px=3, order=5)
     expected = 0.3 + 0.2 * pair.grid.x + 0.5 * pair.grid.y[:, None]
     margin = int(np.ceil(4 * level.blur)) + 1  # scipy's Gaussian ends at 4 standard deviations
     inner = (slice(margin, -margin),) * 2 if level.blur else (slice(None),) * 2
@@ -118,7 +121,7 @@ def test_pixels_of_the_finest_level_keep_their_distance_from_the_border(
     """Where what lies beyond is felt by more than 0.2 %: 0.43^8 and 0.27^5 are 0.12 and 0.14 %."""
     f = np.random.default_rng(3).uniform(size=shape)
     grid = PixelGrid.centred(*shape, 1.0)
-    pair = level_pair(f, f, grid, None, None, COARSE_TO_FINE[-1], edge_px=3, order=order)
+    pair = level_pair(ImagePair(f, f, grid), COARSE_TO_FINE[-1], edge_px=3, order=order)
     expected = np.zeros(shape, dtype=np.bool_)
     expected[border:-border, border:-border] = True
     np.testing.assert_array_equal(pair.valid, expected)

@@ -15,8 +15,9 @@ from manufactured import GRID
 
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
-from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 
@@ -105,7 +106,7 @@ def test_a_truncated_file_is_refused(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": "modeharvest-result-0"}, "modeharvest-result-4"),
+        ({"format": "modeharvest-result-0"}, "modeharvest-result-5"),
         ({"outcome": "splendid"}, "complete"),
         ({"inverse": [[1.0, 2.0], [3.0]]}, "complete"),
         ({"inverse": [[1.0]]}, "inverse of shape"),
@@ -167,12 +168,13 @@ def test_bad_shapes() -> None:
         replace(result, inverse=np.eye(2))
     with pytest.raises(InputError, match="expected 43 unknowns"):
         replace(result, unknowns=np.zeros(3))
-    image = np.zeros(GRID.shape)
-    with pytest.raises(InputError, match=r"two images of \(360, 320\) px.*\(3, 3\)"):
-        result.residual(image, np.zeros((3, 3)))
+    small = np.eye(3)
+    with pytest.raises(InputError, match=r"images of \(360, 320\) px.*\(3, 3\)"):
+        result.residual(ImagePair(small, small, PixelGrid.centred(3, 3, 0.01)))
 
 
 def test_residual_is_nan_off_the_image() -> None:
     result = some_result()
     far = replace(result, grid=PixelGrid.centred(20, 30, 0.01), unknowns=np.zeros(43) + 9.0)
-    assert np.isnan(far.residual(np.zeros((20, 30)), np.zeros((20, 30)))).all()
+    image = np.random.default_rng(0).random((20, 30))
+    assert np.isnan(far.residual(ImagePair(image, image, far.grid))).all()

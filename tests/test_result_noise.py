@@ -16,9 +16,10 @@ from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.idic.solver.pyramid import Level, blurred
-from modeharvest.idic.uncertainty.noise import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 
 GRID = PixelGrid.centred(240, 220, PIXEL)
@@ -43,7 +44,7 @@ def correlated(in_f: float, in_g: float) -> Result:
     f, g = pair()
     noise = np.random.default_rng(1).normal(size=(2, *GRID.shape))
     f, g = f + in_f * noise[0], g + in_g * noise[1]
-    return correlate(f, g, GRID, ANSATZ, truth(), MASK, options=FINE)
+    return correlate(ImagePair(f, g, GRID, MASK), ANSATZ, guess=truth(), options=FINE)
 
 
 @pytest.mark.parametrize("order", [3, 5, 11])

@@ -11,6 +11,7 @@ from manufactured import GRID
 
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.slow_fields import Box
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.validation.onset import Moment, find_buckling, mean_strain
 
 CRITICAL = 0.091
@@ -51,7 +52,7 @@ def test_a_pattern_from_the_beginning_is_said() -> None:
 def test_mean_strain_is_that_of_the_slow_field() -> None:
     ansatz, _, f, g = case()
     a = ansatz.initial_guess(0.037, 1.0)
-    result = correlate(f, g, GRID, ansatz, a, MASK)
+    result = correlate(ImagePair(f, g, GRID, MASK), ansatz, guess=a)
     along, across = mean_strain(replace(result, unknowns=a), Box.centred(2.0, 2.4))
     assert along == pytest.approx(0.037 * 1.0, rel=1e-12)
     assert across == pytest.approx(0.0, abs=1e-12)

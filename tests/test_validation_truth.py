@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic import correlate as correlation
+from modeharvest.idic.correlate import best_fit, fit_displacement
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import Truth
 from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.validation import truth as truth_module
-from modeharvest.validation.truth import Comparison, best_fit, describe, pattern_size
+from modeharvest.validation.truth import Comparison, describe, pattern_size
 
 GRID = PixelGrid.centred(150, 130, 0.02)
 # The body that `manufactured.one_mode` is made for: a cellular part of 2.0 x 2.4 mm, l = 1 mm.
@@ -62,7 +63,7 @@ def comparison() -> Comparison:
 def test_the_best_fit_is_the_lowest_minimum_though_it_is_looked_for_on_few_pixels(
     flip: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(truth_module, "_ENOUGH", 800)  # every third pixel or so
+    monkeypatch.setattr(correlation, "_ENOUGH", 800)  # every third pixel or so
     ansatz, mask = one_mode(), body()
     near = ansatz.initial_guess(0.05, 1.0)
     trapped = near.copy()
@@ -72,7 +73,8 @@ def test_the_best_fit_is_the_lowest_minimum_though_it_is_looked_for_on_few_pixel
     on_all = [fit_displacement(truth, GRID, ansatz, a, mask) for a in (near, trapped)]
     assert on_all[1].residual_rms > 1.1 * on_all[0].residual_rms
     starts = (trapped, near) if flip else (near, trapped)
-    found = best_fit(truth, GRID, ansatz, starts, mask)
+    begun = replace(on_all[0], unknowns=starts[0])
+    found = best_fit(Truth.of(displacement=truth), begun, guesses=starts[1:])
     assert found.pixels == on_all[0].pixels
     assert found.residual_rms <= on_all[0].residual_rms
     # as near as the coarser tolerance of the other, 1e-4 px

@@ -15,17 +15,17 @@ from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.pair import CheckedImages
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.slow_fields import Box, Brightness
 from modeharvest.idic.solver.assembly import Assembly, warped_back
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, Outcome
 from modeharvest.idic.solver.level_search import step_length
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, level_pair
 from modeharvest.idic.solver.weighting import Gradient, Weighting, best_blur, instrument, root
-from modeharvest.idic.uncertainty.noise import ImageNoise
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.errors import InputError
 
@@ -66,8 +66,8 @@ def test_the_deformed_image_itself_as_the_instrument_changes_nothing() -> None:
 def steps_to_the_truth(weighting: Weighting) -> int:
     """Go to the root from unknowns that are 0.3 px off; returns in how many steps."""
     f, g = pair()
-    images = CheckedImages.checked(f, g, GRID, MASK, None)
-    level = level_pair(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    images = ImagePair(f, g, GRID, MASK)
+    level = level_pair(images, FULL, edge_px=2, order=5)
     used = Assembly(ANSATZ, GRID, level.mask)
     a = truth() + 0.002 * np.random.default_rng(4).normal(size=ANSATZ.size)
     length = step_length(ANSATZ, GRID, level.mask, 1)
@@ -95,8 +95,8 @@ def test_exact_images_have_their_root_at_the_truth(gradient: Gradient, blur_px: 
 
 def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> None:
     f, g = pair()
-    images = CheckedImages.checked(f, g, GRID, MASK, None)
-    level = level_pair(images.f, images.g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    images = ImagePair(f, g, GRID, MASK)
+    level = level_pair(images, FULL, edge_px=2, order=5)
     used = Assembly(ANSATZ, GRID, level.mask)
     of_f, of_g = (instrument(Weighting(gradient), images, level, used, truth())[:2, level.mask]
                   for gradient in (Gradient.REFERENCE, Gradient.DEFORMED))  # fmt: skip
@@ -107,7 +107,7 @@ def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> No
 
 
 def test_noise_free_images_keep_the_least_squares_minimum() -> None:
-    found = correlate(*pair(), GRID, ANSATZ, truth(), MASK, options=FINEST)
+    found = correlate(ImagePair(*pair(), GRID, MASK), ANSATZ, guess=truth(), options=FINEST)
     assert found.weighting.is_least_squares
     assert "deformed image's gradient." in found.weighting.sentence
 
@@ -118,7 +118,10 @@ def test_a_displacement_left_over_keeps_the_least_squares_minimum() -> None:
     noise = NOISE * np.random.default_rng(1).normal(size=(2, *GRID.shape))
     f, g = pair()
     found = correlate(
-        f + noise[0], g + noise[1], GRID, low, low.initial_guess(0.03), MASK, options=FINEST
+        ImagePair(f + noise[0], g + noise[1], GRID, MASK),
+        low,
+        guess=low.initial_guess(0.03),
+        options=FINEST,
     )
     assert not found.residual_test().is_white
     assert found.weighting.is_least_squares
@@ -138,11 +141,11 @@ def monte_carlo(options: CorrelationOptions) -> tuple[FloatArray, FloatArray, li
     errors, bounds, results = [], [], []
     for seed in range(PAIRS):
         f, g = pair(seed)
-        clean = correlate(f, g, GRID, ANSATZ, truth(), MASK, options=LEAST_SQUARES)
+        clean = correlate(ImagePair(f, g, GRID, MASK), ANSATZ, guess=truth(), options=LEAST_SQUARES)
         noise = NOISE * np.random.default_rng([seed, 7]).normal(size=(2, *GRID.shape))
         found = [
-            correlate(f + s * noise[0], g + s * noise[1], GRID, ANSATZ, truth(), MASK,
-                      options=options)
+            correlate(ImagePair(f + s * noise[0], g + s * noise[1], GRID, MASK), ANSATZ,
+                      guess=truth(), options=options)
             for s in (1, -1)
         ]  # fmt: skip
         errors.append([r.unknowns - truth() for r in found])
@@ -202,7 +205,9 @@ def test_noise_does_not_make_a_gain_too_small() -> None:
         for seed in range(16):
             noise = NOISE * np.random.default_rng([seed, 8]).normal(size=(2, *GRID.shape))
             f, g = (image + n for image, n in zip(pair(seed), noise, strict=True))
-            found = correlate(f, g, GRID, ansatz, truth_of_all, MASK, options=options)
+            found = correlate(
+                ImagePair(f, g, GRID, MASK), ansatz, guess=truth_of_all, options=options
+            )
             gains.append(found.unknowns[number])
             sds.append(found.standard_errors(NOISE)[number])
         means.append(np.mean(gains) / (np.mean(sds) / np.sqrt(len(gains))))
@@ -221,7 +226,10 @@ def test_weighing_anew_takes_little_memory(gradient: str) -> None:
     options = replace(CorrelationOptions(), gradient=gradient)
     tracemalloc.start()
     found = correlate(
-        f, g, grid, ANSATZ, ANSATZ.initial_guess(0.0), everywhere, everywhere, options
+        ImagePair(f, g, grid, everywhere, everywhere),
+        ANSATZ,
+        guess=ANSATZ.initial_guess(0.0),
+        options=options,
     )
     peak = tracemalloc.get_traced_memory()[1] / f.nbytes
     tracemalloc.stop()
@@ -314,10 +322,8 @@ def bias_of_a_shift(
         f, g = shifted(shift_px, seed)
         noise = np.random.default_rng([seed, 9]).normal(size=(2, *GRID.shape))
         for sign in (1, -1):
-            found = correlate(
-                f + sign * in_f * noise[0], g + sign * in_g * noise[1], GRID, SMALL,
-                np.zeros(SMALL.size), MASK, options=options,
-            )  # fmt: skip
+            noisy = ImagePair(f + sign * in_f * noise[0], g + sign * in_g * noise[1], GRID, MASK)
+            found = correlate(noisy, SMALL, guess=np.zeros(SMALL.size), options=options)
             at = [SMALL.v0_slice(c).start for c in (0, 1)]
             errors.append(found.unknowns[at] / PIXEL - truth)
             sds.append(found.standard_errors(ImageNoise(in_f, in_g))[at] / PIXEL)
@@ -356,7 +362,9 @@ def test_pixels_at_the_border_do_not_keep_a_correlation_from_settling() -> None:
         noise = 0.01 * np.random.default_rng(seed).normal(size=(2, *GRID.shape))
         options = CorrelationOptions(gradient="reference")
         start = np.zeros(SMALL.size)
-        found = correlate(f + noise[0], g + noise[1], GRID, SMALL, start, options=options)
+        found = correlate(
+            ImagePair(f + noise[0], g + noise[1], GRID), SMALL, guess=start, options=options
+        )
         assert found.outcome is Outcome.CONVERGED
         assert found.weighting.gradient is Gradient.REFERENCE
 
@@ -365,7 +373,7 @@ def test_a_root_that_is_not_found_is_told() -> None:
     """Weights that have nothing to do with the images lead nowhere."""
     f, g = pair()
     used = Assembly(ANSATZ, GRID, MASK)
-    level = level_pair(f, g, GRID, MASK, None, FULL, edge_px=2, order=5)
+    level = level_pair(ImagePair(f, g, GRID, MASK), FULL, edge_px=2, order=5)
     here = used.images(truth(), level.reference, level.deformed)
     noise = np.random.default_rng(1).normal(size=(3, *GRID.shape)).astype(np.float32)
     found = root(

@@ -49,6 +49,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.spectra.pattern import (
     WavePattern,
     mode_deviation,
@@ -58,7 +59,6 @@ from modeharvest.idic.spectra.pattern import (
 from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.idic.uncertainty.identifiability import identifiability
-from modeharvest.idic.uncertainty.noise import ImageNoise
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -341,16 +341,11 @@ def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> list[
     Each unit cell's share of the residual counts as one draw: where noise says how well the
     images determine the unknowns, this says how far w moves them.
     """
-    images, how, result = measured.images, measured.how, comparison.result
-    pair = (
-        images.reference(camera=how.camera),
-        images.deformed(comparison.strain, camera=how.camera),
-    )
-    masks = images.mask(), images.deformed_mask(comparison.strain)
+    how, result = measured.how, comparison.result
+    pair = measured.images.pair(comparison.strain, camera=how.camera)
     try:
-        found = MatchedImages.of(result, pair, masks, how.edge_px).model_error_covariance(
-            result, measured.specimen.pitch
-        )
+        matched = MatchedImages.of(result, pair, how.edge_px)
+        found = matched.sandwich_covariance(measured.specimen.pitch)
     except InputError:  # a specimen of too few cells
         return [None] * result.ansatz.size
     return _finite_or_none(np.sqrt(np.diag(found)))

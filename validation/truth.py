@@ -13,7 +13,6 @@ or the noise of a local DIC is quoted. The rms of the vectors' length is sqrt(2)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,11 +20,9 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.correlate import best_fit
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.assembly import Assembly, residual
-from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.spline import SplineImage
@@ -71,12 +68,6 @@ def describe(field: FloatArray, mask: BoolArray, unit: float = 1.0) -> dict[str,
         "p95_length": float(p95),
         "max_length": float(largest),
     }
-
-
-_ENOUGH = 40_000
-"""Pixels of material that tell one minimum of the best fit from another."""
-_CLOSE = GaussNewtonOptions(tolerance_px=1e-5)
-"""A tenth of a correlation's tolerance: the best fit is what that is measured by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +145,7 @@ def compare(
     """
     grid, mask, ansatz = images.grid, images.mask(), result.ansatz
     truth = images.truth(strain).displacement
-    best = best_fit(truth, grid, ansatz, (result.unknowns, start), mask, progress)
+    best = best_fit(images.truth(strain), result, guesses=(start,), progress=progress)
     left = residual(
         Assembly(ansatz, grid, mask),
         result.unknowns,
@@ -162,49 +153,6 @@ def compare(
         SplineImage.of(images.deformed(strain, camera=camera)),
     )
     return Comparison(strain, grid, mask, truth, result, best, left.astype(np.float64))
-
-
-def best_fit(
-    displacement: FloatArray,
-    grid: PixelGrid,
-    ansatz: Ansatz,
-    starts: Sequence[FloatArray],
-    mask: BoolArray,
-    progress: Progress = silent,
-) -> Result:
-    """Fit an ansatz to a known displacement, and take the best that is reached from some starts.
-
-    Which that is, and most of the way there, is found on some tens of thousands of pixels: the
-    ansatz is smooth, and its minima are far apart.
-
-    Parameters
-    ----------
-    displacement
-        (rows, cols, 2) [mm]; may be NaN outside the mask.
-    grid
-        The pixels.
-    ansatz
-        What is fitted.
-    starts
-        (n,) unknowns each.
-    mask
-        (rows, cols) True where the displacement counts.
-    progress
-        Listener.
-    """
-    every = max(1, int(np.sqrt(mask.sum() / _ENOUGH)))
-    # As far from the first row and column as from the last: a symmetric field stays symmetric.
-    top, left = ((size - 1) % every // 2 for size in grid.shape)
-    few = np.s_[top::every, left::every]
-    rows, cols = mask[few].shape
-    (x,), (y,) = grid.to_mm([top], [left])
-    coarse = PixelGrid(rows, cols, every * grid.pixel_size, x, y)
-    reached = min(
-        (fit_displacement(displacement[few], coarse, ansatz, a, mask[few], _CLOSE) for a in starts),
-        key=lambda fit: fit.residual_rms,
-    )
-    begin = np.append(reached.unknowns, starts[0][reached.unknowns.size :])
-    return fit_displacement(displacement, grid, ansatz, begin, mask, _CLOSE, progress)
 
 
 @dataclass(frozen=True)

@@ -107,11 +107,8 @@ class _Ways:
         return self._ours(*self.pair.fixed())
 
     def _ours(self, ansatz: Ansatz, start: FloatArray) -> Result:
-        pair = self.pair
-        return correlate(
-            pair.reference, pair.deformed, pair.grid, ansatz, start, pair.mask,
-            pair.deformed_mask, CorrelationOptions(edge_px=self.edge_px),
-        )  # fmt: skip
+        options = CorrelationOptions(edge_px=self.edge_px)
+        return correlate(self.pair.images, ansatz, guess=start, options=options)
 
     def pyxel(self, way: str) -> Callable[[], pyxel_side.Found]:
         """pyxel's, in one of three ways."""

@@ -20,6 +20,7 @@ from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
+from modeharvest.imaging.pair import ImagePair as CheckedPair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.runs.case import Case, shipped_solution
 
@@ -81,8 +82,13 @@ class ImagePair:
         inside[row, col] = allowed[to]
         return inside
 
-    def held(self) -> tuple[Ansatz, FloatArray]:
-        """Ansatz and start with the mode's parameters held at the start."""
+    @property
+    def images(self) -> CheckedPair:
+        """The images as ours takes them."""
+        return CheckedPair(self.reference, self.deformed, self.grid, self.mask, self.deformed_mask)
+
+    def fixed(self) -> tuple[Ansatz, FloatArray]:
+        """Ansatz and start with the mode's parameters fixed at the start."""
         (mode,), n = self.ansatz.modes, self.ansatz.phi_offset(0)
         family = replace(mode.family, start=self.start[self.ansatz.phi_slice(0)]).fixed()
         return replace(self.ansatz, modes=(replace(mode, family=family),)), self.start[:n]

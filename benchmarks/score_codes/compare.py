@@ -67,6 +67,11 @@ class Task:
         return cls(public, entry["camera_image"], f, g, mask, grid, strain)
 
     @property
+    def pair(self) -> ImagePair:
+        """The images with both masks."""
+        return ImagePair(self.reference, self.deformed, self.grid, self.mask, self.deformed_mask)
+
+    @property
     def deformed_mask(self) -> np.ndarray:
         """Material is nowhere black."""
         return np.asarray(self.deformed > 25)
@@ -76,11 +81,8 @@ def idic(task: Task, field: Path, codes: str) -> None:
     """Micromorphic IDIC with the paper's ansatz and start: it knows where the holes are."""
     how = SquareLatticeOptions()
     ansatz = how.ansatz(Specimen())
-    found = correlate(
-        task.reference, task.deformed, task.grid, ansatz,
-        ansatz.initial_guess(task.strain, how.start_amplitude),
-        task.mask, task.deformed_mask, how.options(),
-    )  # fmt: skip
+    guess = ansatz.initial_guess(task.strain, how.start_amplitude)
+    found = correlate(task.pair, ansatz, guess=guess, options=how.options())
     step, grid = STEP_PX, task.grid
     row, col = np.mgrid[step // 2 : grid.rows : step, step // 2 : grid.cols : step]
     row, col = (i[task.mask[row, col]] for i in (row, col))
@@ -96,8 +98,7 @@ def pyvale(filling: float) -> Callable[[Task, Path, str], None]:
     def run(task: Task, field: Path, codes: str) -> None:
         os.environ[WHERE] = codes
         options = SubsetOptions(subset_px=SUBSET_PX, step_px=STEP_PX, filling=filling)
-        pair = ImagePair(task.reference, task.deformed, task.grid, task.mask, task.deformed_mask)
-        write_field(field, subset_field(pair, options))
+        write_field(field, subset_field(task.pair, options))
 
     return run
 

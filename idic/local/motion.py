@@ -147,6 +147,8 @@ def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tupl
 
     Parameters
     ----------
+    pair
+        Whose masks are looked at.
     domain
         Of the polynomial [mm].
     pair
@@ -258,10 +260,7 @@ def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
         If the known part leads out of the image altogether.
     """
     factor = max(1, round(cell_size / (CELL_PX * pair.grid.pixel_size)))
-    level = level_pair(
-        pair.reference, pair.deformed, pair.grid, pair.mask, pair.deformed_mask,
-        Level(factor, BLUR), 0, 3, levelled=True,
-    )  # fmt: skip
+    level = level_pair(pair, Level(factor, BLUR), 0, 3, normalised=True)
     coarse = level.grid
     points = np.stack(np.broadcast_arrays(coarse.x[None, :], coarse.y[:, None]), axis=-1)
     slow = np.asarray(known(points), dtype=np.float64)

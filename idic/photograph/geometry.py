@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.idic.photograph.matching import (
     BlockMatch,
@@ -205,8 +204,8 @@ class Geometry:
             return (), f"The holes could not be followed: {error}."
 
 
-def find_geometry(prepared: PreparedPhotographs, table: SpecimenTable, base: Path) -> Geometry:
-    """Find holes, lattice and cellular part in the reference.
+def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: Path) -> Geometry:
+    """Find holes, lattice and cellular part in the reference's material (rows, cols).
 
     Raises
     ------
@@ -214,7 +213,6 @@ def find_geometry(prepared: PreparedPhotographs, table: SpecimenTable, base: Pat
         If the holes contradict the cell size, there is no lattice and no region is given, or
         given parts lie outside the image or on one another.
     """
-    grid, mask = prepared.grid, prepared.mask()
     lattice: HoleLattice | None = None
     try:
         lattice = find_hole_lattice(mask, table.cell_size / grid.pixel_size)

@@ -1,4 +1,4 @@
-"""Measurement of one photograph: initial guess, correlation, final smoothing, error analysis.
+"""Measurement of one photograph: its noise, initial guess, correlation, residual test.
 
 With it a sequence can be correlated image by image: g_k against g_(k-1) at x + u_(k-1), which
 takes the reference's place. The unknowns stay those of the whole displacement, so there is
@@ -8,7 +8,6 @@ however, the next ones inherit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry, confirmed_by_speckle, matched_holes
 from modeharvest.idic.photograph.initial_guess import (
     InitialGuess,
@@ -29,131 +27,53 @@ from modeharvest.idic.photograph.initial_guess import (
 )
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import PhotographOptions
-from modeharvest.idic.slow_fields import Brightness
-from modeharvest.idic.solver.final_smoothing import (
-    FinalSmoothing,
-    blurred_pair,
-    final_smoothing,
-    speckle_size,
-)
+from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.idic.solver.noise import GIVEN, CameraNoise, ImageNoise, estimated_noise
 from modeharvest.idic.solver.pyramid import eroded
-from modeharvest.idic.uncertainty.covariance import (
-    MatchedImages,
-    hessian_corrected_covariance,
-    noise_covariance,
-)
-from modeharvest.idic.uncertainty.identifiability import identifiability
-from modeharvest.idic.uncertainty.noise import GIVEN, ImageNoise, estimated_noise
-from modeharvest.idic.uncertainty.residual_test import ResidualTest, autocorrelation, lags_for
+from modeharvest.idic.solver.residual_test import ResidualTest, autocorrelation, lags_for
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
 
-def noise_of(prepared: PreparedPhotographs, name: str) -> ImageNoise:
+def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
     """Noise of the reference and of a deformed photograph [grey levels].
 
     Unless it was given for both, the deformed one's is larger or smaller by as much as its finest
     details are: a lamp that has aged, or other exposure, shows there.
     """
-    sd = prepared.noise.sd
-    if prepared.noise.source == GIVEN:
+    sd = camera.sd
+    if camera.source == GIVEN:
         return ImageNoise(sd, sd)
-    seen = prepared_pair(prepared, name)
     in_f, in_g = (
         estimated_noise(image, mask).sd
-        for image, mask in zip((seen.reference, seen.deformed), seen.masks, strict=True)
+        for image, mask in zip((pair.reference, pair.deformed), pair.masks, strict=True)
     )
     return ImageNoise(sd, sd * in_g / in_f if in_f > 0.0 else sd)
 
 
-def covariances(
-    measured: MeasuredPhotograph, pair: ImagePair, noise: ImageNoise, cell: float
-) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
-    """Covariances of the unknowns by the images' noise and by what the ansatz leaves over.
+def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: int) -> ResidualTest:
+    """Test the residual of the unfiltered photographs against their noise.
 
     Parameters
     ----------
-    measured
-        What came out of a photograph.
-    pair
-        That was correlated.
-    noise
-        Of the two photographs.
-    cell
-        Edge of the blocks that are taken for independent [mm].
-
-    Returns
-    -------
-    by_noise, by_model_error, warnings
-        (n, n) each; the second None where there are too few cells, which the warnings say.
+    result, pair, noise
+        What was measured on photographs, and their noise.
+    edge_px
+        Pixels so near to a hole are left out [px].
     """
-    result, blur, order = measured.result, measured.blur_px, measured.result.order
-    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
-    if blur > 0.0:
-        images = blurred_pair(*images, *pair.masks, blur)
-    seen = MatchedImages.of(result, images, (pair.mask, pair.deformed_mask), _EDGE_PX)
-    soft = seen.softness(result)
-    by_noise = hessian_corrected_covariance(result, noise, soft)
-    try:
-        by_model_error = seen.model_error_covariance(result, cell, soft)
-        if blur > 0.0:
-            by_noise = noise_covariance(
-                result, seen.reference, seen.deformed, _noises(pair, blur, noise), seen.used,
-                cell, order, soft,
-            )  # fmt: skip
-    except InputError as error:
-        return by_noise, None, (f"No error bars for what the ansatz leaves over: {error}.",)
-    return by_noise, by_model_error, ()
-
-
-_EDGE_PX = 3
-
-
-def _noises(
-    pair: ImagePair, blur: float, noise: ImageNoise
-) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """What a blur makes of examples of white noise in both images."""
-    rng = np.random.default_rng(0)
-    quiet = blurred_pair(pair.reference, pair.deformed, *pair.masks, blur)
-    for _ in range(_EXAMPLES):
-        f, g = (
-            image + np.float32(sd) * rng.standard_normal(image.shape, dtype=np.float32)
-            for image, sd in ((pair.reference, noise.reference), (pair.deformed, noise.deformed))
-        )
-        loud = blurred_pair(f, g, *pair.masks, blur)
-        yield loud[0] - quiet[0], loud[1] - quiet[1]
-
-
-_EXAMPLES = 4
-
-
-def prepared_pair(prepared: PreparedPhotographs, name: str) -> ImagePair:
-    """The reference and a deformed photograph."""
-    return ImagePair(
-        prepared.image(), prepared.image(name), prepared.grid, prepared.mask(), prepared.mask(name)
-    )
-
-
-def residual_test(
-    measured: MeasuredPhotograph, reference: NDArray[Any], image: NDArray[Any], prepared: PreparedPhotographs,
-    noise: ImageNoise,
-) -> ResidualTest:  # fmt: skip
-    """The residual of the photographs as they are against their noise, lit alike."""
-    result = measured.result
-    if measured.blur_px == 0.0:
+    if result.final_smoothing is None or result.final_smoothing.blur_px == 0.0:
         return result.residual_test(noise)
-    back, seen = pulled_back(image, result, result.order)
-    used = eroded(prepared.mask(), _EDGE_PX) & seen
-    f, g = reference[used], back[used]
+    back, inside = pulled_back(pair.deformed, result, result.order)
+    used = eroded(pair.masks[0], edge_px) & inside
+    f, g = pair.reference[used], back[used]
     gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
     offset = f.mean(dtype=np.float64) - gain * g.mean(dtype=np.float64)
-    residual = np.where(used, reference - np.float32(gain) * back - np.float32(offset), np.nan)
+    residual = np.where(used, pair.reference - np.float32(gain) * back - np.float32(offset), np.nan)
     rms = float(np.sqrt(np.nanmean(np.square(residual, dtype=np.float64))))
-    lags = lags_for(speckle_size(reference, used))
+    lags = lags_for(speckle_size(pair.reference, used))
     return ResidualTest.of(
         rms, autocorrelation(residual, lags), int(used.sum()), result.ansatz.size,
         result.residual_noise(noise), lags,
@@ -172,8 +92,6 @@ class MeasuredPhotograph:
         The displacement field that the start was read from, a local DIC's if there is one.
     fixed
         Whether the mode was fixed.
-    blur_px
-        Of the images that the correlation ended on [px]; 0 for the images as they are.
     sentences
         Where the correlation started from and ended, in words.
     """
@@ -181,7 +99,6 @@ class MeasuredPhotograph:
     result: Result
     local: LocalField
     fixed: bool
-    blur_px: float
     sentences: tuple[str, ...]
 
 
@@ -233,61 +150,23 @@ def measure(
     )  # fmt: skip
     ansatz, unknowns, fixed = chosen_modes(guess, geometry, cell_size, how)
     sentences = (said, *_guess_text(guess, ansatz, geometry))
+    options = how.options()
     if before is not None and _goes_on(before, ansatz, unknowns, fixed):
-        found, finish = correlated(
-            pair, geometry, *_with_brightness(before.result, how), how, progress
-        )
+        again, there = _with_brightness(before.result, how)
+        found = correlate(pair, again, guess=there, options=options, progress=progress)
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
-            said_all = (*sentences, words, finish.sentence)
-            return MeasuredPhotograph(found, guess.local, before.fixed, finish.blur_px, said_all)
-    found, finish = correlated(pair, geometry, ansatz, unknowns, how, progress)
-    return MeasuredPhotograph(
-        found, guess.local, fixed, finish.blur_px, (*sentences, finish.sentence)
-    )
+            return _measured(found, guess.local, before.fixed, (*sentences, words))
+    found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
+    return _measured(found, guess.local, fixed, sentences)
 
 
-def correlated(
-    pair: ImagePair,
-    geometry: Geometry,
-    ansatz: Ansatz,
-    unknowns: FloatArray,
-    how: PhotographOptions,
-    progress: Progress = silent,
-) -> tuple[Result, FinalSmoothing]:
-    """Correlate from coarse to fine, and finish as the leftover on the last coarse level asks for.
-
-    Parameters
-    ----------
-    pair, geometry
-        Images and specimen.
-    ansatz, unknowns
-        The start.
-    how
-        How to correlate.
-    progress
-        Listener.
-
-    Returns
-    -------
-    result, finish
-        A result on blurred images has no unknowns for gain and offset: levelling did that.
-    """
-    options, grid = how.options(), geometry.grid
-    masks = pair.masks
-    coarse = replace(options, levels=options.levels[:-1])
-    images: tuple[NDArray[Any], NDArray[Any]] = pair.reference, pair.deformed
-    rough = correlate(*images, grid, ansatz, unknowns, *masks, coarse, progress)
-    binned = rough.grid.pixel_size / grid.pixel_size
-    model_error_px = binned * identifiability(rough, None).model_error_px
-    finish = final_smoothing(pair.reference, masks[0], model_error_px)
-    if finish.blur_px > 0.0:
-        images = blurred_pair(*images, *masks, finish.blur_px)
-        ansatz = replace(ansatz, brightness=Brightness())
-    fine = replace(options, levels=options.levels[-1:])
-    start = rough.unknowns[: ansatz.size]
-    result = correlate(*images, grid, ansatz, start, *masks, fine, progress)
-    return replace(result, history=(*rough.history, *result.history)), finish
+def _measured(
+    result: Result, local: LocalField, fixed: bool, sentences: tuple[str, ...]
+) -> MeasuredPhotograph:
+    """What was measured, with what was done to the images at last."""
+    assert result.final_smoothing is not None
+    return MeasuredPhotograph(result, local, fixed, (*sentences, result.final_smoothing.sentence))
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from modeharvest.idic.solver.pyramid import eroded, locally_normalised
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
 _LONGEST = 64
@@ -74,7 +75,7 @@ def _lagged(values: NDArray[Any], n: int) -> FloatArray:
 
 
 WIDTHS = 6.0
-"""Speckles are as wide as that many rms lengths of w per component. Where 10 px speckles are
+"""Speckles have to be as wide as that many rms lengths of w per component. Where 10 px speckles are
 measured with w of 2 px, the paper's virtual experiment, nothing has to be blurred."""
 AROUND = 2.0
 """How far local mean and contrast reach [blurs]: nearly a single speckle."""
@@ -85,82 +86,74 @@ _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 @dataclass(frozen=True)
 class FinalSmoothing:
-    """How the last level looks.
+    """Which images the last level compares.
 
     Parameters
     ----------
-    width_px
+    speckle_size_px
         Full width at half maximum of the speckle's autocorrelation [px].
     model_error_px
-        What the ansatz leaves over, rms per component [px].
+        Estimate of w on a coarser level, rms per component [px].
     blur_px
         Standard deviation of the blur [px]; 0 for none.
     """
 
-    width_px: float
+    speckle_size_px: float
     model_error_px: float
     blur_px: float
+
+    @classmethod
+    def of(cls, pair: ImagePair, model_error_px: float) -> FinalSmoothing:
+        """Choose the blur that makes speckles as wide as the model error needs."""
+        size = speckle_size(pair.reference, pair.mask)
+        wanted = (WIDTHS * model_error_px) ** 2 - size**2
+        # Widths of Gaussians add up in squares; a blur of s widens an autocorrelation by sqrt(2) s.
+        blur = float(np.sqrt(max(0.0, wanted / 2.0)) / _FWHM)
+        return cls(size, model_error_px, blur if blur >= _LEAST_BLUR else 0.0)
+
+    @classmethod
+    def given(cls, pair: ImagePair, blur_px: float) -> FinalSmoothing:
+        """A blur that was chosen without an estimate of the model error."""
+        return cls(speckle_size(pair.reference, pair.mask), np.nan, blur_px)
 
     @property
     def sentence(self) -> str:
         """That in words."""
         start = (
-            f"The speckle's autocorrelation is {self.width_px:.1f} px wide, the ansatz leaves "
-            f"about {self.model_error_px:.2g} px over"
+            f"The speckle size (autocorrelation) is {self.speckle_size_px:.1f} px, the model error "
+            f"about {self.model_error_px:.2g} px"
         )
         if self.blur_px == 0.0:
-            return f"{start}: the correlation ends on the images as they are."
+            return f"{start}: the correlation ends on the unfiltered images."
         return (
             f"{start}, too much for such fine speckles: the correlation ends on images blurred "
             f"by {self.blur_px:.1f} px, with a local mean of 0 and a local contrast of 1."
         )
 
 
-def final_smoothing(image: NDArray[Any], mask: BoolArray, model_error_px: float) -> FinalSmoothing:
-    """Decide how to finish.
+def smoothed_pair(pair: ImagePair, blur_px: float) -> ImagePair:
+    """Both images blurred over their material and locally normalised, in f's grey levels.
 
     Parameters
     ----------
-    image, mask
-        (rows, cols) the reference and its material.
-    model_error_px
-        Rms per component of w, as a coarser level tells it [px].
-    """
-    width = speckle_size(image, mask)
-    wanted = (WIDTHS * model_error_px) ** 2 - width**2
-    # Widths of Gaussians add up in squares; a blur of s widens an autocorrelation by sqrt(2) s.
-    blur = float(np.sqrt(max(0.0, wanted / 2.0)) / _FWHM)
-    return FinalSmoothing(width, model_error_px, blur if blur >= _LEAST_BLUR else 0.0)
-
-
-def blurred_pair(
-    reference: NDArray[Any],
-    deformed: NDArray[Any],
-    mask: BoolArray,
-    deformed_mask: BoolArray,
-    blur_px: float,
-) -> tuple[FloatImage, FloatImage]:
-    """Both images blurred over their material and levelled, in the reference's grey levels.
-
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) f and g.
-    mask, deformed_mask
-        (rows, cols) True on material.
+    pair
+        Of images.
     blur_px
-        Standard deviation [px].
+        Standard deviation [px]; 0 for the pair itself.
     """
-    f = locally_normalised(reference, mask, blur_px, AROUND)
-    g = locally_normalised(deformed, deformed_mask, blur_px, AROUND)
-    scale = contrast_after(reference, mask, blur_px)
-    f *= scale
-    g *= scale
-    return f, g
+    if blur_px == 0.0:
+        return pair
+    f = locally_normalised(pair.reference, pair.mask, blur_px, AROUND)
+    g = locally_normalised(pair.deformed, pair.deformed_mask, blur_px, AROUND)
+    contrast = contrast_after(pair.reference, pair.mask, blur_px)
+    f *= contrast
+    g *= contrast
+    return pair.with_images(f, g)
 
 
-def contrast_after(image: NDArray[Any], mask: BoolArray, blur_px: float) -> np.float32:
+def contrast_after(image: FloatImage, mask: BoolArray | None, blur_px: float) -> np.float32:
     """Standard deviation that a speckle has after a blur [grey levels]."""
-    inner = eroded(mask, int(np.ceil(3.0 * blur_px)))
+    inner = np.ones(image.shape, np.bool_) if mask is None else mask
+    reach = eroded(inner, int(np.ceil(3.0 * blur_px)))
     smooth = ndimage.gaussian_filter(np.asarray(image, dtype=np.float32), blur_px)
-    return np.float32(smooth[inner if inner.any() else mask].std(dtype=np.float64))
+    return np.float32(smooth[reach if reach.any() else inner].std(dtype=np.float64))

@@ -24,8 +24,6 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.scaled_eigen import ScaledEigen
 
-"""Columns of the Jacobian smaller than this share of the largest one are taken for zero."""
-
 
 class Outcome(Enum):
     """Why an iteration ended; ``explanation`` says it in a sentence."""
@@ -63,8 +61,8 @@ _EXPLANATIONS = {
     ),
     Outcome.LOCAL_MINIMUM: (
         "The iteration ended where parts of the images don't match at all: a local minimum; "
-        "start closer, with other mode parameters, or with coarser speckle: fine speckle beside "
-        "a large displacement that the ansatz can't describe traps it, from any start."
+        "start closer, with other mode parameters, or with coarser speckle: beside a large model "
+        "error, fine speckle has local minima near any initial guess."
     ),
     Outcome.UNWEIGHTED: (
         "The least-squares minimum was found, but from there no way to where the gradient that "
@@ -193,7 +191,7 @@ def minimise(
     factor: int = 1,
     on_iteration: Callable[[int], None] = lambda number: None,
     curvature: FloatArray | None = None,
-    least: float = 0.0,
+    eigenvalue_cutoff: float = 0.0,
 ) -> Minimum:
     """Minimise 1/2 sum r^2.
 
@@ -213,13 +211,13 @@ def minimise(
         Called with the number of each finished iteration.
     curvature
         (n, n) what to begin with in place of J'J, if something is known already.
-    least
+    eigenvalue_cutoff
         Directions with an eigenvalue below this share of the largest one get no step [-].
     """
     at = _SearchPoint.of(start, evaluate(start, curvature is None), curvature)
-    limits = _Limits(options, tolerance_px, _SHORT * factor, least)
+    limits = _Limits(options, tolerance_px, _SHORT * factor, eigenvalue_cutoff)
     history: list[Iteration] = []
-    outcome = Outcome.OUTSIDE_IMAGE if _left(at.equations) > options.max_outside else None
+    outcome = Outcome.OUTSIDE_IMAGE if _share_outside(at.equations) > options.max_outside else None
     while outcome is None:
         if not np.any(at.curvature):
             outcome = Outcome.SINGULAR
@@ -263,7 +261,7 @@ class _Limits:
     options: GaussNewtonOptions
     tolerance_px: float
     short_px: float
-    least: float
+    eigenvalue_cutoff: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,14 +281,14 @@ def _descend(
     """Take a step that lowers the cost, damped as much as it takes."""
     eigen, damping = ScaledEigen.of(at.curvature), at.damping
     while True:
-        a = at.a - eigen.solve(at.equations.gradient, damping, limits.least)
+        a = at.a - eigen.solve(at.equations.gradient, damping, limits.eigenvalue_cutoff)
         length = step_length(at.a, a)
         is_settling = damping == 0.0 and length < limits.short_px and not at.has_fallen
         # The last step's matrix is wanted for the covariance.
         is_assembled = not is_settling or length <= limits.tolerance_px
         found = evaluate(a, is_assembled)
         descends = found.mean_square <= at.equations.mean_square
-        accepted = descends and _left(found) <= limits.options.max_outside
+        accepted = descends and _share_outside(found) <= limits.options.max_outside
         if accepted or length <= limits.tolerance_px or damping >= _LARGEST_DAMPING:
             break
         damping = max(_FIRST_DAMPING, 10.0 * damping)
@@ -336,6 +334,6 @@ def standard_errors(step: FloatArray, curvature: FloatArray, at: NormalEquations
     return float(np.sqrt(squares / (at.mean_square * step.size)))
 
 
-def _left(equations: NormalEquations) -> float:
+def _share_outside(equations: NormalEquations) -> float:
     """Fraction of the pixels that are mapped outside the image."""
     return equations.outside_image / max(1, equations.outside_image + equations.pixels)

@@ -53,7 +53,7 @@ class LevelSearch:
         The kinematics.
     factor
         Its binning.
-    least
+    eigenvalue_cutoff
         Directions less determined than this share of the best one stay as they are [-].
     tolerance_px, rough_px
         Steps to stop at, with all pixels and with every few rows [px].
@@ -66,27 +66,27 @@ class LevelSearch:
     pair: LevelPair
     ansatz: Ansatz
     factor: int
-    least: float
+    eigenvalue_cutoff: float
     tolerance_px: float
     rough_px: float
     options: GaussNewtonOptions
     on_iteration: Callable[[int], None]
 
-    def better(self, a: FloatArray, before: FloatArray) -> FloatArray:
-        """Choose what fits better: the last level's unknowns, or those it began with.
+    def lower_cost(self, a: FloatArray, before: FloatArray) -> FloatArray:
+        """Choose what has the lower cost: the last level's unknowns, or those it began with.
 
         A speckle that is too fine for a coarse blur leaves no information there, and the level
         leads astray; this takes its steps back.
         """
         if np.array_equal(a, before):
             return a
-        some = self._thinned(self._everything)
+        some = self._thinned(self._all_pixels)
         costs = [self._equations(some, x, False).mean_square for x in (a, before)]
         return a if costs[0] <= costs[1] else before
 
     def minimum(self, start: FloatArray) -> tuple[Minimum, Assembly]:
         """Find it, and the pixels it was found with."""
-        assembly = self._landed(start)
+        assembly = self._valid_assembly(start)
         history: tuple[Iteration, ...] = ()
         curvature = None
         some = self._thinned(assembly)
@@ -104,7 +104,7 @@ class LevelSearch:
             used, start, curvature = assembly, found.unknowns, found.curvature
             if self.pair.valid is None:
                 break
-            assembly = self._landed(start)
+            assembly = self._valid_assembly(start)
             if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
                 break
         return replace(found, history=history), used
@@ -134,21 +134,21 @@ class LevelSearch:
         there = root(evaluate, how.slope, length, found, self.options, self.on_iteration)
         return there, how
 
-    def _landed(self, a: FloatArray) -> Assembly:
+    def _valid_assembly(self, a: FloatArray) -> Assembly:
         """All pixels, less those that these unknowns map onto no material, or off the image."""
         pair = self.pair
         if pair.valid is None:
-            return self._everything
-        kept, outside = valid_pixels(self._everything, a, pair.reference, pair.deformed, pair.valid)
-        return replace(self._everything, mask=kept, outside=outside)
+            return self._all_pixels
+        kept, outside = valid_pixels(self._all_pixels, a, pair.reference, pair.deformed, pair.valid)
+        return replace(self._all_pixels, mask=kept, outside=outside)
 
     @property
     def _only_leads(self) -> bool:
         """Whether this is a coarse level: the next one has to be reached, and no more."""
-        return self.least > 0.0
+        return self.eigenvalue_cutoff > 0.0
 
     @cached_property
-    def _everything(self) -> Assembly:
+    def _all_pixels(self) -> Assembly:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
 
     @cached_property
@@ -176,7 +176,7 @@ class LevelSearch:
             self.factor,
             self.on_iteration,
             curvature,
-            self.least,
+            self.eigenvalue_cutoff,
         )
 
     def _limits(self, assembly: Assembly) -> GaussNewtonOptions:

@@ -16,6 +16,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, border_reach
 from modeharvest.util.arrays import BoolArray
 from modeharvest.util.compiled import compiled, readable
@@ -184,51 +185,38 @@ class LevelPair:
 
 
 def level_pair(
-    reference: Image,
-    deformed: Image,
-    grid: PixelGrid,
-    mask: BoolArray | None,
-    deformed_mask: BoolArray | None,
-    level: Level,
-    edge_px: int,
-    order: int,
-    levelled: bool = False,
+    pair: ImagePair, level: Level, edge_px: int, order: int, *, normalised: bool = False
 ) -> LevelPair:
     """Make one level of a pair of images.
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) f and g.
-    grid
-        Their pixels.
-    mask, deformed_mask
-        (rows, cols) True on material, of f and of g; None if not known. Holes are kept out of
-        the blur only if both are known: they have to look alike in the two images.
+    pair
+        Holes are kept out of the blur only if both masks are known: they have to look alike in
+        the two images.
     level
         Binning and blur.
     edge_px
         Pixels closer than this to the mask's edge are left out on the finest level [px].
     order
-        Of the spline, 3 or 5.
-    levelled
+        Of the spline: 3, 5 or 11.
+    normalised
         Give both images a local mean of 0 and a local contrast of 1, so that differences of
         brightness that vary slowly are gone; for blurred levels only.
     """
-    reference, deformed = (np.asarray(image, np.float32) for image in (reference, deformed))
-    f_weight = mask if deformed_mask is not None else None
+    grid, f_weight = pair.grid, pair.mask if pair.deformed_mask is not None else None
     is_finest = level == FULL
     # The reference is never sampled between its pixels: no need to continue it into holes.
-    f = reference if is_finest else _smooth(reference, f_weight, level)
-    g = _smooth(deformed, deformed_mask, level)
-    if levelled and level.blur > 0:
+    f = pair.reference if is_finest else _smooth(pair.reference, f_weight, level)
+    g = _smooth(pair.deformed, pair.deformed_mask, level)
+    if normalised and level.blur > 0:
         f, g = _locally_normalised(f, level.blur), _locally_normalised(g, level.blur)
-    inside = np.ones(grid.shape, dtype=np.bool_) if mask is None else mask
+    inside = pair.masks[0]
     if is_finest:
         inside = eroded(inside, edge_px)
-        valid = _valid(deformed_mask, grid.shape, edge_px, order)
+        valid = _valid(pair.deformed_mask, grid.shape, edge_px, order)
     else:
-        inside = binned(reference, inside, level.factor)[1] >= 0.5
+        inside = binned(pair.reference, inside, level.factor)[1] >= 0.5
         valid = None
     return LevelPair(grid.binned(level.factor), f, SplineImage.of(g, order), inside, valid)
 
@@ -315,7 +303,7 @@ def locally_normalised(
 ) -> NDArray[np.float32]:
     """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
 
-    Where all speckles count alike, what an ansatz leaves over weighs alike everywhere.
+    Where all speckles count alike, the model error weighs alike everywhere.
 
     Parameters
     ----------

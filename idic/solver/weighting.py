@@ -37,7 +37,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.idic.pair import CheckedImages
 from modeharvest.idic.solver.assembly import Assembly, NormalEquations, push_forward, warped_back
 from modeharvest.idic.solver.gauss_newton import (
     GaussNewtonOptions,
@@ -48,8 +47,9 @@ from modeharvest.idic.solver.gauss_newton import (
     corrected,
     standard_errors,
 )
+from modeharvest.idic.solver.noise import slope_noise
 from modeharvest.idic.solver.pyramid import LevelPair, blurred, smoothed
-from modeharvest.idic.uncertainty.noise import slope_noise
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -80,19 +80,19 @@ class Weighting:
     blur_px
         Standard deviation of the blur of the image that the gradient is taken of [px]; 0 for
         none.
-    width_px
+    speckle_size_px
         Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known.
     """
 
     gradient: Gradient = Gradient.DEFORMED
     blur_px: float = 0.0
-    width_px: float = np.inf
+    speckle_size_px: float = np.inf
 
     def __post_init__(self) -> None:
-        if not (self.blur_px >= 0 and self.width_px > 0):
+        if not (self.blur_px >= 0 and self.speckle_size_px > 0):
             raise InputError(
                 "expected a blur of at least 0 px and a speckle wider than 0 px, got "
-                f"{self.blur_px} and {self.width_px}"
+                f"{self.blur_px} and {self.speckle_size_px}"
             )
 
     @property
@@ -118,7 +118,7 @@ class Weighting:
         noise *= slope_noise(order, self.blur_px)
         if self.blur_px == 0.0:
             return 0.5 * noise
-        t = (self.blur_px * _FWHM / self.width_px) ** 2
+        t = (self.blur_px * _FWHM / self.speckle_size_px) ** 2
         return float((1.0 + t) ** 4 * (1.0 / (1.0 + 2.0 * t) ** 2 + 0.5 * noise) - 1.0)
 
     @property
@@ -136,19 +136,19 @@ class Weighting:
         )
 
 
-def best_blur(noise: float, width_px: float, order: int = 5, worth: float = WORTH_IT) -> float:
+def best_blur(noise: float, size_px: float, order: int = 5, worth: float = WORTH_IT) -> float:
     """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
 
     Parameters
     ----------
     noise, order
         As for :meth:`Weighting.excess`.
-    width_px
+    size_px
         Full width at half maximum of the speckle's autocorrelation [px].
     worth
         Share of the variance that a blur has to spare at least [-].
     """
-    candidates = [Weighting(Gradient.REFERENCE, blur, width_px) for blur in (0.0, *_BLURS_PX)]
+    candidates = [Weighting(Gradient.REFERENCE, blur, size_px) for blur in (0.0, *_BLURS_PX)]
     excess = [weighting.excess(noise, order) for weighting in candidates]
     best = int(np.argmin(excess))
     return candidates[best].blur_px if excess[0] - excess[best] > worth else 0.0
@@ -167,7 +167,7 @@ _NEIGHBOURS_PX = 1.0
 
 
 def instrument(
-    weighting: Weighting, images: CheckedImages, pair: LevelPair, used: Assembly, a: FloatArray
+    weighting: Weighting, pair: ImagePair, level: LevelPair, used: Assembly, a: FloatArray
 ) -> NDArray[np.float32]:
     """Make what weighs the residual: (3, rows, cols), slopes along x and y, and grey levels.
 
@@ -179,24 +179,24 @@ def instrument(
     ----------
     weighting
         Which gradient.
-    images, pair
+    pair, level
         f and g, whole and prepared for the finest level.
     used, a
         The pixels that count, and the (size,) unknowns of the least-squares minimum.
     """
-    order = pair.deformed.order
+    order = level.deformed.order
     # As in the pyramid: what is beyond the material is only left out if both masks are known.
-    f_mask = None if images.g_mask is None else images.f_mask
+    f_mask = None if pair.deformed_mask is None else pair.mask
     if weighting.gradient is Gradient.DEFORMED:
-        g = smoothed(images.g, images.g_mask, weighting.blur_px)
-        made = warped_back(used, a, pair.reference, SplineImage.of(g, order))
+        g = smoothed(pair.deformed, pair.deformed_mask, weighting.blur_px)
+        made = warped_back(used, a, level.reference, SplineImage.of(g, order))
     else:
-        f = smoothed(images.f, f_mask, weighting.blur_px)
+        f = smoothed(pair.reference, f_mask, weighting.blur_px)
         rest = np.zeros_like(a)
-        made = warped_back(used, rest, pair.reference, SplineImage.of(f, order))
+        made = warped_back(used, rest, level.reference, SplineImage.of(f, order))
         push_forward(used, a, made)
     if used.ansatz.brightness.gain_degree is not None:
-        made[2] = _neighbours(images.f, f_mask, max(weighting.blur_px, _NEIGHBOURS_PX))
+        made[2] = _neighbours(pair.reference, f_mask, max(weighting.blur_px, _NEIGHBOURS_PX))
     return made
 
 

@@ -3,39 +3,288 @@
 Linear propagation of the unknowns' covariance, at any positions. Two causes are kept apart:
 
 * the images' noise, from :meth:`modeharvest.idic.result.Result.covariance`;
-* what the ansatz leaves over (w): its residual pushes the unknowns about, cell by cell. Taking
-  the cells' pushes for independent gives the covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ with
-  g_b = Σ_{x in b} Jᵀr, the "sandwich" of robust statistics with one block for a unit cell.
+* the model error w: its residual moves the unknowns, cell by cell. Taking the cells for
+  independent gives the sandwich covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ of robust statistics, with the
+  block gradients g_b = Σ_{x in b} Jᵀr and one block for a unit cell.
 
-How far a push moves the unknowns is a matter of the cost's curvature H. Gauss and Newton's JᵀJ is
-that without residual; with a large w the cost is softer, and the same noise does more.
+How far a gradient moves the unknowns is a matter of the cost's Hessian H. Gauss and Newton's JᵀJ is
+that without residual; with a large w the curvature is smaller, and the same noise does more.
 
 Sources: G. Besnard, F. Hild, S. Roux, Exp. Mech. 46 (2006), doi 10.1007/s11340-006-9824-8 (noise);
 H. White, Econometrica 48 (1980), doi 10.2307/1912934 (sandwich).
-
-The deformed image as it is has edges at its holes, and pixels that land there took no part. A
-curvature that sees them is none of the cost's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from modeharvest.idic.result import Result
+from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.solver.assembly import Assembly, valid_pixels
+from modeharvest.idic.solver.final_smoothing import smoothed_pair
+from modeharvest.idic.solver.noise import ImageNoise
 from modeharvest.idic.solver.pyramid import FULL, level_pair
-from modeharvest.idic.uncertainty.noise import ImageNoise
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 
 _FEWEST_BLOCKS = 8
-"""Fewer cells than this tell nothing about how their pushes scatter."""
+"""Fewer blocks than this tell nothing about how their gradients scatter."""
+_ENOUGH_PX, _STEP_PX = 400_000, 0.002
+_SMALL = np.float32(0.05)
+"""Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
+_EXAMPLES = 4
+"""Of filtered noise: with 100 cells a standard deviation is good to 4 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """The (n, n) covariances of a result's unknowns by their causes.
+
+    Parameters
+    ----------
+    by_noise
+        By the images' noise.
+    by_model_error
+        By the residual, cell by cell; None where there are too few cells.
+    warnings
+        Why, one sentence each.
+    """
+
+    by_noise: FloatArray
+    by_model_error: FloatArray | None
+    warnings: tuple[str, ...] = ()
+
+
+def covariance(
+    result: Result, pair: ImagePair, noise: ImageNoise, block: float, edge_px: int
+) -> Covariance:
+    """Find the covariances of the unknowns of a correlation.
+
+    Parameters
+    ----------
+    result, pair
+        Of the correlation, and the images without final smoothing.
+    noise
+        Of the images.
+    block
+        Edge of the blocks that are taken for independent [mm]: the unit cell.
+    edge_px
+        Of :class:`~modeharvest.idic.setup.CorrelationOptions`.
+    """
+    blur_px = result.final_smoothing.blur_px if result.final_smoothing else 0.0
+    matched = MatchedImages.of(result, smoothed_pair(pair, blur_px), edge_px)
+    by_noise = matched.hessian_corrected_covariance(noise)
+    try:
+        by_model_error = matched.sandwich_covariance(block)
+        if blur_px > 0.0:
+            by_noise = matched.noise_covariance(_smoothed_noise(pair, blur_px, noise), block)
+    except InputError as error:
+        return Covariance(by_noise, None, (f"No error bars by model error: {error}.",))
+    return Covariance(by_noise, by_model_error)
+
+
+def _smoothed_noise(
+    pair: ImagePair, blur_px: float, noise: ImageNoise
+) -> Iterator[tuple[FloatImage, FloatImage]]:
+    """What a blur makes of examples of white noise in both images."""
+    rng = np.random.default_rng(0)
+    without = smoothed_pair(pair, blur_px)
+    for _ in range(_EXAMPLES):
+        f, g = (
+            image + np.float32(sd) * rng.standard_normal(image.shape, dtype=np.float32)
+            for image, sd in ((pair.reference, noise.reference), (pair.deformed, noise.deformed))
+        )
+        noisy = smoothed_pair(pair.with_images(f, g), blur_px)
+        yield noisy.reference - without.reference, noisy.deformed - without.deformed
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedImages:
+    """A result and the images as the last level of the correlation compared them.
+
+    Parameters
+    ----------
+    result
+        Of the correlation.
+    reference, deformed
+        (rows, cols) f, and g continued into its holes [grey levels]: as it is, g has edges at
+        its holes. A curvature that sees them is none of the cost's.
+    used
+        (rows, cols) True on the pixels that count.
+    """
+
+    result: Result
+    reference: FloatImage
+    deformed: FloatImage
+    used: BoolArray
+
+    @classmethod
+    def of(cls, result: Result, pair: ImagePair, edge_px: int) -> MatchedImages:
+        """Prepare the images once more as the last level of a correlation did.
+
+        Parameters
+        ----------
+        result, pair
+            Of the correlation.
+        edge_px
+            Of :class:`~modeharvest.idic.setup.CorrelationOptions`.
+        """
+        level = level_pair(pair, FULL, edge_px, result.order)
+        used = level.mask
+        if level.valid is not None:
+            every = Assembly(result.ansatz, result.grid, level.mask)
+            used, _ = valid_pixels(
+                every, result.unknowns, level.reference, level.deformed, level.valid
+            )
+        row, col = np.indices(result.grid.shape, dtype=np.float64)
+        deformed = level.deformed.sample(row, col)[0].astype(np.float32)
+        return cls(result, level.reference, deformed, used)
+
+    @cached_property
+    def inverse_hessian(self) -> FloatArray:
+        """(n, n) inverse of the cost's own curvature H; infinite where M⁻¹ is.
+
+        H by differences of the gradient; of large images from some of the rows, which is what the
+        speckles in them are many enough for.
+        """
+        result, mask = self.result, self.used
+        every = int(np.clip(mask.sum() // _ENOUGH_PX, 1, 4))
+        some = np.zeros_like(mask)
+        some[::every] = mask[::every]
+        assembly = Assembly(result.ansatz, result.grid, some)
+        f, g = self.reference, SplineImage.of(self.deformed, result.order)
+        kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
+        matrix = np.linalg.inv(result.inverse[np.ix_(kept, kept)])
+        # Steps that move the image by about _STEP_PX: rms grey levels over the rms gradient.
+        per_px = np.sqrt(np.trace(matrix[:2, :2]) / max(1, result.pixels)) * result.grid.pixel_size
+        steps = _STEP_PX * per_px / np.sqrt(np.diag(matrix) / max(1, result.pixels))
+
+        def at(number: int, step: float) -> FloatArray:
+            a = result.unknowns.copy()
+            a[kept[number]] += step
+            return np.asarray(assembly.images(a, f, g, False).gradient[kept])
+
+        here = at(0, 0.0)
+        columns = [(at(k, h) - here) / h for k, h in enumerate(steps)]
+        share = some.sum() / max(1, mask.sum())
+        curvature = 0.5 * (np.array(columns) + np.array(columns).T) / share
+        found = result.inverse.copy()
+        found[np.ix_(kept, kept)] = np.linalg.inv(curvature)
+        return found
+
+    def hessian_corrected_covariance(self, noise: ImageNoise | float) -> FloatArray:
+        """(n, n) covariance by white noise in both images against the cost's own curvature.
+
+        H⁻¹ V H⁻¹, where V = M C M, C = ``result.covariance(noise)`` and M is Gauss and Newton's
+        curvature. Where the residual is noise there is no such difference, and C itself is given.
+
+        Parameters
+        ----------
+        noise
+            Of the images, or the standard deviation of both [grey levels].
+        """
+        result = self.result
+        found = result.covariance(noise)
+        if result.residual_test().is_white:
+            return found
+        kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
+        M = (1.0 - result.noise_in_slope(ImageNoise.of(noise))) * np.linalg.inv(
+            result.inverse[kept]
+        )
+        inverse = self.inverse_hessian[kept]
+        found[kept] = inverse @ M @ found[kept] @ M @ inverse.T
+        return found
+
+    def sandwich_covariance(self, block: float) -> FloatArray:
+        """(n, n) covariance of the unknowns by the model error.
+
+        The images' noise is in it, too: it is in the residual. Where w has the lattice's own
+        period the block gradients are alike, and their independence is an assumption.
+
+        Parameters
+        ----------
+        block
+            Edge of the blocks [mm]: the unit cell.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than eight blocks.
+        """
+        gradients = self._block_gradients(self._blocks(block), self.reference, self.deformed)
+        return _sandwich(self.inverse_hessian, gradients)
+
+    def noise_covariance(
+        self,
+        examples: Iterable[tuple[FloatImage, FloatImage]],
+        block: float,
+        inverse: FloatArray | None = None,
+    ) -> FloatArray:
+        """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
+
+        For images that were filtered before they were correlated: their noise is not white any
+        more, and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every example
+        gives each block a gradient; the covariance is their mean square. What the noise does to
+        the gradient that w is seen with is in it.
+
+        Parameters
+        ----------
+        examples
+            Of the noise in f and in g, (rows, cols) each, filtered as they were.
+        block
+            As for :meth:`sandwich_covariance`.
+        inverse
+            (n, n) in place of :attr:`inverse_hessian`.
+        """
+        blocks, f, g = self._blocks(block), self.reference, self.deformed
+        without = self._block_gradients(blocks, f, g)
+        found = []
+        for in_f, in_g in examples:
+            noisy = self._block_gradients(blocks, f + _SMALL * in_f, g + _SMALL * in_g)
+            found.append((noisy - without) / _SMALL)
+        inverse = self.inverse_hessian if inverse is None else inverse
+        return _sandwich(inverse, np.vstack(found)) / len(found)
+
+    def _blocks(self, block: float) -> list[Assembly]:
+        """The pixels of each block; InputError if there are fewer than eight."""
+        grid, mask = self.result.grid, self.used
+        side = max(1, round(block / grid.pixel_size))
+        found = []
+        for top in range(0, grid.rows, side):
+            for left in range(0, grid.cols, side):
+                here = (slice(top, top + side), slice(left, left + side))
+                if mask[here].any():
+                    inside = np.zeros_like(mask)
+                    inside[here] = mask[here]
+                    found.append(Assembly(self.result.ansatz, grid, inside))
+        if len(found) < _FEWEST_BLOCKS:
+            raise InputError(
+                f"expected at least {_FEWEST_BLOCKS} blocks of {block} mm with material, got "
+                f"{len(found)}"
+            )
+        return found
+
+    def _block_gradients(
+        self, blocks: list[Assembly], f: FloatImage, deformed: FloatImage
+    ) -> FloatArray:
+        """(blocks, n): the derivative of each block's share of the cost."""
+        a, g = self.result.unknowns, SplineImage.of(deformed, self.result.order)
+        return np.array([b.images(a, f, g, False).gradient for b in blocks])
+
+
+def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:
+    """H⁻¹ (Σ g gᵀ) H⁻¹; infinite for unknowns that the images say nothing about."""
+    known, lost = determined_part(inverse)
+    half = gradients @ known
+    found = half.T @ half
+    found[lost, lost] = np.inf
+    return np.asarray(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +320,9 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
         Positions [mm] that broadcast together, or two axes. The errors are as smooth as the
         ansatz: a coarse grid will do.
     covariance
-        (n, n) of the unknowns: ``result.covariance(noise_sd)`` for the images' noise, or
-        :func:`model_error_covariance` for what the ansatz leaves over. Unknowns of infinite
-        variance, about which the images say nothing, make the fields they touch infinite.
+        (n, n) of the unknowns: ``result.covariance(noise_sd)``, or one of a :class:`Covariance`.
+        Unknowns of infinite variance, about which the images say nothing, make the fields they
+        touch infinite.
     """
     ansatz, a = result.ansatz, result.unknowns
     matrix = np.asarray(covariance, dtype=np.float64)
@@ -99,203 +348,9 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
     )
 
 
-def sandwich_covariance(
-    result: Result,
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    mask: NDArray[np.bool_],
-    block: float,
-    order: int = 5,
-    soft: FloatArray | None = None,
-) -> FloatArray:
-    """(n, n) covariance of the unknowns by what the ansatz leaves over, its residual included.
-
-    The images' noise is in it, too: it is in the residual. Where w has the lattice's own period
-    its pushes are alike in all cells, and the blocks' independence is an assumption.
-
-    Parameters
-    ----------
-    result
-        Of a correlation.
-    reference, deformed
-        (rows, cols) f and g, as they were correlated.
-    mask
-        (rows, cols) pixels that counted.
-    block
-        Edge of the blocks [mm]: the unit cell.
-    order
-        Of the spline.
-    soft
-        Of :func:`softness`, if it is known already.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than eight blocks.
-    """
-    blocks = _blocks(result, mask, block)
-    pushes = _block_gradients(blocks, result, reference, deformed, order)
-    if soft is None:
-        soft = inverse_hessian(result, reference, deformed, mask, order)
-    return _sandwich(soft, pushes)
-
-
-def noise_covariance(
-    result: Result,
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    noises: Iterable[tuple[ArrayLike, ArrayLike]],
-    mask: NDArray[np.bool_],
-    block: float,
-    order: int = 5,
-    soft: FloatArray | None = None,
-) -> FloatArray:
-    """(n, n) covariance of the unknowns by noise of any kind, from examples of it.
-
-    For images that were filtered before they were correlated: their noise is not white any more,
-    and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every example pushes the
-    unknowns in every block independently; the covariance is the pushes' mean square. What the
-    noise does to the gradient that w is seen with is in it.
-
-    Parameters
-    ----------
-    result, reference, deformed, mask, block, order, soft
-        As for :func:`model_error_covariance`.
-    noises
-        Examples of the noise in f and in g, (rows, cols) each, filtered as they were.
-    """
-    blocks = _blocks(result, mask, block)
-    f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
-    quiet = _block_gradients(blocks, result, f, g, order)
-    examples = []
-    for in_f, in_g in noises:
-        small_f, small_g = (_SMALL * np.asarray(n, dtype=np.float32) for n in (in_f, in_g))
-        pushed = _block_gradients(blocks, result, f + small_f, g + small_g, order)
-        examples.append((pushed - quiet) / _SMALL)
-    if soft is None:
-        soft = inverse_hessian(result, f, g, mask, order)
-    return _sandwich(soft, np.vstack(examples)) / len(examples)
-
-
-def hessian_corrected_covariance(
-    result: Result, noise: ImageNoise | float, soft: FloatArray
-) -> FloatArray:
-    """(n, n) covariance by white noise in both images against the cost's own curvature.
-
-    H⁻¹ V H⁻¹, where V = M C M are the pushes that make C = ``result.covariance(noise)`` with
-    Gauss and Newton's curvature M. Where the residual is noise there is no such difference, and
-    C itself is given.
-
-    Parameters
-    ----------
-    result
-        Of a correlation.
-    noise
-        Of the images, or the standard deviation of both [grey levels].
-    soft
-        (n, n) of :func:`softness`.
-    """
-    found = result.covariance(noise)
-    if result.residual_test().is_white:
-        return found
-    kept = np.ix_(*[np.flatnonzero(np.isfinite(np.diag(result.inverse)))] * 2)
-    M = (1.0 - result.noise_in_slope(ImageNoise.of(noise))) * np.linalg.inv(result.inverse[kept])
-    found[kept] = soft[kept] @ M @ found[kept] @ M @ soft[kept].T
-    return found
-
-
-def inverse_hessian(
-    result: Result,
-    reference: ArrayLike,
-    deformed: ArrayLike,
-    mask: NDArray[np.bool_],
-    order: int = 5,
-) -> FloatArray:
-    """(n, n) inverse of the cost's own curvature H at a result; infinite where M⁻¹ is.
-
-    H by differences of the gradient; of large images from some of the rows, which is what the
-    speckles in them are many enough for.
-
-    Parameters
-    ----------
-    result, reference, deformed, mask, order
-        As for :func:`model_error_covariance`.
-    """
-    every = int(np.clip(mask.sum() // _ENOUGH_PX, 1, 4))
-    some = np.zeros_like(mask)
-    some[::every] = mask[::every]
-    assembly = Assembly(result.ansatz, result.grid, some)
-    f = np.ascontiguousarray(reference, dtype=np.float32)
-    g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
-    kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
-    matrix = np.linalg.inv(result.inverse[np.ix_(kept, kept)])
-    # Steps that move the image by about _STEP_PX: rms grey levels over the rms gradient.
-    gradient = np.sqrt(np.trace(matrix[:2, :2]) / max(1, result.pixels)) * result.grid.pixel_size
-    steps = _STEP_PX * gradient / np.sqrt(np.diag(matrix) / max(1, result.pixels))
-
-    def at(number: int, step: float) -> FloatArray:
-        a = result.unknowns.copy()
-        a[kept[number]] += step
-        return np.asarray(assembly.images(a, f, g, False).gradient[kept])
-
-    here = at(0, 0.0)
-    columns = [(at(k, h) - here) / h for k, h in enumerate(steps)]
-    share = some.sum() / max(1, mask.sum())
-    curvature = 0.5 * (np.array(columns) + np.array(columns).T) / share
-    found = result.inverse.copy()
-    found[np.ix_(kept, kept)] = np.linalg.inv(curvature)
-    return found
-
-
-_ENOUGH_PX, _STEP_PX = 400_000, 0.002
-
-
-_SMALL = np.float32(0.05)
-"""Noise is made that much smaller, and its effect larger again: the linear part is wanted."""
-
-
-def _blocks(result: Result, mask: NDArray[np.bool_], block: float) -> list[Assembly]:
-    """The pixels of each block; InputError if there are fewer than eight."""
-    grid = result.grid
-    side = max(1, round(block / grid.pixel_size))
-    found = []
-    for top in range(0, grid.rows, side):
-        for left in range(0, grid.cols, side):
-            here = (slice(top, top + side), slice(left, left + side))
-            if mask[here].any():
-                inside = np.zeros(mask.shape, np.bool_)
-                inside[here] = mask[here]
-                found.append(Assembly(result.ansatz, grid, inside))
-    if len(found) < _FEWEST_BLOCKS:
-        raise InputError(
-            f"expected at least {_FEWEST_BLOCKS} blocks of {block} mm with material, got "
-            f"{len(found)}"
-        )
-    return found
-
-
-def _block_gradients(
-    blocks: list[Assembly], result: Result, reference: ArrayLike, deformed: ArrayLike, order: int
-) -> FloatArray:
-    """(blocks, n): the derivative of each block's share of the cost."""
-    f = np.ascontiguousarray(reference, dtype=np.float32)
-    g = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)
-    return np.array([b.images(result.unknowns, f, g, False).gradient for b in blocks])
-
-
-def _sandwich(soft: FloatArray, pushes: FloatArray) -> FloatArray:
-    """H⁻¹ (Σ g gᵀ) H⁻¹; infinite for unknowns that the images say nothing about."""
-    lost = np.isinf(np.diag(soft))
-    half = pushes @ np.where(lost[:, None] | lost[None, :], 0.0, soft)
-    covariance = half.T @ half
-    covariance[lost, lost] = np.inf
-    return np.asarray(covariance)
-
-
 def _sd(sensitivity: FloatArray, covariance: FloatArray) -> FloatArray:
     """Square root of the diagonal of S C Sᵀ; infinite where it touches an infinite variance."""
-    lost = np.isinf(np.diag(covariance))
-    known = np.where(lost[:, None] | lost[None, :], 0.0, covariance)
+    known, lost = determined_part(covariance)
     variance = np.einsum("...n,nm,...m->...", sensitivity, known, sensitivity, optimize=True)
     touched = np.any(sensitivity[..., lost] != 0.0, axis=-1)
     return np.asarray(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
@@ -305,74 +360,3 @@ def _open(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Two axes as an open grid; anything else as it is, like the ansatz does."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     return (x[None, :], y[:, None]) if x.ndim == y.ndim == 1 else (x, y)
-
-
-@dataclass(frozen=True, eq=False)
-class MatchedImages:
-    """What a result was found with.
-
-    Parameters
-    ----------
-    reference, deformed
-        (rows, cols) f, and g continued into its holes [grey levels].
-    used
-        (rows, cols) True on the pixels that count.
-    order
-        Of the spline.
-    """
-
-    reference: NDArray[np.float32]
-    deformed: NDArray[np.float32]
-    used: BoolArray
-    order: int
-
-    @classmethod
-    def of(
-        cls,
-        result: Result,
-        images: tuple[NDArray[Any], NDArray[Any]],
-        masks: tuple[BoolArray | None, BoolArray | None],
-        edge_px: int,
-    ) -> MatchedImages:
-        """Prepare the images once more as the last level of a correlation did.
-
-        Parameters
-        ----------
-        result
-            Of the correlation.
-        images, masks
-            (rows, cols) f and g, and where they show material; None if not known.
-        edge_px
-            Of :class:`~modeharvest.idic.setup.CorrelationOptions`.
-        """
-        grid, order = result.grid, result.order
-        pair = level_pair(*images, grid, *masks, FULL, edge_px, order)
-        used = pair.mask
-        if pair.valid is not None:
-            every = Assembly(result.ansatz, grid, pair.mask)
-            used, _ = valid_pixels(
-                every, result.unknowns, pair.reference, pair.deformed, pair.valid
-            )
-        row, col = np.indices(grid.shape, dtype=np.float64)
-        deformed = pair.deformed.sample(row, col)[0].astype(np.float32)
-        return cls(pair.reference, deformed, used, order)
-
-    def softness(self, result: Result) -> FloatArray:
-        """(n, n) H⁻¹, see :func:`~modeharvest.idic.uncertainty.covariance.inverse_hessian`."""
-        return inverse_hessian(result, self.reference, self.deformed, self.used, self.order)
-
-    def model_error_covariance(
-        self, result: Result, block: float, soft: FloatArray | None = None
-    ) -> FloatArray:
-        """(n, n) by what the ansatz leaves over.
-
-        Parameters
-        ----------
-        result
-            Of the correlation.
-        block, soft
-            See :func:`~modeharvest.idic.uncertainty.covariance.sandwich_covariance`.
-        """
-        return sandwich_covariance(
-            result, self.reference, self.deformed, self.used, block, self.order, soft
-        )

@@ -132,9 +132,9 @@ def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiab
         result.undetermined,
         _worst(result),
         tuple(overlaps),
-        _model_error_px(result),
+        result.model_error_px,
         amplitudes,
-        result.weighting.width_px,
+        result.weighting.speckle_size_px,
     )
 
 
@@ -182,9 +182,3 @@ def _worst(result: Result) -> tuple[Combination, ...]:
         terms = tuple((result.names[kept[k]], float(vector[k])) for k in largest)
         found.append(Combination(float(value), terms))
     return tuple(found)
-
-
-def _model_error_px(result: Result) -> float:
-    """Residual over the rms gradient."""
-    gradient = np.sqrt(2.0 * result.slope_square)
-    return float(result.residual_rms / gradient) if gradient else np.inf

@@ -22,6 +22,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions, SquareLatticeOptions
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -98,10 +99,9 @@ class ResolutionSpec:
         options = CorrelationOptions(
             (Level(1, 0.0),), self.buckled.how.edge_px, self.buckled.how.order
         )
-        return correlate(
-            pair.f, pair.g, self.buckled.grid, self.ansatz(degree, motion),
-            self.start(degree, motion), pair.mask, pair.deformed_mask, options,
-        )  # fmt: skip
+        images = ImagePair(pair.f, pair.g, self.buckled.grid, pair.mask, pair.deformed_mask)
+        guess = self.start(degree, motion)
+        return correlate(images, self.ansatz(degree, motion), guess=guess, options=options)
 
 
 _ADAPTER = TypeAdapter(ResolutionSpec)

@@ -24,6 +24,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.spectra.pattern import mode_equivalent
 from modeharvest.idic.uncertainty.covariance import MatchedImages
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -284,10 +285,11 @@ def _sd(result: Result, covariance: FloatArray, pitch: float) -> FloatArray:
 
 
 def _model_error_sd(scene: VirtualImagePair, result: Result) -> FloatArray:
-    """The same by what the ansatz leaves over, cell by cell."""
-    pitch, how = scene.specimen.pitch, scene.how.options()
-    seen = MatchedImages.of(result, scene.pair(), scene.masks(), how.edge_px)
-    return _sd(result, seen.model_error_covariance(result, pitch), pitch)
+    """The same by the model error, cell by cell."""
+    pitch = scene.specimen.pitch
+    pair = ImagePair(*scene.pair(), scene.images.grid, *scene.masks())
+    seen = MatchedImages.of(result, pair, scene.how.edge_px)
+    return _sd(result, seen.sandwich_covariance(pitch), pitch)
 
 
 def _units(pitch: float) -> FloatArray:

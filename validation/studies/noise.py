@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.idic.uncertainty.covariance import MatchedImages, field_errors, noise_covariance
+from modeharvest.idic.uncertainty.covariance import MatchedImages, field_errors
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -114,7 +115,7 @@ class FieldPoints:
 CAUSES = ("bound", "det F", "curvature", "least")
 """Each with all that stand before it."""
 HESSIAN_CORRECTED = "softened"
-"""2 H⁻¹MH⁻¹, the curvature only: what :func:`modeharvest.idic.uncertainty.covariance.hessian_corrected_covariance` knows of."""
+"""2 H⁻¹MH⁻¹, the curvature only: the Hessian-corrected covariance of the error analysis."""
 COVARIANCES = (*CAUSES, HESSIAN_CORRECTED)
 EXAMPLES = 24
 """Of the noise, for V; each counts as many times as there are unit cells."""
@@ -124,13 +125,14 @@ _WEAK_NOISE = 0.01
 
 def matched_images(scene: VirtualImagePair, result: Result, images: Images) -> MatchedImages:
     """What a correlation of images of this scene compared at its end."""
-    options = scene.how.options()
-    return MatchedImages.of(result, images, scene.masks(), options.edge_px)
+    pair = ImagePair(*images, scene.images.grid, *scene.masks())
+    return MatchedImages.of(result, pair, scene.how.edge_px)
 
 
-def zero_residual(seen: MatchedImages, result: Result) -> MatchedImages:
+def zero_residual(seen: MatchedImages) -> MatchedImages:
     """The same without a residual: f is what g says that it is."""
-    left = result.residual(seen.reference, seen.deformed, seen.order)
+    pair = ImagePair(seen.reference, seen.deformed, seen.result.grid)
+    left = seen.result.residual(pair, seen.result.order)
     f = np.where(seen.used, seen.reference - left, seen.reference).astype(np.float32)
     return replace(seen, reference=f)
 
@@ -156,19 +158,18 @@ def covariances_by_cause(
     seen, cell = matched_images(scene, result, scene.pair()), scene.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
     at = np.ix_(~lost, ~lost)
-    inverse, soft = result.inverse[at], seen.softness(result)[at]
+    inverse, corrected = result.inverse[at], seen.inverse_hessian[at]
     M = np.linalg.inv(inverse)
     # Noise in f pushes by s²M, noise in g by what its examples do.
     V0, V = (
-        M + M @ _by_noise_of_g(images, result, cell, seed)[at] @ M
-        for images in (zero_residual(seen, result), seen)
+        M + M @ _by_noise_of_g(images, cell, seed)[at] @ M for images in (zero_residual(seen), seen)
     )
     known = {
         "bound": 2.0 * inverse,
         "det F": inverse @ V0 @ inverse,
-        "curvature": soft @ V0 @ soft,
-        "least": soft @ V @ soft,
-        HESSIAN_CORRECTED: 2.0 * soft @ M @ soft,
+        "curvature": corrected @ V0 @ corrected,
+        "least": corrected @ V @ corrected,
+        HESSIAN_CORRECTED: 2.0 * corrected @ M @ corrected,
     }
     found = {}
     for name, covariance in known.items():
@@ -177,12 +178,10 @@ def covariances_by_cause(
     return found
 
 
-def _by_noise_of_g(seen: MatchedImages, result: Result, cell: float, seed: int) -> FloatArray:
+def _by_noise_of_g(seen: MatchedImages, cell: float, seed: int) -> FloatArray:
     """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone, pushing every cell independently."""
-    found = noise_covariance(
-        result, seen.reference, seen.deformed, _noise_examples(seen.reference, seed), seen.used, cell,
-        seen.order, result.inverse,
-    )  # fmt: skip
+    examples = _noise_examples(seen.reference, seed)
+    found = seen.noise_covariance(examples, cell, seen.result.inverse)
     return np.asarray(found / _WEAK_NOISE**2, dtype=np.float64)
 
 
@@ -326,8 +325,8 @@ def _without_noise(scene: VirtualImagePair, result: Result, seed: int) -> dict[s
 
 def _curvature_sd(scene: VirtualImagePair, result: Result, images: Images) -> float:
     """Rms over the points of u's standard deviation by the covariance H⁻¹ [mm]."""
-    soft = matched_images(scene, result, images).softness(result)
-    return float(np.sqrt((_predicted_fields(scene, result, soft)[:, PARTS["u"]] ** 2).mean()))
+    corrected = matched_images(scene, result, images).inverse_hessian
+    return float(np.sqrt((_predicted_fields(scene, result, corrected)[:, PARTS["u"]] ** 2).mean()))
 
 
 def _noisy(scene: VirtualImagePair, case: Mapping[str, Any]) -> Images:

@@ -28,6 +28,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -190,10 +191,9 @@ class VirtualImagePair:
     def correlate(self, start: FloatArray | None = None, pair: Images | None = None) -> Result:
         """Correlate the pair, or a noisy one, from the standard start or another."""
         f, g = self.pair() if pair is None else pair
-        mask, deformed_mask = self.masks()
+        images = ImagePair(f, g, self.images.grid, *self.masks())
         begin = self.start() if start is None else start
-        grid, options = self.images.grid, self.how.options()
-        return correlate(f, g, grid, self.ansatz, begin, mask, deformed_mask, options)
+        return correlate(images, self.ansatz, guess=begin, options=self.how.options())
 
     def masks(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """(rows, cols) True on material, of the reference and of the deformed image."""

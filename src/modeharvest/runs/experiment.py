@@ -296,15 +296,11 @@ class Run(StagedRun[Case]):
         how, specimen = self.case.correlation, self.case.experiment.specimen
         ansatz = how.ansatz(specimen)
         return correlate(
-            images.reference(camera=how.camera),
-            images.deformed(strain, camera=how.camera),
-            images.grid,
+            images.pair(strain, camera=how.camera),
             ansatz,
-            ansatz.initial_guess(strain, how.start_amplitude),
-            images.mask(),
-            images.deformed_mask(strain),
-            how.options(),
-            self.progress,
+            guess=ansatz.initial_guess(strain, how.start_amplitude),
+            options=how.options(),
+            progress=self.progress,
         )
 
 

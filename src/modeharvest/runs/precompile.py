@@ -19,16 +19,16 @@ from pathlib import Path
 import numpy as np
 
 from modeharvest.fem.field import Solution
-from modeharvest.idic.correlate import correlate
+from modeharvest.idic.correlate import best_fit, correlate
 from modeharvest.idic.solver.passes import accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
 from modeharvest.imaging.mapping.rasterise import rasterise
+from modeharvest.imaging.pair import ImagePair, Truth
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.compiled import cached_in, sources
 from modeharvest.util.machine import is_alone
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.truth import best_fit
 
 _CASE = "paper-virtual"
 
@@ -47,14 +47,14 @@ def _correlation() -> None:
     case, rng = Case.read(_CASE), np.random.default_rng(0)
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
     ansatz = case.correlation.ansatz(case.experiment.specimen)
-    start = ansatz.initial_guess(strain, case.correlation.start_amplitude)
     f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
     options = replace(
         case.correlation.options(),
         gauss_newton=replace(case.correlation.options().gauss_newton, max_iterations=1),
     )
-    found = correlate(f, f[::-1].copy(), grid, ansatz, start, mask, mask, options)
-    best_fit(found.displacement(), grid, ansatz, (start,), mask)
+    pair = ImagePair(f, f[::-1].copy(), grid, mask, mask, strain=strain)
+    found = correlate(pair, ansatz, options=options)
+    best_fit(Truth.of(displacement=found.displacement()), found)
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,7 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.photograph.measure import (
-    MeasuredPhotograph,
-)
+from modeharvest.idic.photograph.measure import MeasuredPhotograph
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.uncertainty.identifiability import identifiability

@@ -51,12 +51,12 @@ class ScaledEigen:
             return float("inf")
         return float(self.values[-1] / self.values[0])
 
-    def solve(self, right: FloatArray, damping: float = 0.0, least: float = 0.0) -> FloatArray:
+    def solve(self, right: FloatArray, damping: float = 0.0, cutoff: float = 0.0) -> FloatArray:
         """Solve (matrix + damping diag) x = right on the determined directions.
 
-        Those with an eigenvalue below ``least`` times the largest one count as undetermined, too.
+        Those with an eigenvalue below ``cutoff`` times the largest one count as undetermined, too.
         """
-        keep = self.determined & (self.values >= least * self.values[-1])
+        keep = self.determined & (self.values >= cutoff * self.values[-1])
         part = self.vectors[:, keep].T @ (right / self.scale) / (self.values[keep] + damping)
         return np.asarray(self.vectors[:, keep] @ part / self.scale)
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from modeharvest.idic.local.field import LocalField, read_field, write_field
-from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, pulled_back
 from modeharvest.idic.result import Result
@@ -28,6 +27,7 @@ from modeharvest.runs.case import CaseModel
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import (
     Optics,
+    PreparedPhotographs,
     all_files,
     calibrate_lens,
     calibrated_lens,
@@ -57,7 +57,6 @@ class _StartRecord:
 
     failed: str
     fixed: bool = False
-    blur_px: float = 0.0
     text: tuple[str, ...] = ()
 
 
@@ -107,7 +106,8 @@ class HarvestRun(StagedRun[PhotographCase]):
     @cached_property
     def geometry(self) -> Geometry:
         """Holes, lattice and cellular part, from the reference."""
-        return find_geometry(self.prepared(), self.case.specimen, self.case.base)
+        prepared, table = self.prepared(), self.case.specimen
+        return find_geometry(prepared.mask(), prepared.grid, table, self.case.base)
 
     def results(self) -> dict[str, MeasuredPhotograph]:
         """Correlate every photograph, each after the one before; leaves ``results/``.
@@ -204,7 +204,7 @@ class HarvestRun(StagedRun[PhotographCase]):
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            record = _StartRecord("", measured.fixed, measured.blur_px, measured.sentences)
+            record = _StartRecord("", measured.fixed, measured.sentences)
             write_json(start, to_plain(record))
             return result, field, start
 
@@ -213,7 +213,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             if record.failed:
                 return None
             outcome = Result.read(result), read_field(field)
-            return MeasuredPhotograph(*outcome, record.fixed, record.blur_px, record.text)
+            return MeasuredPhotograph(*outcome, record.fixed, record.text)
 
         return self.do(f"correlate {name}", key, work, read)
 

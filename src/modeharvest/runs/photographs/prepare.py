@@ -23,17 +23,21 @@ import numpy as np
 
 from modeharvest.idic.local.field import LocalField, read_field, without_distortion
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
-from modeharvest.idic.pair import PREPARED_FILE, PreparedPhotographs
 from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
-from modeharvest.idic.photograph.measure import prepared_pair
-from modeharvest.idic.uncertainty.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
+from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibration.calibrate import calibrate
 from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
 from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.files import (
+    read_image,
+    read_mask,
+    require_same_shape,
+    write_image,
+)
 from modeharvest.imaging.photographs.photograph import (
     Photograph,
     read_frame,
@@ -41,10 +45,76 @@ from modeharvest.imaging.photographs.photograph import (
     read_reference,
 )
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
-from modeharvest.util.arrays import BoolArray
+from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, silent
+from modeharvest.util.typed import made
+
+PREPARED_FILE = "prepared.json"
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPhotographs:
+    """Photographs on the ideal grid, in a folder; read when asked for.
+
+    Parameters
+    ----------
+    folder
+        Where they are.
+    info
+        The content of ``prepared.json``.
+    """
+
+    folder: Path
+    info: dict[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path) -> PreparedPhotographs:
+        """Open a finished folder; raises InputError if it isn't one."""
+        path = folder / PREPARED_FILE
+        with reading(path, "prepared photographs", "remove it, and harvest again"):
+            found = cls(folder, dict(read_json(path)))
+            _ = found.names, found.skipped, found.noise, found.grid
+            return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the deformed images that can be used, in the order of the test."""
+        return tuple(map(str, self.info["names"]))
+
+    @property
+    def skipped(self) -> tuple[tuple[str, str], ...]:
+        """Name of each file that can't be used, and why."""
+        return tuple((name, reason) for name, reason in self.info["skipped"])
+
+    @property
+    def noise(self) -> CameraNoise:
+        """The camera's."""
+        return made(CameraNoise, self.info["noise"])
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The ideal pixels; the physical origin is the middle of the image."""
+        return made(PixelGrid, self.info["grid"])
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file, the record last."""
+        stems = (f"{name}{kind}" for name in ("reference", *self.names) for kind in ("", "_mask"))
+        return (*(self.folder / f"{stem}.tif" for stem in stems), self.folder / PREPARED_FILE)
+
+    def image(self, name: str = "reference") -> FloatImage:
+        """(rows, cols) grey levels."""
+        return read_image(self.folder / f"{name}.tif")
+
+    def mask(self, name: str = "reference") -> BoolArray:
+        """(rows, cols) True on material."""
+        return read_mask(self.folder / f"{name}_mask.tif")
+
+    def pair(self, name: str) -> ImagePair:
+        """The reference and a deformed photograph."""
+        return ImagePair(self.image(), self.image(name), self.grid, self.mask(), self.mask(name))
 
 
 def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
@@ -307,7 +377,7 @@ def local_field(
         return None
     if table.code == "pyvale":
         options = SubsetOptions(subset_px=table.subset, step_px=table.step)
-        return subset_field(prepared_pair(prepared, name), options)
+        return subset_field(prepared.pair(name), options)
     path = of_each_photograph(case, table.files, "local.files")[name]
     field = read_field(
         path,

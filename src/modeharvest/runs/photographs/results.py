@@ -14,28 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.pair import PreparedPhotographs
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.photograph.measure import (
     MeasuredPhotograph,
-    covariances,
-    noise_of,
-    prepared_pair,
+    image_noise,
     residual_test,
 )
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
-from modeharvest.idic.uncertainty.covariance import FieldErrors, field_errors
+from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, field_errors
 from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
-from modeharvest.idic.uncertainty.residual_test import ResidualTest
 from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.photographs.prepare import Optics
+from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -366,15 +363,14 @@ def _frame(
     name: str,
     measured: MeasuredPhotograph,
 ) -> HarvestedFrame:
-    result, image = measured.result, prepared.image(name)
+    result, pair = measured.result, prepared.pair(name)
     box = geometry.region.cellular
     cell = case.specimen.cell_size
     x, y = _axes(geometry.region.domain)
-    noise = noise_of(prepared, name)
-    by_noise, by_model_error, warnings = covariances(
-        measured, prepared_pair(prepared, name), noise, cell
-    )
-    identified = identifiability(result, prepared.mask())
+    noise, edge_px = image_noise(pair, prepared.noise), case.correlation.edge_px
+    found = covariance(result, pair, noise, cell, edge_px)
+    by_model_error = found.by_model_error
+    identified = identifiability(result, pair.mask)
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
     pattern = read_pattern(spectrum)
@@ -382,25 +378,25 @@ def _frame(
         name=name,
         strain_x=along,
         strain_y=across,
-        image=image,
-        mask=prepared.mask(name),
+        image=pair.deformed,
+        mask=pair.deformed_mask,
         result=result,
         identifiability=identified,
-        residual_test=residual_test(measured, prepared.image(), image, prepared, noise),
+        residual_test=residual_test(result, pair, noise, edge_px),
         error_x=x,
         error_y=y,
-        by_noise=field_errors(result, x, y, by_noise),
+        by_noise=field_errors(result, x, y, found.by_noise),
         by_model_error=None
         if by_model_error is None
         else field_errors(result, x, y, by_model_error),
-        noise_covariance=by_noise,
+        noise_covariance=found.by_noise,
         model_error_covariance=by_model_error,
         spectrum=spectrum,
         pattern=pattern,
         parts=_parts(measured, geometry, cell),
         local=measured.local if case.local.code != "none" else None,
         start_text=tuple(s for s in measured.sentences if s not in pattern.sentences),
-        warnings=warnings,
+        warnings=found.warnings,
     )
 
 

@@ -1,9 +1,9 @@
 """Residual test: is a residual white noise, and which fraction of the image is decorrelated.
 
-Noise has no correlation from one pixel to another a few pixels off; a displacement that is left
-over shows the speckle's own gradient, which is correlated over a speckle. So the residual's
-autocorrelation tells the two apart without knowing how large the noise is; where that is known,
-chi squared tells, too.
+Noise has no correlation from one pixel to another a few pixels off; a model error shows the
+speckle's own gradient, which is correlated over a speckle. So the residual's autocorrelation
+separates the two without knowing how large the noise is; where that is known, chi squared does,
+too.
 
 NaN is where no pixel counts. Each row, or row of blocks, is summed on its own, so the result does
 not depend on the number of threads.
@@ -116,7 +116,7 @@ _SIGMAS, _MODEL = 4.0, 0.03
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """The residual against the noise that the images are said to have.
+    """The residual against the noise of the images.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class ResidualTest:
         noise_sd: float | None = None,
         lags_px: tuple[int, ...] = LAGS_PX,
     ) -> ResidualTest:
-        """Judge a residual.
+        """Test a residual.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class ResidualTest:
         if self.is_white:
             return (
                 f"The residual is uncorrelated, but chi squared is {self.chi_square:.3g}: the "
-                "noise is not what it is said to be."
+                "noise is not the given one."
             )
         return (
             f"The residual is not noise: {known}its autocorrelation over {self.lags_px[0]} "
@@ -202,18 +202,18 @@ class ResidualTest:
         )
 
 
-def lags_for(width_px: float) -> tuple[int, ...]:
-    """Distances over which a displacement left over shows, and noise doesn't [px].
+def lags_for(speckle_size_px: float) -> tuple[int, ...]:
+    """Distances over which a model error shows, and noise doesn't [px].
 
     From a third of a speckle to a whole one, but no closer than what the spline correlates.
 
     Parameters
     ----------
-    width_px
+    speckle_size_px
         Full width at half maximum of the speckle's autocorrelation [px]; see
         :func:`modeharvest.idic.solver.final_smoothing.speckle_size`.
     """
-    first, last = max(_SPARED_PX, width_px / 3.0), max(_SPARED_PX + 1, width_px)
+    first, last = max(_SPARED_PX, speckle_size_px / 3.0), max(_SPARED_PX + 1, speckle_size_px)
     return tuple(sorted({round(lag) for lag in np.linspace(first, last, 5)}))
 
 
@@ -241,7 +241,7 @@ def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) 
 
 
 def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> float:
-    """Share of the image whose two grey levels have little to do with each other [-].
+    """Fraction of the image whose two grey levels are decorrelated [-].
 
     Over blocks of ``BLOCK_PX``: those in which the reference and the deformed image brought
     back to it have a zero-normalised cross-correlation below ``CORRELATED``. At a local minimum a
@@ -262,8 +262,8 @@ def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> fl
     f, g, fg, ff, gg = np.moveaxis(sums[..., 1:] / np.maximum(count, 1.0)[..., None], -1, 0)
     cov, var_f, var_g = fg - f * g, ff - f * f, gg - g * g
     # Blocks with a third of their pixels, and with a speckle in them.
-    judged = (count > BLOCK_PX**2 / 3) & (var_f > 1e-6 * var_f.max(initial=0.0))
-    if not judged.any():
+    compared = (count > BLOCK_PX**2 / 3) & (var_f > 1e-6 * var_f.max(initial=0.0))
+    if not compared.any():
         return 0.0
-    product = np.sqrt(np.maximum(var_f * var_g, 0.0))[judged]
-    return float(np.mean(cov[judged] < CORRELATED * product))
+    product = np.sqrt(np.maximum(var_f * var_g, 0.0))[compared]
+    return float(np.mean(cov[compared] < CORRELATED * product))
