@@ -17,13 +17,15 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from refinement import refined_cell
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
+from modeharvest.fem.bloch.dispersion import ZONES
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
 from modeharvest.fem.bloch.zone import zone_path
 from modeharvest.fem.lattice.bloch_map import factorise
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
-from modeharvest.fem.lattice.cells import SQUARE_ZONE, UnitCell, hexagonal, refined_cell, square
+from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square
 from modeharvest.fem.lattice.options import (
     CriticalSearch,
     MacroLoading,
@@ -51,7 +53,7 @@ def cost(per_pitch: int, ratio: float) -> str:
     cell = PeriodicCell(square(1.0, ratio, 1 / per_pitch), TwoTermI1())
     state = CellPath(cell, uniaxial()).at(0.002)
     assert state is not None
-    points, _ = zone_path(SQUARE_ZONE, cell.cell.lattice, POINTS)
+    points, _ = zone_path(ZONES["oblique"], cell.cell.lattice, POINTS)
     matrix = BlochWaves(cell, state).stiffness.at((0.7, 2.1))
 
     def factorisations(order: str) -> Callable[[], None]:

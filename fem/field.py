@@ -27,6 +27,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 
 FORMAT = "modeharvest-solution-1"
+_CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 _MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
 
@@ -67,6 +68,23 @@ class Mesh:
             raise InputError("expected finite node positions, got NaN or infinity")
         if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.nodes):
             raise InputError(f"a cell names a node outside 0 ... {len(self.nodes) - 1}")
+
+
+def boundary_sides(mesh: Mesh) -> IntArray:
+    """(s, 3) first corner, mid-side and second corner of the sides that only one cell has.
+
+    The material lies to their left; without mid-side nodes the second column repeats the first.
+    """
+    corners = _CORNERS[mesh.element]
+    has_middle = mesh.cells.shape[1] > corners
+    sides = []
+    for k in range(corners):
+        a, b = mesh.cells[:, k], mesh.cells[:, (k + 1) % corners]
+        sides.append(np.stack([a, mesh.cells[:, corners + k] if has_middle else a, b], axis=1))
+    every = np.vstack(sides)
+    pairs = np.sort(every[:, [0, 2]], axis=1)
+    _, number, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(every[count[number.ravel()] == 1])
 
 
 @dataclass(frozen=True, eq=False)

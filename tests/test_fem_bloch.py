@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import runpy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,14 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from modeharvest.fem.bloch.critical import LatticeCritical, critical_at, first_critical
+from modeharvest.fem.bloch.dispersion import ZONES
 from modeharvest.fem.bloch.eigen import BlochWaves, Wave, scan
 from modeharvest.fem.bloch.zone import Zone, folded, is_same, zone_path
 from modeharvest.fem.lattice.bloch_map import Condensation, factorise, negative_pivots
 from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import (
-    HEXAGONAL_ZONE,
-    SQUARE_ZONE,
     UnitCell,
     hexagonal,
-    refined_cell,
     square,
 )
 from modeharvest.fem.lattice.options import (
@@ -37,6 +36,9 @@ from modeharvest.fem.materials import TwoTermI1
 from modeharvest.fem.meshing import join, rectangle
 from modeharvest.util.errors import InputError
 
+refined = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks/refinement.py"))[
+    "refined_cell"
+]
 M: Wave = (math.pi, math.pi)
 GENERAL: Wave = (0.7, -2.1)
 HOLES = 0.8696
@@ -177,7 +179,7 @@ def test_nested_meshes_converge_at_the_rate_of_quadratic_elements() -> None:
         assert state is not None
         areas.append(made.filling - (1.0 - math.pi / 4 * HOLES**2))
         values.append(float(BlochWaves(made, state).lowest(M).eigenvalues[0]))
-        cell = refined_cell(cell, HOLES)
+        cell = refined(cell, HOLES)
     area_rates = np.log2(np.divide(areas[:-1], areas[1:]))
     assert np.all(area_rates > 3.9)
     assert values[0] > values[1] > values[2]
@@ -198,8 +200,8 @@ def test_waves_of_the_enlarged_cell_are_those_that_fold_onto_them() -> None:
 def test_a_scan_finds_modes_that_the_wave_before_has_no_part_of() -> None:
     # On the zone's boundary mirror symmetry keeps modes apart.
     waves = waves_of("square", 0.04)
-    points, stops = zone_path(SQUARE_ZONE, waves.cell.cell.lattice, 21)
-    assert [points[k] for k in stops] == [wave for _, wave in SQUARE_ZONE]
+    points, stops = zone_path(ZONES["square"], waves.cell.cell.lattice, 21)
+    assert [points[k] for k in stops] == [wave for _, wave in ZONES["square"]]
     waves.factorisations = 0
     values = scan(waves, points)[:, 0]
     assert values[0] == values[-1] == pytest.approx(dense(waves, points[0])[2], rel=1e-6)
@@ -230,7 +232,7 @@ def test_wave_vectors_out_of_the_plane_are_refused(wave: Any) -> None:
 
 def test_the_corners_of_the_hexagonal_zone_are_where_geometry_has_them() -> None:
     inverse = np.linalg.inv(cell_of("hexagonal", 6).lattice)
-    m, k = (np.linalg.norm(inverse @ wave) * 1.386 for _, wave in HEXAGONAL_ZONE[1:3])
+    m, k = (np.linalg.norm(inverse @ wave) * 1.386 for _, wave in ZONES["hexagonal"][1:3])
     assert m == pytest.approx(2 * math.pi / math.sqrt(3))
     assert k == pytest.approx(4 * math.pi / 3)
 
@@ -359,7 +361,7 @@ def test_bad_searches_are_refused() -> None:
     with pytest.raises(InputError, match="positive loads"):
         CriticalSearch(largest=0.0)
     with pytest.raises(InputError, match="zone path"):
-        zone_path(SQUARE_ZONE[:1], np.eye(2), 10)
+        zone_path(ZONES["square"][:1], np.eye(2), 10)
 
 
 def test_the_grid_has_every_wave_once() -> None:

@@ -15,21 +15,16 @@ and its tetrachiral sister with four:
 - No fillets: where a ligament's inner edge meets a ring, the boundary has a sharp notch, at
   which strains are singular. Energies and eigenvalues therefore converge more slowly with the
   mesh than those of round holes.
-
-:func:`refined_cell` divides each triangle into four while holes stay round: nested meshes show a
-rate of convergence undisturbed by a mesher's choices.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.periodicity import Periodicity, find_periodicity
@@ -45,24 +40,6 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _MIRRORED = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
-
-# Corners of irreducible zones as phases (k . a1, k . a2) [rad].
-SQUARE_ZONE = (
-    ("Γ", (0.0, 0.0)),
-    ("X", (math.pi, 0.0)),
-    ("M", (math.pi, math.pi)),
-    ("Y", (0.0, math.pi)),
-    ("Γ", (0.0, 0.0)),
-)
-"""Of a square lattice loaded along its axes (a quarter of the zone: x and y may differ)."""
-
-HEXAGONAL_ZONE = (
-    ("Γ", (0.0, 0.0)),
-    ("M", (math.pi, 0.0)),
-    ("K", (4 * math.pi / 3, 2 * math.pi / 3)),
-    ("Γ", (0.0, 0.0)),
-)
-"""Of a hexagonal lattice that keeps its sixfold symmetry (equibiaxial loading)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,59 +314,3 @@ class _RingAndLigaments:
 
 def _polar(radius: float, angle: float) -> tuple[float, float]:
     return radius * math.cos(angle), radius * math.sin(angle)
-
-
-_REFERENCE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
-_CHILDREN = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-_SIDES = ((0, 1, 3), (1, 2, 4), (2, 0, 5))
-_NEAR = 0.02  # of the radius: what of the boundary belongs to a hole
-
-
-def refined(mesh: Mesh, onto: Callable[[FloatArray], FloatArray], tolerance: float) -> Mesh:
-    """The mesh with every element divided into four along its own curved coordinates.
-
-    Parameters
-    ----------
-    mesh
-        T6 mesh [mm].
-    onto
-        Moves nodes (n, 2) of the mesh's boundary onto the true one [mm].
-    tolerance
-        Nodes closer than this become one [mm].
-    """
-    blocks = []
-    for child in _CHILDREN:
-        corners = _REFERENCE[list(child)]
-        places = np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])
-        nodes = np.einsum("kn,end->ekd", _shape_functions(places), mesh.nodes[mesh.cells])
-        blocks.append(MeshBlock(nodes.reshape(-1, 2), np.arange(6 * len(nodes)).reshape(-1, 6)))
-    result = join(blocks, tolerance)
-    boundary = np.unique(_boundary_sides(result))
-    result.nodes[boundary] = onto(result.nodes[boundary])
-    return result
-
-
-def refined_cell(cell: UnitCell, diameter: float) -> UnitCell:
-    """A unit cell refined, with its circular hole about the origin [mm]."""
-    shortest = float(np.linalg.norm(cell.lattice, axis=1).min())
-
-    def onto(nodes: FloatArray) -> FloatArray:
-        stretch = 0.5 * diameter / np.linalg.norm(nodes, axis=1)
-        return np.where(np.abs(stretch - 1.0) < _NEAR, stretch, 1.0)[:, None] * nodes
-
-    return UnitCell(refined(cell.mesh, onto, 1e-7 * shortest), cell.lattice)
-
-
-def _boundary_sides(mesh: Mesh) -> NDArray[np.int64]:
-    """(s, 3) nodes of the sides that belong to one element only."""
-    sides = mesh.cells[:, _SIDES].reshape(-1, 3)
-    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
-    return np.asarray(sides[first[count == 1]])
-
-
-def _shape_functions(places: FloatArray) -> FloatArray:
-    """(k, 6) of the T6 at reference coordinates (k, 2)."""
-    x, y = places.T
-    z = 1.0 - x - y
-    corners = [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1)]
-    return np.stack([*corners, 4 * x * z, 4 * x * y, 4 * y * z], axis=1)

@@ -8,24 +8,20 @@ Of a deformed cell :func:`overlaps` tells whether it has run into itself: contac
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.field import Mesh
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.fem.field import Mesh, boundary_sides
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 # Neighbours that can touch a cell whose outline reaches no further than two cells.
 _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
-# The three sides of a T6: two corners and the node between them.
-_SIDES = np.array([[0, 1, 3], [1, 2, 4], [2, 0, 5]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +79,7 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -
         )
     distance = tolerance * float(lengths.min())
     pairs = _pairs(mesh.nodes, lattice, distance)
-    sides = _boundary_sides(mesh)
+    sides = boundary_sides(mesh)
     _refuse_overlap(mesh, lattice, np.unique(sides))
     _refuse_hanging(mesh, lattice, sides, pairs)
     found = _classes(mesh.nodes, lattice, pairs)
@@ -110,13 +106,6 @@ def _classes(nodes: FloatArray, lattice: FloatArray, pairs: IntArray) -> Periodi
     return Periodicity(lattice, master.astype(np.int64), shift.astype(np.int64))
 
 
-def _boundary_sides(mesh: Mesh) -> IntArray:
-    """(s, 3) corner, corner, mid-side of the sides with one element, material to their left."""
-    sides = mesh.cells[:, _SIDES].reshape(-1, 3)
-    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
-    return np.asarray(sides[first[count == 1]])
-
-
 def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None:
     inner = np.setdiff1d(mesh.cells[:, :3], boundary)
     covered = _covered(mesh, lattice, mesh.nodes[inner])
@@ -130,7 +119,7 @@ def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None
 def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: IntArray) -> None:
     """Material may meet another copy's material only where all three nodes of a side agree."""
     matched = np.isin(sides, pairs).all(axis=1)
-    a, b, middle = mesh.nodes[sides[~matched]].transpose(1, 0, 2)
+    a, middle, b = mesh.nodes[sides[~matched]].transpose(1, 0, 2)
     along = b - a
     # A little outside of the side: in the void if the surface is free.
     outside = middle + 0.02 * np.stack([along[:, 1], -along[:, 0]], axis=1)
@@ -145,30 +134,29 @@ def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: Int
         )
 
 
-def _covered(mesh: Mesh, lattice: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+def _covered(mesh: Mesh, lattice: FloatArray, points: FloatArray) -> BoolArray:
     """Whether each point (n, 2) lies in the material of another copy of the cell."""
     triangles = mesh.nodes[mesh.cells[:, :3]]
     covered = np.zeros(len(points), dtype=bool)
     for r in _NEIGHBOURS:
-        covered |= _inside_any(points + np.array(r) @ lattice, triangles)
+        covered |= _inside(points + np.array(r) @ lattice, triangles)
     return covered
 
 
-def _inside_any(points: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
-    """Whether each point (n, 2) lies in one of the triangles (m, 3, 2)."""
+def _inside(points: FloatArray, triangles: FloatArray, depth: float = 0.0) -> BoolArray:
+    """Whether each point (n, 2) lies in one of the triangles (m, 3, 2), ``depth`` heights deep."""
+    centres = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    near = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
-    inside = np.zeros(len(points), dtype=bool)
-    for chunk in _chunks(near, 64):
-        corners = triangles[None] - points[chunk][:, None, None]
-        following = np.roll(corners, -1, axis=2)
-        area = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
-        inside[chunk] = np.any(np.all(area > 0, axis=2), axis=1)
+    near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+    tree, inside = cKDTree(centres), np.zeros(len(points), dtype=bool)
+    pairs = cKDTree(points[near]).sparse_distance_matrix(tree, reach, output_type="ndarray")
+    place = near[pairs["i"]]
+    corners = triangles[pairs["j"]] - points[place][:, None]
+    following = np.roll(corners, -1, axis=1)
+    areas = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
+    inside[place[areas.min(axis=1) > depth * areas.sum(axis=1)]] = True
     return inside
-
-
-def _chunks(numbers: IntArray, size: int) -> Iterator[IntArray]:
-    return (numbers[k : k + size] for k in range(0, len(numbers), size))
 
 
 def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
@@ -214,9 +202,8 @@ def _named(numbers: IntArray, nodes: FloatArray, most: int = 4) -> str:
     return f"{len(numbers)} nodes: {', '.join(places)}{more}"
 
 
-# A T6 as four triangles with straight sides, and its sides as corner, corner, middle.
+# A T6 as four triangles with straight sides.
 _PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-_T6_SIDES = np.array([[0, 1, 3], [1, 2, 4], [2, 0, 5]])
 _DEPTH = 1e-3  # of a triangle's height: what doesn't count as overlap
 
 
@@ -236,26 +223,6 @@ def overlaps(
     """
     nodes, vectors = mesh.nodes + displacement, lattice @ gradient.T
     triangles = nodes[mesh.cells[:, _PARTS].reshape(-1, 3)]
-    points = nodes[_boundary(mesh)]
+    points = nodes[np.unique(boundary_sides(mesh))]
     images = [points + np.array(r) @ vectors for r in product((-1, 0, 1), repeat=2)]
-    return _any_inside(np.vstack(images), triangles)
-
-
-def _boundary(mesh: Mesh) -> NDArray[np.int64]:
-    """Nodes of the sides that belong to one element only."""
-    sides = mesh.cells[:, _T6_SIDES].reshape(-1, 3)
-    _, first, count = np.unique(sides[:, 2], return_index=True, return_counts=True)
-    return np.asarray(np.unique(sides[first[count == 1]]))
-
-
-def _any_inside(points: FloatArray, triangles: FloatArray) -> bool:
-    """Whether any of the points (n, 2) lies within one of the triangles (m, 3, 2)."""
-    centres = triangles.mean(axis=1)
-    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    points = points[np.all((points > low) & (points < high), axis=1)]
-    near = cKDTree(points).sparse_distance_matrix(cKDTree(centres), reach, output_type="ndarray")
-    corners = triangles[near["j"]] - points[near["i"]][:, None]
-    following = np.roll(corners, -1, axis=1)
-    areas = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
-    return bool(np.any(areas.min(axis=1) > _DEPTH * areas.sum(axis=1)))
+    return bool(_inside(np.vstack(images), triangles, _DEPTH).any())

@@ -10,12 +10,10 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 from skimage.measure import approximate_polygon, find_contours
 
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.lattice.periodicity import find_periodicity
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
-
-_CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ class MeshBoundary:
     @classmethod
     def of(cls, mesh: Mesh) -> MeshBoundary:
         """Find the outline of a mesh."""
-        edges = _boundary_edges(mesh)
+        edges = boundary_sides(mesh)
         following = {int(a): k for k, a in enumerate(edges[:, 0])}
         loops, seen = [], np.zeros(len(edges), dtype=bool)
         for first in range(len(edges)):
@@ -65,20 +63,6 @@ class MeshBoundary:
             vertices.append(np.vstack([a[:1], points, a[:1]]))
             codes += [Path.MOVETO, *[Path.CURVE3] * len(points), Path.CLOSEPOLY]
         return Path(np.vstack(vertices), codes)
-
-
-def _boundary_edges(mesh: Mesh) -> IntArray:
-    """(m, 3) corner, mid-side, corner of the edges that only one cell has."""
-    corners = _CORNERS[mesh.element]
-    has_middle = mesh.cells.shape[1] > corners
-    edges = []
-    for k in range(corners):
-        a, b = mesh.cells[:, k], mesh.cells[:, (k + 1) % corners]
-        edges.append(np.stack([a, mesh.cells[:, corners + k] if has_middle else a, b], axis=1))
-    every = np.vstack(edges)
-    pairs = np.sort(every[:, [0, 2]], axis=1)
-    _, number, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(every[count[number.ravel()] == 1])
 
 
 CELLS = 900
