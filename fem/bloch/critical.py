@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import brentq
 
-from modeharvest.fem.bloch.eigen import BlochWaves, Wave
-from modeharvest.fem.bloch.zone import CENTRE, LeastStable, Zone, is_same
+from modeharvest.fem.bloch.eigen import BlochWaves
+from modeharvest.fem.bloch.zone import LeastStable, Zone, is_same
 from modeharvest.fem.lattice.cell import CellPath, CellState
-from modeharvest.fem.lattice.options import CriticalSearch
+from modeharvest.fem.lattice.options import CENTRE, CriticalSearch, Wave
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 

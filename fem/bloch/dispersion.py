@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
+from modeharvest.fem.lattice.options import CENTRE, Wave, wave_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
@@ -26,40 +27,19 @@ if TYPE_CHECKING:
     from modeharvest.fem.lattice.cell import CellPath, CellState
 
 
-Wave = tuple[float, float]
 Corners = Sequence[tuple[str, Wave]]
 
 _PI = math.pi
+_GAMMA = ("Γ", CENTRE)
+_M = ("M", (_PI, _PI))
+_K = ("K", (4 * _PI / 3, 2 * _PI / 3))
+_X, _Y = ("X", (_PI, 0.0)), ("Y", (0.0, _PI))
+_M1, _M2 = ("M₁", (_PI, _PI)), ("M₂", (0.0, _PI))
 ZONES: dict[str, tuple[tuple[str, Wave], ...]] = {
-    "oblique": (
-        ("Γ", (0.0, 0.0)),
-        ("X", (_PI, 0.0)),
-        ("M", (_PI, _PI)),
-        ("Y", (0.0, _PI)),
-        ("Γ", (0.0, 0.0)),
-        ("M", (_PI, _PI)),
-    ),
-    "square": (
-        ("Γ", (0.0, 0.0)),
-        ("X", (_PI, 0.0)),
-        ("M", (_PI, _PI)),
-        ("Γ", (0.0, 0.0)),
-    ),
-    "hexagonal": (
-        ("Γ", (0.0, 0.0)),
-        ("M", (_PI, _PI)),
-        ("K", (4 * _PI / 3, 2 * _PI / 3)),
-        ("Γ", (0.0, 0.0)),
-    ),
-    "rhombic": (
-        ("Γ", (0.0, 0.0)),
-        ("K", (4 * _PI / 3, 2 * _PI / 3)),
-        ("M₁", (_PI, _PI)),
-        ("K′", (2 * _PI / 3, 4 * _PI / 3)),
-        ("M₂", (0.0, _PI)),
-        ("Γ", (0.0, 0.0)),
-        ("M₁", (_PI, _PI)),
-    ),
+    "oblique": (_GAMMA, _X, _M, _Y, _GAMMA, _M),
+    "square": (_GAMMA, _X, _M, _GAMMA),
+    "hexagonal": (_GAMMA, _M, _K, _GAMMA),
+    "rhombic": (_GAMMA, _K, _M1, ("K′", (2 * _PI / 3, 4 * _PI / 3)), _M2, _GAMMA, _M1),
 }
 """Closed tours of a zone by its symmetry, corners as phases (k . a1, k . a2) [rad].
 
@@ -230,7 +210,7 @@ def dispersion(
     from modeharvest.fem.bloch.eigen import BlochWaves
     from modeharvest.fem.bloch.zone import zone_path
 
-    corners = [(label, in_plane(wave)) for label, wave in corners]
+    corners = [(label, wave_of(wave)) for label, wave in corners]
     if bands < 1 or not len(loads):
         raise InputError(f"dispersion: expected a band and a load or more, got {bands}, {loads}")
     lattice = path.cell.cell.lattice
@@ -286,26 +266,6 @@ def zone_map(
     return ZoneMap(load, phases, values, path.cell.cell.lattice)
 
 
-def in_plane(wave: Sequence[float]) -> Wave:
-    """The wave as two finite phases [rad].
-
-    Raises
-    ------
-    InputError
-        If it is anything else: a third component points out of the plane.
-    """
-    try:
-        phases = np.asarray(wave, dtype=np.float64)
-    except (TypeError, ValueError):
-        phases = np.array([])
-    if phases.shape != (2,) or not np.isfinite(phases).all():
-        raise InputError(
-            "wave vector: expected two finite phases (k . a1, k . a2) in the lattice's plane, got "
-            f"{wave!r}"
-        )
-    return float(phases[0]), float(phases[1])
-
-
 def _state(path: CellPath, load: float) -> CellState:
     state = path.at(load)
     if state is None:
@@ -326,6 +286,6 @@ def _along(waves: BlochWaves, points: Sequence[Wave], bands: int) -> FloatArray:
     values = np.empty((len(points), bands))
     values[~np.array(centre)] = scan(waves, elsewhere, bands)
     if any(centre):
-        others = waves.lowest((0.0, 0.0), bands).eigenvalues
+        others = waves.lowest(CENTRE, bands).eigenvalues
         values[centre] = np.sort([0.0, 0.0, *others])[:bands]
     return values

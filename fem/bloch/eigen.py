@@ -27,13 +27,11 @@ from modeharvest.fem.lattice.bloch_map import (
     negative_pivots,
 )
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
+from modeharvest.fem.lattice.options import Wave, wave_of
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
-
-Wave = tuple[float, float]
 
 _SCAN_TOLERANCE = 1e-10  # of lambda + s, relative
-_TOGETHER = 30  # waves iterated at once: more would only take more memory
+_BATCH = 30  # waves iterated at once: more would only take more memory
 _NOISE = 0.2  # in a start vector, relative
 _DIRECTIONS = 36  # over half a turn
 
@@ -123,10 +121,10 @@ class BlochWaves:
             (w, count) and (size, w, count).
         """
         solver, below = self._solver_below(waves)
-        T = self.cell.reduction.copies.at(waves)
+        T = self.cell.reduction.bloch_map.at(waves)
 
         def weigh(block: Batch) -> Batch:
-            return T.gather(applied(self.cell.nodal_mass.__matmul__, T.spread(block)))
+            return T.restrict(applied(self.cell.nodal_mass.__matmul__, T.expand(block)))
 
         start = self._start(T.dtype, count, near)[:, None]
         fixed = self._translations() if _are_centre(waves).all() else start[:, :, :0]
@@ -136,14 +134,13 @@ class BlochWaves:
 
     def unstable(self, wave: Wave) -> int:
         """Number of negative eigenvalues, by the inertia of one factor; not for Γ itself."""
-        phases_of([wave])
         self.factorisations += 1
-        return negative_pivots(factorise(self.stiffness.at(wave)))
+        return negative_pivots(factorise(self.stiffness.at(wave_of(wave))))
 
     def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
         """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
         self.factorisations += 1
-        condensation = Condensation(self.state.stiffness, self.cell.reduction.outline)
+        condensation = Condensation(self.state.stiffness, self.cell.reduction.boundary)
         waves = phases_of(points)
         bad = [condensation.at(wave[None]) is None for wave in waves]
         return tuple(wave for wave, is_bad in zip(points, bad, strict=True) if is_bad)
@@ -195,7 +192,7 @@ class BlochWaves:
     def _condense(self) -> None:
         self.factorisations += 1
         shifted = csr_array(self.state.stiffness + self._below * self.cell.nodal_mass)
-        self._condensation = Condensation(shifted, self.cell.reduction.outline)
+        self._condensation = Condensation(shifted, self.cell.reduction.boundary)
 
     def _start(self, dtype: Any, count: int, near: BlochModes | None) -> Batch:
         """(size, count) vectors to begin with: those of ``near``, and always some noise.
@@ -225,36 +222,21 @@ def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArra
     """
     phases = phases_of(points)
     values = np.empty((len(points), count))
-    for group in _alike(phases):
+    for group in _groups(phases):
         values[group], _ = waves.iterated(phases[group], count, None, _SCAN_TOLERANCE)
     return values
 
 
 def phases_of(points: Sequence[Wave]) -> FloatArray:
-    """(n, 2) phases [rad] of wave vectors, checked.
-
-    Raises
-    ------
-    InputError
-        If one is not two finite real numbers.
-    """
-    waves = []
-    for point in points:
-        wave = np.asarray(point)
-        if wave.shape != (2,) or wave.dtype.kind not in "iuf" or not np.isfinite(wave).all():
-            raise InputError(
-                "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers "
-                f"[rad] (the wave lies in the plane), got {point}"
-            )
-        waves.append(wave)
-    return np.array(waves, dtype=np.float64).reshape(-1, 2)
+    """(n, 2) phases [rad] of wave vectors, each checked by :func:`wave_of`."""
+    return np.array([wave_of(point) for point in points], dtype=np.float64).reshape(-1, 2)
 
 
-def _alike(waves: FloatArray) -> list[NDArray[np.int64]]:
+def _groups(waves: FloatArray) -> list[NDArray[np.int64]]:
     """Numbers of the waves that can be iterated together: Γ, other real ones, and some others."""
     is_real, is_centre = _are_centre(2.0 * waves), _are_centre(waves)
     others = np.flatnonzero(~is_real)
-    parts = np.array_split(others, math.ceil(len(others) / _TOGETHER) or 1)
+    parts = np.array_split(others, math.ceil(len(others) / _BATCH) or 1)
     groups = [np.flatnonzero(is_centre), np.flatnonzero(is_real & ~is_centre), *parts]
     return [group for group in groups if len(group)]
 

@@ -32,11 +32,10 @@ import meshio
 import numpy as np
 
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.options import Wave
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
-
-Wave = tuple[float, float]
 
 NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i = j, otherwise 0"
 

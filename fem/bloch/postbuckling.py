@@ -17,7 +17,7 @@ import numpy as np
 
 from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
-from modeharvest.fem.lattice.options import BranchOptions
+from modeharvest.fem.lattice.options import CENTRE, BranchOptions
 from modeharvest.fem.lattice.periodicity import overlaps
 from modeharvest.fem.path.predictor import BranchPoint, amplitude_at, predicted, stacked
 from modeharvest.util.arrays import FloatArray
@@ -83,8 +83,8 @@ class _Tracing:
         reduction, mass = self.cell.reduction, self.cell.nodal_mass
         shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
         # (m, size): times the fluctuation they are the amplitudes of the modes.
-        self.weights = reduction.gathered(np.asarray(mass @ shapes.T)).T / material
-        self.mass = self.cell.mass.at((0.0, 0.0)) / material
+        self.weights = reduction.restricted(np.asarray(mass @ shapes.T)).T / material
+        self.mass = self.cell.mass.at(CENTRE) / material
         below = path.at((1.0 - _BEFORE) * modes.load)
         self.primary = CellPath(self.cell, self.loading, [] if below is None else [below])
         self.points: list[BranchPoint] = []

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, Wave
+from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
 from modeharvest.fem.bloch.modes import ModeSet
 from modeharvest.fem.bloch.zone import is_same
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.options import Wave, wave_of
 from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -101,11 +102,7 @@ def real_modes(
 
 def _commensurate(wave: Wave, largest: int) -> Turns:
     """k . a / 2 pi of both lattice vectors as fractions in [0, 1)."""
-    if np.shape(wave) != (2,) or not np.isfinite(wave).all():
-        raise InputError(
-            f"modes: expected waves as two finite phases (k . a1, k . a2) [rad], got {wave}"
-        )
-    exact = [float(phase) / (2.0 * math.pi) for phase in wave]
+    exact = [phase / (2.0 * math.pi) for phase in wave_of(wave)]
     p, q = (Fraction(turn).limit_denominator(largest) for turn in exact)
     if max(abs(p - exact[0]), abs(q - exact[1])) > _SNAP / (2.0 * math.pi):
         raise InputError(

@@ -13,12 +13,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import minimize
 
-from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, Wave, phases_of, scan
+from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves, phases_of, scan
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
+from modeharvest.fem.lattice.options import CENTRE, Wave
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
-CENTRE: Wave = (0.0, 0.0)
 _CANDIDATES = 3  # grid points from which to descend
 _SAME = 1e-3  # phases [rad] that far apart are the same wave
 
@@ -140,7 +140,7 @@ def zone_path(
     Parameters
     ----------
     corners
-        Names and phases [rad], such as ``lattices.SQUARE_ZONE``.
+        Names and phases [rad], such as ``ZONES["square"]``.
     lattice
         (2, 2) lattice vectors as rows [mm].
     count

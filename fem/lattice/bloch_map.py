@@ -28,8 +28,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from modeharvest.fem.lattice.options import CENTRE, Wave
 from modeharvest.fem.lattice.periodicity import Periodicity
-from modeharvest.util.arrays import ComplexArray, FloatArray, IntArray
+from modeharvest.util.arrays import FloatArray, IntArray
 
 Batch = NDArray[Any]  # of real or complex numbers
 
@@ -60,20 +61,20 @@ class BlochMap:
 
 
 class BlochTransform:
-    """T(k) for some wave vectors; made by ``Copies.at``."""
+    """T(k) for some wave vectors; made by ``BlochMap.at``."""
 
     def __init__(self, copies: BlochMap, factors: Batch) -> None:
         self.dtype = factors.dtype
         self._copies, self._factors = copies, factors[:, :, None]
 
-    def spread(self, vectors: Batch) -> Batch:
+    def expand(self, vectors: Batch) -> Batch:
         """T x for x (size, w, m)."""
         copies = self._copies
         result = vectors[copies.places]
         result[copies._turned] *= self._factors
         return np.asarray(result)
 
-    def gather(self, forces: Batch) -> Batch:
+    def restrict(self, forces: Batch) -> Batch:
         """T^H f for f (n, w, m), which is overwritten."""
         copies = self._copies
         forces[copies._turned] *= self._factors.conj()
@@ -98,49 +99,75 @@ def applied(operator: Callable[[FloatArray], FloatArray], vectors: Batch) -> Bat
     return result.reshape(len(result), *vectors.shape[1:])
 
 
-class BoundaryDofs:
-    """The components of displacement with copies in other cells, and how their matrices reduce.
-
-    ``inner`` and ``rim`` are the components without and with copies, ``inner_places`` and
-    ``rim_places`` the reduced unknowns that they are; ``copies`` those of the rim alone.
+class ShiftedEntries:
+    """The entries of unreduced matrices summed by their place in T^H A T and by R' - R.
 
     Parameters
     ----------
-    copies
-        All components of the mesh's nodes.
+    differences
+        (e, 2) R' - R of each unreduced entry.
+    entries
+        (e,) its number, 0 ... count - 1, among those of the reduced matrix.
+    count
+        Number of reduced entries.
     """
 
-    def __init__(self, copies: BlochMap) -> None:
-        is_inner = np.bincount(copies.places)[copies.places] == 1
-        inner = np.flatnonzero(is_inner)
-        self.inner = inner[np.argsort(copies.places[inner])]  # the order of little fill-in
-        self.inner_places = copies.places[self.inner]
-        self.rim = np.flatnonzero(~is_inner)
-        self.rim_places, column = np.unique(copies.places[self.rim], return_inverse=True)
-        shift = copies.shift[self.rim]
-        self.copies = BlochMap(column, shift)
-        # Sorted by R' - R once, as in ``Reduction``; here matrices are dense.
-        size = len(self.rim_places)
-        differences = (shift[None, :] - shift[:, None]).reshape(-1, 2)
+    def __init__(self, differences: IntArray, entries: IntArray, count: int) -> None:
         self._differences, phase = np.unique(differences, axis=0, return_inverse=True)
-        entry = column[:, None] * size + column
-        self._target = phase.ravel() * size**2 + entry.ravel()
+        self._shape = len(self._differences), count
+        self._target = phase.ravel() * count + entries.ravel()
+
+    def summed(self, values: FloatArray) -> FloatArray:
+        """(d, count) blocks of the entries (e,): one for each R' - R."""
+        size = self._shape[0] * self._shape[1]
+        return np.asarray(np.bincount(self._target, values, size), np.float64).reshape(self._shape)
+
+    def at(self, blocks: FloatArray, waves: FloatArray) -> Batch:
+        """(w, count) entries of T^H A T for phases (w, 2) [rad]; real where T is."""
+        factors = phase_factors(self._differences, waves).T
+        if factors.dtype.kind == "f":
+            return np.asarray(factors @ blocks)
+        result = np.empty((len(factors), blocks.shape[1]), dtype=np.complex128)
+        # Without a complex copy of the blocks.
+        result.real, result.imag = factors.real @ blocks, factors.imag @ blocks
+        return result
+
+
+class BoundaryDofs:
+    """The components of displacement with copies in other cells, and how their matrices reduce.
+
+    ``interior`` and ``boundary`` are the components without and with copies, ``interior_places``
+    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is that of the
+    boundary alone.
+
+    Parameters
+    ----------
+    bloch_map
+        Of all components of the mesh's nodes.
+    """
+
+    def __init__(self, bloch_map: BlochMap) -> None:
+        is_interior = np.bincount(bloch_map.places)[bloch_map.places] == 1
+        interior = np.flatnonzero(is_interior)
+        self.interior = interior[np.argsort(bloch_map.places[interior])]  # with little fill-in
+        self.interior_places = bloch_map.places[self.interior]
+        self.boundary = np.flatnonzero(~is_interior)
+        places = bloch_map.places[self.boundary]
+        self.boundary_places, column = np.unique(places, return_inverse=True)
+        shift = bloch_map.shift[self.boundary]
+        self.bloch_map = BlochMap(column, shift)
+        self._size = len(self.boundary_places)
+        differences = (shift[None, :] - shift[:, None]).reshape(-1, 2)
+        entries = column[:, None] * self._size + column
+        self._entries = ShiftedEntries(differences, entries, self._size**2)
 
     def sorted(self, matrix: FloatArray) -> FloatArray:
-        """The entries of a matrix of all the outline's components by their phase."""
-        shape = len(self._differences), len(self.rim_places) ** 2
-        summed = np.bincount(self._target, matrix.ravel(), shape[0] * shape[1])
-        return np.asarray(summed, dtype=np.float64).reshape(shape)
+        """The entries of a dense matrix of all boundary components by their phase."""
+        return self._entries.summed(matrix.ravel())
 
     def reduced(self, blocks: FloatArray, waves: FloatArray) -> Batch:
         """(w, m, m) T^H A T of a sorted matrix A for phases (w, 2) [rad]."""
-        factors = phase_factors(self._differences, waves).T
-        size = len(factors), len(self.rim_places), len(self.rim_places)
-        if factors.dtype.kind == "f":
-            return (factors @ blocks).reshape(size)
-        result = np.empty((len(factors), blocks.shape[1]), dtype=np.complex128)
-        result.real, result.imag = factors.real @ blocks, factors.imag @ blocks
-        return result.reshape(size)
+        return self._entries.at(blocks, waves).reshape(-1, self._size, self._size)
 
 
 class Reduction:
@@ -163,7 +190,7 @@ class Reduction:
         self.periodicity = periodicity
         self.order: IntArray = np.arange(self.size)
         self._sort(pattern)
-        whole = self.assembled(self._sorted(pattern.data).sum(axis=0))
+        whole = self.assembled(self._entries.summed(pattern.data).sum(axis=0))
         # Shifted, so that it is regular; all that counts is where its entries are.
         identity = csc_array((np.ones(self.size), (self.order, self.order)))
         shift = 2.0 * float(abs(whole).sum(axis=0).max())
@@ -179,29 +206,23 @@ class Reduction:
         place = np.argsort(self.order)
         row = place[2 * master[rows // 2] + rows % 2]
         column = place[2 * master[columns // 2] + columns % 2]
-        differences = shift[columns // 2] - shift[rows // 2]
-        self._differences, phase = np.unique(differences, axis=0, return_inverse=True)
         entries, entry = np.unique(column * self.size + row, return_inverse=True)
         self._indices = (entries % self.size).astype(np.int32)
         counts = np.bincount(entries // self.size, minlength=self.size)
         self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        self._target = phase.ravel() * len(entries) + entry
-
-    def _sorted(self, values: FloatArray) -> FloatArray:
-        blocks = len(self._differences), len(self._indices)
-        summed = np.bincount(self._target, values, blocks[0] * blocks[1])
-        return np.asarray(summed, dtype=np.float64).reshape(blocks)
+        differences = shift[columns // 2] - shift[rows // 2]
+        self._entries = ShiftedEntries(differences, entry, len(entries))
 
     def reduced(self, matrix: csr_array) -> Reduced:
         """The matrix (of the pattern this was made for), ready for any wave vector."""
-        return Reduced(self, self._sorted(matrix.data))
+        return Reduced(self, self._entries, self._entries.summed(matrix.data))
 
     def assembled(self, data: NDArray[Any]) -> csc_array:
         """The sparse matrix with these entries."""
         return csc_array((data, self._indices, self._indptr), shape=(self.size, self.size))
 
     @cached_property
-    def copies(self) -> BlochMap:
+    def bloch_map(self) -> BlochMap:
         """The components of the mesh's nodes as copies of the reduced unknowns."""
         components = 2 * np.repeat(self.periodicity.master, 2)
         components[1::2] += 1
@@ -209,50 +230,31 @@ class Reduction:
         return BlochMap(places, np.repeat(self.periodicity.shift, 2, axis=0))
 
     @cached_property
-    def outline(self) -> BoundaryDofs:
+    def boundary(self) -> BoundaryDofs:
         """Those of them that have copies in other cells."""
-        return BoundaryDofs(self.copies)
+        return BoundaryDofs(self.bloch_map)
 
-    def phases(self, wave: tuple[float, float]) -> ComplexArray:
-        """The factors exp(i k . (R' - R)) of the sorted entries."""
-        return np.asarray(np.exp(1j * (self._differences @ np.asarray(wave))))
-
-    def displacement(self, vector: NDArray[Any], wave: tuple[float, float]) -> NDArray[Any]:
+    def displacement(self, vector: NDArray[Any], wave: Wave = CENTRE) -> NDArray[Any]:
         """(n, 2) nodal displacement T(k) x of a reduced vector (real if x and T(k) are)."""
-        masters = np.empty(self.size, dtype=vector.dtype)
-        masters[self.order] = vector
-        at_nodes = masters.reshape(-1, 2)[self.periodicity.master]
-        if wave == (0.0, 0.0):
-            return np.asarray(at_nodes)
-        phase = np.exp(1j * (self.periodicity.shift @ np.asarray(wave)))
-        return np.asarray(phase[:, None] * at_nodes)
+        T = self.bloch_map.at(np.array([wave]))
+        return T.expand(vector[:, None, None]).reshape(-1, 2)
 
-    def gathered(self, forces: FloatArray) -> FloatArray:
+    def restricted(self, forces: FloatArray) -> FloatArray:
         """T(0)^T f for f (2 n,) or (2 n, m)."""
-        component = 2 * np.repeat(self.periodicity.master, 2) + np.tile([0, 1], len(forces) // 2)
-        summed = np.zeros((self.size, *forces.shape[1:]))
-        np.add.at(summed, component, forces)
-        return np.asarray(summed[self.order])
+        T = self.bloch_map.at(np.array([CENTRE]))
+        result = T.restrict(forces.reshape(len(forces), 1, -1))
+        return result.reshape(self.size, *forces.shape[1:])
 
 
 class Reduced:
     """One matrix K as T(k)^H K T(k), a function of the phases k = (k . a1, k . a2) [rad]."""
 
-    def __init__(self, reduction: Reduction, blocks: FloatArray) -> None:
-        self._reduction, self._blocks = reduction, blocks
+    def __init__(self, reduction: Reduction, entries: ShiftedEntries, blocks: FloatArray) -> None:
+        self._reduction, self._entries, self._blocks = reduction, entries, blocks
 
-    def at(self, wave: tuple[float, float]) -> csc_array:
+    def at(self, wave: Wave) -> csc_array:
         """The Hermitian matrix; real where both phases are multiples of pi."""
-        phases = self._reduction.phases(wave)
-        if np.abs(phases.imag).max() < 1e-12:
-            return self._reduction.assembled(phases.real @ self._blocks)
-        return self._reduction.assembled(self._combined(phases))
-
-    def _combined(self, factors: ComplexArray) -> ComplexArray:
-        """The sorted entries times complex factors, without a complex copy of them."""
-        data = np.empty(self._blocks.shape[1], dtype=np.complex128)
-        data.real, data.imag = factors.real @ self._blocks, factors.imag @ self._blocks
-        return data
+        return self._reduction.assembled(self._entries.at(self._blocks, np.array([wave]))[0])
 
 
 def factorise(matrix: csc_array, order: str = "NATURAL") -> Any:
@@ -282,20 +284,20 @@ class Condensation:
     ----------
     matrix
         (2 n, 2 n), the two components of a node side by side.
-    outline
-        The nodes that have copies.
+    dofs
+        Which nodes have copies.
     """
 
-    def __init__(self, matrix: csr_array, outline: BoundaryDofs) -> None:
-        self.outline = outline
-        rows = matrix[outline.inner]
-        self.factor: Any = factorise(csc_array(rows[:, outline.inner]))
+    def __init__(self, matrix: csr_array, dofs: BoundaryDofs) -> None:
+        self.dofs = dofs
+        rows = matrix[dofs.interior]
+        self.factor: Any = factorise(csc_array(rows[:, dofs.interior]))
         self.is_definite = negative_pivots(self.factor) == 0
-        self.coupling = rows[:, outline.rim]
+        self.coupling = rows[:, dofs.boundary]
         self.transposed = csr_array(self.coupling.T)
         self.response = np.ascontiguousarray(self.factor.solve(self.coupling.toarray()))
-        corner = matrix[outline.rim][:, outline.rim].toarray()
-        self._blocks = outline.sorted(corner - self.transposed @ self.response)
+        corner = matrix[dofs.boundary][:, dofs.boundary].toarray()
+        self._blocks = dofs.sorted(corner - self.transposed @ self.response)
 
     def at(self, waves: FloatArray) -> CondensedWaves | None:
         """The solvers for phases (w, 2) [rad]; None if one matrix isn't positive definite."""
@@ -303,7 +305,7 @@ class Condensation:
             return None
         try:
             # LAPACK has matrices by columns, and A(-k)^T = A(k).
-            transposed = self.outline.reduced(self._blocks, -waves)
+            transposed = self.dofs.reduced(self._blocks, -waves)
             return CondensedWaves(self, transposed.transpose(0, 2, 1), waves)
         except np.linalg.LinAlgError:
             return None
@@ -314,20 +316,20 @@ class CondensedWaves:
 
     def __init__(self, whole: Condensation, complements: Batch, waves: FloatArray) -> None:
         self._whole = whole
-        self._T = whole.outline.copies.at(waves)
+        self._T = whole.dofs.bloch_map.at(waves)
         options = {"lower": True, "check_finite": False, "overwrite_a": True}
         self._factors = [cho_factor(complement, **options) for complement in complements]
 
     def solve(self, forces: Batch) -> Batch:
         """The solutions for a batch of right-hand sides (size, w, m)."""
-        whole, outline = self._whole, self._whole.outline
-        relaxed = applied(whole.factor.solve, forces[outline.inner_places])
-        reaction = self._T.gather(applied(whole.transposed.__matmul__, relaxed))
-        complement = self._solved(forces[outline.rim_places] - reaction)
+        whole, dofs = self._whole, self._whole.dofs
+        relaxed = applied(whole.factor.solve, forces[dofs.interior_places])
+        reaction = self._T.restrict(applied(whole.transposed.__matmul__, relaxed))
+        complement = self._solved(forces[dofs.boundary_places] - reaction)
         result = np.empty_like(forces)
-        result[outline.rim_places] = complement
-        moved = applied(whole.response.__matmul__, self._T.spread(complement))
-        result[outline.inner_places] = relaxed - moved
+        result[dofs.boundary_places] = complement
+        moved = applied(whole.response.__matmul__, self._T.expand(complement))
+        result[dofs.interior_places] = relaxed - moved
         return result
 
     def _solved(self, forces: Batch) -> Batch:

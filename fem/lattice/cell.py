@@ -20,14 +20,13 @@ from scipy.sparse import csc_array, csr_array
 from modeharvest.fem.hyperelastic import FreeBody
 from modeharvest.fem.lattice.bloch_map import Reduction, factorise, negative_pivots
 from modeharvest.fem.lattice.cells import UnitCell
-from modeharvest.fem.lattice.options import MacroLoading
+from modeharvest.fem.lattice.options import CENTRE, MacroLoading
 from modeharvest.fem.materials import Material
 from modeharvest.util.arrays import FloatArray
 
 # Forces must be smaller than what a change of the load by this would make.
 _LOAD_TOLERANCE = 1e-11
 _AMPLITUDE_TOLERANCE = 1e-11  # relative
-_AT_REST = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +105,7 @@ class LinearisedCell:
         self.area = cell.cell.area
         u = cell.displaced(gradient, fluctuation)
         forces = cell.body.forces(u)
-        self.forces = cell.reduction.gathered(forces)[cell.moving]
+        self.forces = cell.reduction.restricted(forces)[cell.free_dofs]
         self.macro_forces = cell.affine.T @ forces
         self.is_regular = bool(np.isfinite(forces).all())
         if self.is_regular:
@@ -114,10 +113,10 @@ class LinearisedCell:
 
     def _eliminate(self, stiffness: csr_array) -> None:
         """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
-        cell, moving = self.cell, np.flatnonzero(self.cell.moving)
+        cell, moving = self.cell, np.flatnonzero(self.cell.free_dofs)
         self.stiffness, self.on_affine = stiffness, stiffness @ cell.affine
-        self.coupling = cell.reduction.gathered(self.on_affine)[moving]
-        inner = cell.reduction.reduced(stiffness).at(_AT_REST)[moving][:, moving]
+        self.coupling = cell.reduction.restricted(self.on_affine)[moving]
+        inner = cell.reduction.reduced(stiffness).at(CENTRE)[moving][:, moving]
         cell.factorisations += 1
         try:
             self._factor: Any = factorise(csc_array(inner))
@@ -174,7 +173,7 @@ class LinearisedCell:
         if self.amplitude is None:
             along, stiffness = along[:, :-1], stiffness[:, :-1]
         else:
-            weights = self.amplitude.weights[self.cell.moving]
+            weights = self.amplitude.weights[self.cell.free_dofs]
             stiffness = np.vstack([stiffness, weights @ self.response @ along])
             rest = np.append(rest, self._excess + weights @ relaxed)
         unknown = np.linalg.solve(stiffness, -rest)
@@ -197,13 +196,12 @@ class LinearisedCell:
 
     def _full(self, moving: FloatArray) -> FloatArray:
         every = np.zeros(self.cell.reduction.size)
-        every[self.cell.moving] = moving
+        every[self.cell.free_dofs] = moving
         return every
 
 
 _ITERATIONS = 12
 _SMALLEST_STEP = 1e-6  # of the load
-_ZERO_WAVE = (0.0, 0.0)
 
 
 class Failure(Enum):
@@ -219,7 +217,7 @@ class PeriodicCell:
     ``nodal_mass`` and ``mass`` are the mass matrix of unit density [mm^2], unreduced and reduced,
     ``filling`` is the share of the cell that is material [-]; ``factorisations`` counts every
     factorisation of an equilibrium. ``affine`` (2 n, 4) are the displacements of F̄_11, F̄_12,
-    F̄_21 and F̄_22 [mm]; ``moving`` says which reduced unknowns are not held.
+    F̄_21 and F̄_22 [mm]; ``free_dofs`` says which reduced unknowns are not fixed.
 
     Parameters
     ----------
@@ -240,7 +238,7 @@ class PeriodicCell:
         X, zero = cell.mesh.nodes, np.zeros(len(cell.mesh.nodes))
         modes = [(X[:, 0], zero), (X[:, 1], zero), (zero, X[:, 0]), (zero, X[:, 1])]
         self.affine = np.stack([np.stack(m, axis=1).ravel() for m in modes], axis=1)
-        self.moving = self.reduction.order // 2 != 0  # master 0 is held
+        self.free_dofs = self.reduction.order // 2 != 0  # master 0 is fixed
 
     def displacement(self, state: CellState) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes, affine part included [mm]."""
@@ -295,11 +293,11 @@ class PeriodicCell:
     def negative_eigenvalues(self, loading: MacroLoading, state: CellState) -> int:
         """Number of negative eigenvalues of the tangent in w and the free components of F̄.
 
-        Those of w with F̄ held, and of the moduli of the free components (Haynsworth, Linear
+        Those of w with F̄ fixed, and of the moduli of the free components (Haynsworth, Linear
         Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
         """
-        moving = np.flatnonzero(self.moving)
-        inner = self.reduction.reduced(state.stiffness).at(_ZERO_WAVE)[moving][:, moving]
+        moving = np.flatnonzero(self.free_dofs)
+        inner = self.reduction.reduced(state.stiffness).at(CENTRE)[moving][:, moving]
         self.factorisations += 1
         free = loading.free
         moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
@@ -309,7 +307,7 @@ class PeriodicCell:
     def displaced(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes for F̄ (4,) and w (2 count,) [mm]."""
         affine = (self.affine @ (gradient - np.eye(2).ravel())).reshape(-1, 2)
-        return np.asarray(affine + self.reduction.displacement(fluctuation, _ZERO_WAVE))
+        return np.asarray(affine + self.reduction.displacement(fluctuation))
 
 
 @dataclass(eq=False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,32 @@ class BranchOptions:
             raise InputError(
                 f"branch: expected 0 < first <= longest <= farthest and growth >= 1, got {self}"
             )
+
+
+Wave = tuple[float, float]
+"""Phases (k . a1, k . a2) of a Bloch wave from cell to cell [rad]."""
+CENTRE: Wave = (0.0, 0.0)
+"""Γ: the modes with the cell's own period."""
+
+
+def wave_of(given: Any) -> Wave:
+    """A wave vector as two finite phases [rad].
+
+    Raises
+    ------
+    InputError
+        If it is anything else: a third component points out of the plane.
+    """
+    try:
+        phases = np.asarray(given)
+    except ValueError:  # rows of different lengths
+        phases = np.empty(0)
+    if phases.shape != (2,) or phases.dtype.kind not in "iuf" or not np.isfinite(phases).all():
+        raise InputError(
+            "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers [rad] "
+            f"(the wave lies in the plane), got {given}"
+        )
+    return float(phases[0]), float(phases[1])
 
 
 Rates = tuple[tuple[float | None, float | None], tuple[float | None, float | None]]

@@ -12,7 +12,8 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from modeharvest.fem.bloch.modes import Branch, Wave
+from modeharvest.fem.bloch.modes import Branch
+from modeharvest.fem.lattice.options import Wave
 from modeharvest.fem.materials import material_text
 from modeharvest.idic.spectra.lattice_spectrum import upward
 from modeharvest.report.figures.lattice import (

@@ -16,8 +16,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import Voronoi
 
 from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap
-from modeharvest.fem.bloch.modes import Branch, Wave
+from modeharvest.fem.bloch.modes import Branch
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.options import Wave
 from modeharvest.report.figures.curves import annotate, curve
 from modeharvest.report.figures.maps import WIDTH, ColourScale, colour_bar
 from modeharvest.report.figures.outlines import LatticePatch, MeshBoundary

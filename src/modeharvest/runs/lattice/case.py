@@ -29,15 +29,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, runti
 
 from pydantic import model_validator
 
-from modeharvest.fem.bloch.dispersion import ZONES, Wave, in_plane
+from modeharvest.fem.bloch.dispersion import ZONES
 from modeharvest.fem.experiment import SMALLEST_STEP
 from modeharvest.fem.lattice.options import (
     MacroLoading,
     Rates,
+    Wave,
     equibiaxial,
     simple_shear,
     uniaxial,
     uniaxial_strain,
+    wave_of,
 )
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
@@ -394,7 +396,7 @@ class ModesPlan:
 
 def _phases(waves: Any) -> tuple[Wave, ...]:
     """Units of π to rad, each wave checked to be in the plane."""
-    checked = (in_plane(wave) for wave in waves)
+    checked = (wave_of(wave) for wave in waves)
     return tuple((math.pi * p, math.pi * q) for p, q in checked)
 
 

@@ -54,8 +54,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from modeharvest.fem.bloch.dispersion import Dispersion
-from modeharvest.fem.bloch.modes import Branch, ModeSet, Wave
+from modeharvest.fem.bloch.modes import Branch, ModeSet
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
 from modeharvest.runs.lattice.case import LatticeCase
