@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
 
-from modeharvest.fem.materials import Material, Ogden
+from modeharvest.fem.materials import Material, Ogden, material_table
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.util.errors import InputError
 
@@ -23,7 +23,7 @@ _LARGEST_TILT = 1.0
 
 @dataclass(frozen=True)
 class PathOptions:
-    """How the path is walked.
+    """How the path is followed.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Experiment:
         Scatter of the holes; with any, there is no bifurcation to find and the one natural
         path is followed.
     path
-        How the path is walked.
+        How the path is followed.
     tilt
         By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
         about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is
@@ -142,10 +142,9 @@ class Experiment:
 
         As JSON gives it back; the rest of the options says how the solution is found.
         """
-        material: Any = self.material
         tables = {
             "specimen": self.specimen.plain(),
-            "material": {"kind": type(material).__name__, **vars(material)},
+            "material": material_table(self.material),
             "loading": {
                 "edges": self.edges,
                 "length_mm": self.specimen.length,

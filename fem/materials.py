@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from modeharvest.util.errors import InputError
+from modeharvest.util.typed import made, nearest
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,6 @@ class TwoTermI1:
         )
 
 
-MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
-
-
 @runtime_checkable
 class Material(Protocol):
     """Anything that has a strain energy density."""
@@ -111,23 +109,30 @@ class Material(Protocol):
         """Strain energy density W [MPa] as a UFL expression of F (2 x 2) [-]."""
 
 
-def material_text(table: Mapping[str, Any]) -> str:
-    """A material's kind and constants, and whether they are this project's default.
+MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
+"""By their kinds in a case."""
 
-    Parameters
-    ----------
-    table
-        ``kind`` and the constants, as in a case or in a solution's ``info``.
+
+def material_table(material: Any) -> dict[str, Any]:
+    """Kind (the class' name) and constants, as solutions hold them."""
+    return {"kind": type(material).__name__, **vars(material)}
+
+
+def material_of(table: Mapping[str, Any]) -> Material:
+    """The material of a table with its ``kind`` as in a case or as in a solution.
+
+    Raises
+    ------
+    InputError
+        If there is no such kind, a constant is unknown or out of its range.
     """
-    constants = {name: value for name, value in table.items() if name != "kind"}
-    values = ", ".join(f"{name} {_plain_number(value)}" for name, value in constants.items())
-    usual = {name: _plain_number(value) for name, value in vars(Ogden()).items()}
-    is_usual = {name: _plain_number(value) for name, value in constants.items()} == usual
-    return f"{'default ' * is_usual}material {table['kind']}: {values} (moduli in MPa)"
-
-
-def _plain_number(value: Any) -> str:
-    return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"
+    constants = dict(table)
+    kinds = {**MATERIALS, **{kind.__name__: kind for kind in MATERIALS.values()}}
+    kind = constants.pop("kind", None)
+    if kind not in kinds:
+        raise InputError(f"material: expected a kind, got {kind!r}{nearest(str(kind), [*kinds])}")
+    material: Material = made(kinds[kind], constants)
+    return material
 
 
 def power_sum_of_stretches(F: Any, m: float) -> Any:

@@ -1,11 +1,11 @@
-"""From a specimen to its solution: mesh it, walk the path, keep the snapshots asked for."""
+"""From a specimen to its solution: mesh it, follow its path, keep the requested snapshots."""
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -15,14 +15,16 @@ from petsc4py import PETSc
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
+from modeharvest.fem.materials import material_table
 from modeharvest.fem.meshing import mesh_specimen, perturb
-from modeharvest.fem.path.branching import follow_branch
+from modeharvest.fem.path.branching import PATTERN_TOLERANCE, follow_branch, follow_to_pattern
 from modeharvest.fem.path.continuation import PathFollower, State
 from modeharvest.fem.path.critical import Critical, locate_critical
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.stability import Mode
 from modeharvest.fem.specimen import Specimen
 from modeharvest.util import __version__
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
 
 
@@ -52,22 +54,41 @@ def simulate(
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)
+    return _Run(experiment, mesh, _follower(experiment, mesh, comm, progress)).solution()
+
+
+def _follower(
+    experiment: Experiment, mesh: Mesh, comm: MPI.Comm, progress: Progress = silent
+) -> PathFollower:
+    spec = experiment.specimen
     pins = spec.mid_junctions if experiment.guided else ()
     loading = EdgeCompression(
         spec.half_size[0], spec.length, experiment.edges, experiment.tilt, pins
     )
     structure = Structure(mesh, experiment.material, loading, comm)
-    return _Run(experiment, mesh, PathFollower(structure, experiment.path, progress)).solution()
+    return PathFollower(structure, experiment.path, progress)
+
+
+def _snapshot(structure: Structure, length: float, state: State, branch: str) -> Snapshot:
+    return Snapshot(
+        nominal_strain=state.strain,
+        displacement=structure.nodal(state.u),
+        reaction=structure.reaction(state.u, length),
+        energy=structure.energy(state.u),
+        negative_pivots=state.negative_pivots,
+        eigenvalues=state.eigenvalues,
+        branch=branch,
+    )
 
 
 @dataclass(eq=False)
 class _Run:
     experiment: Experiment
     mesh: Mesh
-    walker: PathFollower
+    follower: PathFollower
 
     def solution(self) -> Solution:
-        """Walk the path and put together what it gave."""
+        """Follow the path and put together what it gave."""
         path, critical = self._primary()
         branches = {} if critical is None else self._branches(self._oriented(critical))
         limit = _stable_until(path, critical)
@@ -78,27 +99,27 @@ class _Run:
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _primary(self) -> tuple[list[State], Critical | None]:
-        """The primary path, and where it becomes unstable; beyond that only if it is asked for.
+        """The primary path, and where it becomes unstable; beyond that only on request.
 
         Without a bifurcation there is one natural path, which bends where the pattern sets in:
         in an imperfect specimen, under tilted loading, and in a specimen with an odd number of
         holes both ways, whose pattern has its own symmetries. Long steps slip off it, so it is
-        walked again from the last stable state, and no unstable one is accepted.
+        followed again from the last stable state, and no unstable one is accepted.
         """
         strains = self.experiment.strains
-        path = [self.walker.start()]
+        path = [self.follower.start()]
         if self.experiment.is_perfect:
-            self.walker.primary(path, strains, until_unstable=True)
+            self.follower.follow_primary(path, strains, until_unstable=True)
             if path[-1].negative_pivots == 0:
                 return path, None
-            critical = locate_critical(self.walker, path[-2], path[-1])
+            critical = locate_critical(self.follower, path[-2], path[-1])
             if critical is not None:
                 if "primary" in self.experiment.branches:
-                    self.walker.primary(path, strains)
+                    self.follower.follow_primary(path, strains)
                 return path, critical
             path.pop()
-            self.walker.linearisation = None
-        self.walker.primary(path, strains, refuse_unstable=True)
+            self.follower.linearisation = None
+        self.follower.follow_primary(path, strains, refuse_unstable=True)
         return path, None
 
     def _oriented(self, critical: Critical) -> Critical:
@@ -111,24 +132,24 @@ class _Run:
         is_staggered = self.experiment.specimen.is_staggered
         overlap = 0.0 if is_staggered else self._pattern_overlap(mode)
         if abs(overlap) < 1e-6:
-            overlap = mode.overlap(self._lopsided())
+            overlap = mode.overlap(self._asymmetric_field())
         if overlap < 0:
             critical.modes[0] = mode.reversed()
         return critical
 
-    def _lopsided(self) -> PETSc.Vec:
+    def _asymmetric_field(self) -> PETSc.Vec:
         """A smooth field that no symmetry of a rectangle maps to plus or minus itself."""
 
-        def field(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        def field(points: FloatArray) -> FloatArray:
             x, y = (points / self.experiment.specimen.half_size).T
             along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
             return np.stack([along, across], axis=1)
 
-        return self.walker.structure.from_function(field)
+        return self.follower.structure.from_function(field)
 
     def _pattern_overlap(self, mode: Mode) -> float:
-        pattern = self.walker.structure.from_function(self.experiment.specimen.pattern)
-        weighted = self.walker.mass * pattern
+        pattern = self.follower.structure.from_function(self.experiment.specimen.pattern)
+        weighted = self.follower.mass * pattern
         return mode.overlap(pattern) / float(np.sqrt(pattern.dot(weighted)))
 
     def _pattern_share(self, mode: Mode) -> float:
@@ -137,12 +158,12 @@ class _Run:
         The root of the part of x . M x that lies in the span of the pattern's restrictions
         to single unit cells: 1 for the pattern with any smooth envelope.
         """
-        structure, spec = self.walker.structure, self.experiment.specimen
+        structure, spec = self.follower.structure, self.experiment.specimen
         pattern = spec.pattern(self.mesh.nodes)
         cell = _cell_of(self.mesh.nodes, spec)
         inside = cell >= 0
         with_mode = np.sum(pattern * structure.nodal(mode.weighted), axis=1)[inside]
-        mass_of = structure.nodal(self.walker.mass * structure.from_function(spec.pattern))
+        mass_of = structure.nodal(self.follower.mass * structure.from_function(spec.pattern))
         with_self = np.sum(pattern * mass_of, axis=1)[inside]
         numerator = np.bincount(cell[inside], with_mode)
         return float(np.sqrt(np.sum(numerator**2 / np.bincount(cell[inside], with_self))))
@@ -152,7 +173,7 @@ class _Run:
         pitch = self.experiment.specimen.pitch
         signs = {"buckled+": 1, "buckled-": -1}
         wanted = [b for b in self.experiment.branches if b in signs]
-        return {b: follow_branch(self.walker, critical, targets, signs[b], pitch) for b in wanted}
+        return {b: follow_branch(self.follower, critical, targets, signs[b], pitch) for b in wanted}
 
     def _snapshots(
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
@@ -165,19 +186,10 @@ class _Run:
         ]
         kept += [(state, name) for name, states in branches.items() for state in states]
         kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
-        return [self._snapshot(state, name) for state, name in kept]
-
-    def _snapshot(self, state: State, branch: str) -> Snapshot:
-        structure = self.walker.structure
-        return Snapshot(
-            nominal_strain=_exact(state.strain, self.experiment.strains),
-            displacement=structure.nodal(state.u),
-            reaction=structure.reaction(state.u, self.experiment.specimen.length),
-            energy=structure.energy(state.u),
-            negative_pivots=state.negative_pivots,
-            eigenvalues=state.eigenvalues,
-            branch=branch,
-        )
+        structure, length = self.follower.structure, self.experiment.specimen.length
+        found = [_snapshot(structure, length, state, name) for state, name in kept]
+        strains = self.experiment.strains
+        return [replace(s, nominal_strain=_exact(s.nominal_strain, strains)) for s in found]
 
     def _info(
         self, path: list[State], critical: Critical | None, branches: dict[str, list[State]]
@@ -190,7 +202,7 @@ class _Run:
             "path": {
                 name: self._curve(states) for name, states in {"primary": path, **branches}.items()
             },
-            "factorisations": self.walker.structure.factorisations,
+            "factorisations": self.follower.structure.factorisations,
             "unknowns": 2 * len(self.mesh.nodes),
             "versions": {
                 "modeharvest": __version__,
@@ -219,7 +231,7 @@ class _Run:
 
     def _curve(self, states: list[State]) -> dict[str, Any]:
         """What happened along a path, for plots: one entry for each state."""
-        structure, length = self.walker.structure, self.experiment.specimen.length
+        structure, length = self.follower.structure, self.experiment.specimen.length
         return {
             "nominal_strain": [s.strain for s in states],
             "reaction_N_per_mm": [structure.reaction(s.u, length) for s in states],
@@ -269,7 +281,7 @@ def _stable_until(path: list[State], critical: Critical | None) -> float:
     return max(state.strain for state in path if state.negative_pivots == 0)
 
 
-def _cell_of(nodes: NDArray[np.float64], specimen: Specimen) -> NDArray[np.int64]:
+def _cell_of(nodes: FloatArray, specimen: Specimen) -> NDArray[np.int64]:
     """(n,) number of the unit cell that each node lies in, -1 in the bulk edges."""
     a, b = specimen.cellular_half_size
     column = np.floor((nodes[:, 0] + a) / specimen.pitch).astype(np.int64)
@@ -284,3 +296,109 @@ def _is_among(strain: float, strains: Sequence[float]) -> bool:
 
 def _exact(strain: float, strains: Sequence[float]) -> float:
     return min(strains, key=lambda e: abs(strain - e))
+
+
+_ATTEMPTS = 3  # with shorter and shorter steps
+
+
+class PatternMeasure(Protocol):
+    """A pattern in nodal displacements (n, 2) [mm]."""
+
+    def share(self, displacement: FloatArray) -> float:
+        """How much of a field is the pattern, between -1 and 1; its sign is the pattern's."""
+
+    def amplitude(self, displacement: FloatArray) -> float:
+        """The pattern's amplitude [mm]."""
+
+
+def simulate_pattern(
+    experiment: Experiment,
+    mesh: Mesh,
+    pattern: PatternMeasure,
+    target: float,
+    largest_strain: float,
+) -> Solution:
+    """Compress a perfect specimen beyond buckling until its pattern has a given amplitude.
+
+    Without the unstable primary path, which costs most where ligaments are thin.
+
+    Parameters
+    ----------
+    experiment
+        Specimen, material, edges and path options; strains and branches are not used.
+    mesh
+        Of the specimen.
+    pattern
+        What is measured.
+    target
+        The pattern's amplitude to be reached [mm].
+    largest_strain
+        Up to which to look for the first critical point [-].
+
+    Returns
+    -------
+    Solution
+        With one snapshot, on the branch that leaves the primary path at its first critical point.
+        Without such a point it is the last stable state, and ``info["critical"]`` is None; else
+        that has the ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's share.
+        ``info["outcome"]`` is "complete" or the reason why not.
+    """
+    spec, follower = experiment.specimen, _follower(experiment, mesh, MPI.COMM_SELF)
+    structure = follower.structure
+    state, critical, outcome = _until_critical(follower, largest_strain)
+    info = None
+    if critical is not None:
+        mode = critical.modes[0]
+        share = pattern.share(structure.nodal(mode.vector))
+        info = {"strain": critical.strain, "pattern_overlap_by_cell": abs(share)}
+        critical.modes[0] = mode if share > 0 else mode.reversed()
+        found, reached = follow_to_pattern(follower, critical, pattern.amplitude, target)
+        state = found or state
+        if abs(reached / target - 1.0) > PATTERN_TOLERANCE:
+            outcome = (
+                f"the branch could be followed to a pattern of {reached / spec.pitch:.3f} l only, "
+                f"not to {target / spec.pitch:.3f} l"
+            )
+    branch = "primary" if critical is None else "buckled+"
+    return Solution(
+        mesh,
+        (_snapshot(structure, spec.length, state, branch),),
+        {
+            "specimen": spec.plain(),
+            "material": material_table(experiment.material),
+            "loading": {"edges": experiment.edges, "length_mm": spec.length},
+            "mesh_size_mm": experiment.mesh_size,
+            "factorisations": structure.factorisations,
+            "versions": {"modeharvest": __version__},
+            "critical": info,
+            "outcome": outcome,
+        },
+    )
+
+
+def _until_critical(
+    follower: PathFollower, largest_strain: float
+) -> tuple[State, Critical | None, str]:
+    """The last stable state of the primary path, its first critical point, and the outcome.
+
+    Where no bifurcation is found between the last two states, steps were too long to stay on the
+    path: it is followed again from the stable one with shorter steps.
+    """
+    path = [follower.start()]
+    for _ in range(_ATTEMPTS):
+        reached = follower.follow_primary(path, (largest_strain,), until_unstable=True)
+        last = path[-1]
+        if last.negative_pivots == 0:
+            why = "the largest strain looked at" if reached else "where the path was lost"
+            return last, None, f"stable up to {100 * last.strain:.4g} %, {why}"
+        critical = locate_critical(follower, path[-2], last)
+        if critical is not None:
+            return path[-2], critical, "complete"
+        path.pop()
+        steps = {n: getattr(follower.options, n) / 3.0 for n in ("first_step", "largest_step")}
+        follower.options = replace(follower.options, **steps)
+        follower.linearisation = None
+    before, after = 100 * path[-1].strain, 100 * last.strain
+    return path[-1], None, (
+        f"unstable between {before:.4g} and {after:.4g} %, where no bifurcation was found"
+    )  # fmt: skip

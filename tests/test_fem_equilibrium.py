@@ -17,7 +17,7 @@ from modeharvest.fem import dolfinx_api
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.fem.path.continuation import PathFollower, State, along
+from modeharvest.fem.path.continuation import PathFollower, State, displacement_at
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.newton import STRAIN_TOLERANCE, NewtonOutcome, correct
 from modeharvest.fem.specimen import Specimen
@@ -55,9 +55,9 @@ def structure_of(mesh: Mesh, material: Material, edges: str = "clamped") -> Stru
 
 def equilibrium(structure: Structure, strain: float) -> State:
     """The state on the primary path at a strain."""
-    walker = PathFollower(structure)
-    path = [walker.start()]
-    assert walker.primary(path, [strain])
+    follower = PathFollower(structure)
+    path = [follower.start()]
+    assert follower.follow_primary(path, [strain])
     return path[-1]
 
 
@@ -237,10 +237,10 @@ def test_reaction_is_the_slope_of_the_energy(edges: str) -> None:
     mesh = mesh_specimen(specimen, 0.4)
     loading = EdgeCompression(specimen.half_size[0], specimen.length, edges)
     structure = Structure(mesh, Ogden(), loading)
-    walker = PathFollower(structure)
-    path = [walker.start()]
+    follower = PathFollower(structure)
+    path = [follower.start()]
     h = 1e-4
-    assert walker.primary(path, [0.05 - h, 0.05, 0.05 + h])
+    assert follower.follow_primary(path, [0.05 - h, 0.05, 0.05 + h])
     low, mid, high = path[-3:]
     slope = (structure.energy(high.u) - structure.energy(low.u)) / (2 * h)
     # h^2/6 E'''/E' with E ~ e^2 up to softening: below 1e-6.
@@ -280,15 +280,15 @@ def test_half_of_the_tangent_is_kept_and_none_of_it_lost() -> None:
 
 
 def test_a_correction_from_nearby_needs_the_load_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    walker = PathFollower(structure_of(CURVED, Ogden()))
-    start = walker.start()
+    follower = PathFollower(structure_of(CURVED, Ogden()))
+    start = follower.start()
     counted: list[Any] = []
-    load = walker.structure.load
-    monkeypatch.setattr(walker.structure, "load", lambda u: counted.append(u) or load(u))
-    found = walker.equilibrium(1e-3, along(start, 1e-3))
+    load = follower.structure.load
+    monkeypatch.setattr(follower.structure, "load", lambda u: counted.append(u) or load(u))
+    found = follower.equilibrium(1e-3, displacement_at([start], 1e-3))
     assert found is not None
     assert len(counted) == 1
-    residual = walker.structure.residual(found.u).norm()
+    residual = follower.structure.residual(found.u).norm()
     assert residual <= STRAIN_TOLERANCE * load(found.u).norm()
 
 

@@ -85,9 +85,9 @@ def test_modes_are_those_of_the_dense_problem(strain: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Buckled:
-    """A column walked to its critical point."""
+    """A column followed to its critical point."""
 
-    walker: PathFollower
+    follower: PathFollower
     path: list[State]
     critical: Critical
     euler: float
@@ -99,12 +99,12 @@ def buckled_column(slenderness: float, material: Material = NO_POISSON) -> Buckl
     euler = np.pi**2 / (3 * slenderness**2)
     mesh = column(slenderness, 1.0, round(2 * slenderness), 2)
     structure = Structure(mesh, material, EdgeCompression(0.5 * slenderness, slenderness))
-    walker = PathFollower(structure, PathOptions(0.4 * euler, 0.4 * euler))
-    path = [walker.start()]
-    assert walker.primary(path, [1.5 * euler], until_unstable=True)
-    critical = locate_critical(walker, path[-2], path[-1])
+    follower = PathFollower(structure, PathOptions(0.4 * euler, 0.4 * euler))
+    path = [follower.start()]
+    assert follower.follow_primary(path, [1.5 * euler], until_unstable=True)
+    critical = locate_critical(follower, path[-2], path[-1])
     assert critical is not None
-    return Buckled(walker, path, critical, euler)
+    return Buckled(follower, path, critical, euler)
 
 
 def test_slender_column_buckles_at_eulers_strain() -> None:
@@ -129,7 +129,7 @@ def test_inertia_proves_the_critical_strain() -> None:
 
 def test_column_mode_is_the_clamped_cosine() -> None:
     c = buckled_column(16.0)
-    structure = c.walker.structure
+    structure = c.follower.structure
     mode = structure.nodal(c.critical.modes[0].vector)
     axis = np.abs(structure.mesh.nodes[:, 1]) < 1e-9
     x, v = structure.mesh.nodes[axis, 0], mode[axis, 1]
@@ -142,12 +142,12 @@ def test_buckled_column_is_stable_lower_and_as_deep_as_the_elastica() -> None:
     """v = A/2 (1 + cos 2 pi x/L) takes up the shortening beyond: A = 2 L/pi sqrt(e - e_c)."""
     length = 16.0
     c = buckled_column(length)
-    walker, structure = c.walker, c.walker.structure
+    follower, structure = c.follower, c.follower.structure
     targets = [1.2 * c.euler, 1.8 * c.euler]  # the next mode comes at 2.05
-    up = follow_branch(walker, c.critical, targets, 1, 1.0)
-    down = follow_branch(walker, c.critical, targets, -1, 1.0)
-    straight = [walker.start()]
-    assert walker.primary(straight, targets)
+    up = follow_branch(follower, c.critical, targets, 1, 1.0)
+    down = follow_branch(follower, c.critical, targets, -1, 1.0)
+    straight = [follower.start()]
+    assert follower.follow_primary(straight, targets)
     middle = np.argmin(np.linalg.norm(structure.mesh.nodes, axis=1))
     for k, strain in enumerate(targets):
         on_path = next(s for s in straight if abs(s.strain - strain) < 1e-12)
@@ -165,10 +165,10 @@ def test_buckled_column_is_stable_lower_and_as_deep_as_the_elastica() -> None:
 
 def test_critical_strain_does_not_depend_on_the_steps() -> None:
     reference = buckled_column(8.0)
-    walker = PathFollower(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
-    path = [walker.start()]
-    walker.primary(path, [1.5 * reference.euler], until_unstable=True)
-    critical = locate_critical(walker, path[-2], path[-1])
+    follower = PathFollower(reference.follower.structure, PathOptions(0.7 * reference.euler, 1.0))
+    path = [follower.start()]
+    follower.follow_primary(path, [1.5 * reference.euler], until_unstable=True)
+    critical = locate_critical(follower, path[-2], path[-1])
     assert critical is not None
     assert critical.strain == pytest.approx(reference.critical.strain, abs=2e-7)
 
@@ -176,11 +176,11 @@ def test_critical_strain_does_not_depend_on_the_steps() -> None:
 def test_critical_strain_is_found_where_the_negative_mode_is_hidden() -> None:
     """At a state that is critical for another mode the eigensolver may lose the negative one."""
     reference = buckled_column(8.0)
-    walker = PathFollower(reference.walker.structure, PathOptions(0.7 * reference.euler, 1.0))
-    path = [walker.start()]
-    walker.primary(path, [1.5 * reference.euler], until_unstable=True)
-    walker.modes = [mode for mode in walker.modes if mode.eigenvalue > 0]
-    critical = locate_critical(walker, path[-2], path[-1])
+    follower = PathFollower(reference.follower.structure, PathOptions(0.7 * reference.euler, 1.0))
+    path = [follower.start()]
+    follower.follow_primary(path, [1.5 * reference.euler], until_unstable=True)
+    follower.modes = [mode for mode in follower.modes if mode.eigenvalue > 0]
+    critical = locate_critical(follower, path[-2], path[-1])
     assert critical is not None
     assert critical.strain == pytest.approx(reference.critical.strain, abs=2e-7)
     assert (critical.below, critical.above) == (0, 1)
@@ -188,11 +188,11 @@ def test_critical_strain_is_found_where_the_negative_mode_is_hidden() -> None:
 
 def test_tangent_is_the_derivative_of_the_path_and_predicts_with_order_four() -> None:
     structure = small_structure()
-    walker = PathFollower(structure)
+    follower = PathFollower(structure)
     centre, steps = 0.06, np.array([0.02, 0.01, 0.005])
     strains = sorted({centre + s * h for h in steps for s in (-1, 0, 1)})
-    path = [walker.start()]
-    assert walker.primary(path, strains)
+    path = [follower.start()]
+    assert follower.follow_primary(path, strains)
     at = {round(s.strain, 9): s for s in path}
     middle = at[centre]
     slopes, predictions = [], []

@@ -50,9 +50,9 @@ def test_small_tilt_of_a_plate_is_pure_bending() -> None:
 
     def energy_and_force(angle: float) -> tuple[float, float]:
         structure = Structure(mesh, material, EdgeCompression(0.5 * WIDTH, WIDTH, "sliding", angle))
-        walker = PathFollower(structure)
-        path = [walker.start()]
-        assert walker.primary(path, [strain])
+        follower = PathFollower(structure)
+        path = [follower.start()]
+        assert follower.follow_primary(path, [strain])
         return structure.energy(path[-1].u), structure.reaction(path[-1].u, WIDTH)
 
     (bent, bent_force), (plain, plain_force) = energy_and_force(tilt), energy_and_force(0.0)

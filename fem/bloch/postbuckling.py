@@ -19,7 +19,7 @@ from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
 from modeharvest.fem.lattice.options import CENTRE, BranchOptions
 from modeharvest.fem.lattice.periodicity import overlaps
-from modeharvest.fem.path.predictor import BranchPoint, amplitude_at, predicted, stacked
+from modeharvest.fem.path.predictor import BranchPoint, amplitude_at, load_at, value_at
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -91,16 +91,16 @@ class _Tracing:
         self.stopped = ""
 
     def run(self, loads: list[float], progress: Progress) -> Branch:
-        """March along the branch, and report the loads asked for."""
+        """Follow the branch, and report the requested loads."""
         states: list[BranchState] = []
-        for _ in self._march():
+        for _ in self._follow():
             here, there = self.points[-2:]
             progress(there.load, loads[-1], "buckled branch")
             low, high = sorted((here.load, there.load))
             met = [load for load in loads if low <= load <= high and load != here.load]
             found = [self._at_load(here, there, load) for load in met]
             states += [self._report(state) for state in found if state is not None]
-            is_past = there.load > loads[-1] and there.rates[0] > 0
+            is_past = there.load > loads[-1] and there.load_rate > 0
             if is_past or {state.load for state in states}.issuperset(loads):
                 break
         states.sort(key=lambda state: state.load)
@@ -125,7 +125,7 @@ class _Tracing:
         missing = ", ".join(f"{load:.6g}" for load in loads if load not in met)
         return text + (f"; not met: {missing}" if missing else "")
 
-    def _march(self) -> Iterator[None]:
+    def _follow(self) -> Iterator[None]:
         """Add to ``points`` by growing amplitude, pausing after each but the critical one."""
         start = self._start()
         if start is None:
@@ -141,7 +141,7 @@ class _Tracing:
                     return
                 continue
             if len(self.points) == 1:
-                self.points[0] = self._turned(start, found)
+                self.points[0] = self._reoriented(start, found)
             self.points.append(found)
             yield
             step = min(options.growth * step, options.longest * self.pitch)
@@ -162,54 +162,56 @@ class _Tracing:
                 f"{largest:.3g} N/mm^4"
             )
             return None
-        values = stacked(below.load, below.gradient, below.fluctuation)
-        values += (load - below.load) * stacked(1.0, below.gradient_rate, below.fluctuation_rate)
-        self.origin = values[5:]
-        return BranchPoint(0.0, values, stacked(0.0, np.zeros((2, 2)), self._direction(self.mix)))
+        value = _stacked(below.gradient, below.fluctuation)
+        value += (load - below.load) * _stacked(below.gradient_rate, below.fluctuation_rate)
+        self.origin = value[4:]
+        return BranchPoint(0.0, load, 0.0, value, self._direction(self.mix))
 
     def _direction(self, mix: FloatArray) -> FloatArray:
-        """A combination of the modes as a fluctuation; one master is held by a translation."""
+        """(4 + size,) a combination of the modes, F̄ fixed; one master is fixed by a translation."""
         periodicity, order = self.cell.reduction.periodicity, self.cell.reduction.order
         at_masters = np.empty((periodicity.count, 2))
         at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
-        return np.asarray((at_masters - at_masters[0]).ravel()[order])
+        return _stacked(np.zeros((2, 2)), (at_masters - at_masters[0]).ravel()[order])
 
-    def _turned(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
+    def _reoriented(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
         """The start with the direction in which the branch really leaves, to judge by a point."""
-        amplitudes = self.weights @ (first.values[5:] - self.origin)
-        direction = self._direction(amplitudes) * (1.0 / first.amplitude)
-        return replace(start, rates=stacked(0.0, np.zeros((2, 2)), direction))
+        amplitudes = self.weights @ (first.value[4:] - self.origin)
+        return replace(start, rate=self._direction(amplitudes) * (1.0 / first.amplitude))
 
     def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
         """The point of the branch at an amplitude, from one or two before it; or why not."""
-        weights, guess = self.mix @ self.weights, predicted(points, amplitude)
-        wanted = Amplitude(weights, amplitude + float(weights @ self.origin))
-        found = self._corrected(guess, wanted)
+        weights, guess = self.mix @ self.weights, value_at(points, amplitude)
+        prescribed = Amplitude(weights, amplitude + float(weights @ self.origin))
+        found = self._corrected(load_at(points, amplitude), guess, prescribed)
         if isinstance(found, Failure):
             return found.value
         if self._overlaps(found):
             return "the material would run into itself (contact is not modelled)"
-        off = found.fluctuation - guess[5:]
+        off = found.fluctuation - guess[4:]
         if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
             return "another branch is nearer"
-        rates = stacked(1.0, found.gradient_rate, found.fluctuation_rate)
-        rates /= weights @ found.fluctuation_rate
-        return BranchPoint(amplitude, stacked(found.load, found.gradient, found.fluctuation), rates)
+        rate = float(weights @ found.fluctuation_rate)
+        return BranchPoint(
+            amplitude,
+            found.load,
+            1.0 / rate,
+            _stacked(found.gradient, found.fluctuation),
+            _stacked(found.gradient_rate, found.fluctuation_rate) / rate,
+        )
 
     def _corrected(
-        self, guess: FloatArray, amplitude: Amplitude | None = None
+        self, load: float, guess: FloatArray, amplitude: Amplitude | None = None
     ) -> CellState | Failure:
-        load, F, w = float(guess[0]), guess[1:5].reshape(2, 2), guess[5:]
+        F, w = guess[:4].reshape(2, 2), guess[4:]
         return self.cell.corrected(self.loading, load, F, w, amplitude)
 
     def _at_load(self, here: BranchPoint, there: BranchPoint, load: float) -> CellState | None:
         """The state between two points at a load, which one of them is below and one above."""
         for _ in range(_REFINEMENTS):
             between = (here, there)
-            amplitude = amplitude_at(load, between)
-            guess = predicted(between, amplitude)
-            guess[0] = load
-            found = self._corrected(guess)
+            amplitude = amplitude_at(between, load, here.amplitude, there.amplitude)
+            found = self._corrected(load, value_at(between, amplitude))
             if isinstance(found, CellState):
                 got = float(self.mix @ self.weights @ (found.fluctuation - self.origin))
                 # Under a prescribed load Newton may fall back to the primary path.
@@ -245,6 +247,11 @@ class _Tracing:
             displacement=u,
             amplitudes=self.weights @ (state.fluctuation - before),
         )
+
+
+def _stacked(gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
+    """F̄ (2, 2) and fluctuation as one vector."""
+    return np.concatenate([gradient.ravel(), fluctuation])
 
 
 def _check(

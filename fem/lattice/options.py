@@ -94,8 +94,8 @@ def wave_of(given: Any) -> Wave:
         phases = np.empty(0)
     if phases.shape != (2,) or phases.dtype.kind not in "iuf" or not np.isfinite(phases).all():
         raise InputError(
-            "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers [rad] "
-            f"(the wave lies in the plane), got {given}"
+            "wave vector: expected its phases (k . a1, k . a2) as two finite real numbers, in the "
+            f"lattice's plane, got {given}"
         )
     return float(phases[0]), float(phases[1])
 

@@ -22,7 +22,7 @@ from modeharvest.fem.path.newton import (
     correct,
     path_tangent,
 )
-from modeharvest.fem.path.predictor import hermite_weights
+from modeharvest.fem.path.predictor import extrapolate
 from modeharvest.fem.path.stability import Mode, lowest_modes
 from modeharvest.util.progress import Progress, silent
 
@@ -114,7 +114,7 @@ class PathFollower:
 
     # -- the primary path ---------------------------------------------------------------
 
-    def primary(
+    def follow_primary(
         self,
         states: list[State],
         targets: Sequence[float],
@@ -146,7 +146,7 @@ class PathFollower:
                 here = states[-1].strain
                 pieces = max(1, int(np.ceil((target - here) / step - _STRETCH)))
                 strain = target if pieces == 1 else here + (target - here) / pieces
-                guess = _extrapolate(states, strain)
+                guess = displacement_at(states, strain)
                 state = self.equilibrium(strain, guess)
                 if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
                     self.linearisation = None  # it may be that of the state refused
@@ -167,28 +167,6 @@ def _is_slip(before: State, state: State, guess: PETSc.Vec) -> bool:
     return bool(state.negative_pivots > 0 or miss.norm() > _MISS * step.norm())
 
 
-def _extrapolate(states: Sequence[State], strain: float) -> PETSc.Vec:
-    if len(states) == 1:
-        return along(states[-1], strain)
-    return interpolate(states[-2], states[-1], strain)
-
-
-def interpolate(a: State, b: State, strain: float) -> PETSc.Vec:
-    """Cubic Hermite interpolation (or extrapolation) between two states of a path."""
-    return combine(hermite_weights(a.strain, b.strain, strain), (a.u, a.tangent, b.u, b.tangent))
-
-
-def along(state: State, strain: float) -> PETSc.Vec:
-    """Linear extrapolation along the path's tangent."""
-    u = state.u.copy()
-    u.axpy(strain - state.strain, state.tangent)
-    return u
-
-
-def combine(weights: Sequence[float], vectors: Sequence[PETSc.Vec]) -> PETSc.Vec:
-    """Sum of vectors times weights."""
-    result = vectors[0].copy()
-    result.scale(weights[0])
-    for weight, vector in zip(weights[1:], vectors[1:], strict=True):
-        result.axpy(weight, vector)
-    return result
+def displacement_at(states: Sequence[State], strain: float) -> PETSc.Vec:
+    """By the tangent of one state of a path, or the cubic through the last two."""
+    return extrapolate([(s.strain, s.u, s.tangent) for s in states[-2:]], strain)

@@ -9,7 +9,7 @@ from functools import cache
 from petsc4py import PETSc
 from scipy.optimize import brentq
 
-from modeharvest.fem.path.continuation import PathFollower, State, along, interpolate
+from modeharvest.fem.path.continuation import PathFollower, State, displacement_at
 from modeharvest.fem.path.stability import Mode
 
 _SEARCHES = 20  # equilibria tried on the way to one critical point
@@ -43,7 +43,7 @@ class Critical:
     above: int
 
 
-def locate_critical(walker: PathFollower, low: State, high: State) -> Critical | None:
+def locate_critical(follower: PathFollower, low: State, high: State) -> Critical | None:
     """The first critical point between a stable state and the unstable one reached last.
 
     Any field's curvature x . K x is above the lowest eigenvalue, by the square of what it is off
@@ -56,9 +56,9 @@ def locate_critical(walker: PathFollower, low: State, high: State) -> Critical |
     None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the
     two states are not on one path.
     """
-    search = _CriticalBracket(walker, low, high)
+    search = _CriticalBracket(follower, low, high)
     for k in range(_SEARCHES):
-        walker.progress(k, 4, "critical point")
+        follower.progress(k, 4, "critical point")
         estimate = search.estimate()
         is_near = estimate is not None and abs(estimate - search.latest) < _NEAR
         if estimate is None or (k % 3 == 2 and not is_near):
@@ -79,17 +79,17 @@ class _CriticalBracket:
     ``latest`` is the strain of the state reached last; ``is_over`` says that there is no point.
     """
 
-    def __init__(self, walker: PathFollower, low: State, high: State) -> None:
-        self.walker, self.low, self.high = walker, low, high
+    def __init__(self, follower: PathFollower, low: State, high: State) -> None:
+        self.follower, self.low, self.high = follower, low, high
         self.latest, self.is_over = high.strain, False
-        self._visited = [(high, walker.modes)]
+        self._visited = [(high, follower.modes)]
         self._offs: list[float] = []  # of the unstable states reached, from the next estimate
-        self._candidates = [mode for mode in walker.modes if mode.eigenvalue < 0]
+        self._candidates = [mode for mode in follower.modes if mode.eigenvalue < 0]
 
     def estimate(self) -> float | None:
         """Where the curvature of a candidate first passes zero; None if none does."""
         low, strain = self.low.strain, self.high.strain
-        tolerance = 0.1 * self.walker.options.critical_tolerance
+        tolerance = 0.1 * self.follower.options.critical_tolerance
         curvature = cache(self._curvature)
         for mode in self._candidates:
             if curvature(strain, mode) < 0 < curvature(low, mode):
@@ -104,15 +104,15 @@ class _CriticalBracket:
         return strain
 
     def _curvature(self, strain: float, mode: Mode) -> float:
-        u = interpolate(self.low, self.high, strain)
-        return self.walker.structure.curvature(u, mode.vector)
+        u = displacement_at([self.low, self.high], strain)
+        return self.follower.structure.curvature(u, mode.vector)
 
     def step(self, strain: float) -> State | None:
         """An equilibrium within the bracket, which becomes one of its ends; None if not found."""
-        state = self.walker.equilibrium(strain, interpolate(self.low, self.high, strain))
+        state = self.follower.equilibrium(strain, displacement_at([self.low, self.high], strain))
         if state is None:
             return None
-        modes, self.latest = self.walker.modes, strain
+        modes, self.latest = self.follower.modes, strain
         self._visited.append((state, modes))
         negative = [mode for mode in modes if mode.eigenvalue < 0]
         if state.negative_pivots:
@@ -126,19 +126,19 @@ class _CriticalBracket:
 
         If not, the bracket is smaller, or there is nothing more to look for.
         """
-        walker, tolerance = self.walker, self.walker.options.critical_tolerance
+        follower, tolerance = self.follower, self.follower.options.critical_tolerance
         below = self.step(strain - tolerance)
         if below is None or below.negative_pivots:
             self.is_over = below is None
             return None
-        mode, *_ = modes = walker.modes
-        guess = along(below, strain + tolerance)
-        above = walker.equilibrium(strain + tolerance, guess, with_modes=False)
+        mode, *_ = modes = follower.modes
+        guess = displacement_at([below], strain + tolerance)
+        above = follower.equilibrium(strain + tolerance, guess, with_modes=False)
         if above is None or not above.negative_pivots:
             self.low, self.is_over = above or below, above is None
             return None
-        beyond = walker.structure.curvature(above.u, mode.vector)
-        values = [(s.strain, _alike(mode, known).eigenvalue) for s, known in self._visited]
+        beyond = follower.structure.curvature(above.u, mode.vector)
+        values = [(s.strain, _most_similar(mode, known).eigenvalue) for s, known in self._visited]
         values.append((above.strain, beyond))
         (last, final), (far, first) = values[-2], values[0]
         # In proportion to the distance, unless the two states are not on one path.
@@ -150,7 +150,7 @@ class _CriticalBracket:
             strain = last + 2 * tolerance * final / (final - beyond)
         return Critical(
             strain,
-            along(below, strain),
+            displacement_at([below], strain),
             modes,
             values,
             below.negative_pivots,
@@ -158,6 +158,6 @@ class _CriticalBracket:
         )
 
 
-def _alike(mode: Mode, modes: Sequence[Mode]) -> Mode:
-    """That one of the modes of another state which is most like a mode."""
+def _most_similar(mode: Mode, modes: Sequence[Mode]) -> Mode:
+    """That of another state's modes which overlaps most with a mode."""
     return max(modes, key=lambda other: abs(mode.overlap(other.vector)))

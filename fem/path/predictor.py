@@ -1,17 +1,15 @@
-"""Predictor of a branch: a curve over the amplitude of its mode, by its points and tangents.
+"""Predictors of a path: the tangent of one point, or the cubic through two, which extrapolates.
 
-Cubic Hermite interpolation, which extrapolates, too; plain numpy.
+Values may be numbers, arrays or PETSc vectors: anything with sums and multiples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 from scipy.optimize import brentq
-
-from modeharvest.util.arrays import FloatArray
 
 
 def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float, float]:
@@ -26,42 +24,58 @@ def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float,
     )
 
 
+def extrapolate(points: Sequence[tuple[float, Any, Any]], at: float) -> Any:
+    """The value at a parameter, from (parameter, value, rate) of one point or of the last two."""
+    b, value, rate = points[-1]
+    if len(points) == 1:
+        return _combined((1.0, float(at - b)), (value, rate))
+    a, before, rate_before = points[-2]
+    weights = hermite_weights(float(a), float(b), float(at))
+    return _combined(weights, (before, rate_before, value, rate))
+
+
+def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
+    total = weights[0] * values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        if hasattr(total, "axpy"):  # PETSc's, in place
+            total.axpy(weight, value)
+        else:
+            total = total + weight * value
+    return total
+
+
 @dataclass(frozen=True, eq=False)
 class BranchPoint:
-    """A point of the branch, seen as a function of the amplitude [mm].
+    """A point of a branch as a function of its mode's amplitude [mm].
 
-    ``values`` and their derivatives by the amplitude, ``rates``, are as ``flat`` has them: load
-    [-], F̄ [-] and fluctuation [mm].
+    Parameters
+    ----------
+    amplitude, load
+        [mm], [-].
+    load_rate
+        d(load)/d(amplitude).
+    value, rate
+        The state, such as displacements [mm], and its derivative by the amplitude.
     """
 
     amplitude: float
-    values: FloatArray
-    rates: FloatArray
-
-    @property
-    def load(self) -> float:
-        """The load [-]."""
-        return float(self.values[0])
+    load: float
+    load_rate: float
+    value: Any
+    rate: Any
 
 
-def stacked(load: float, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
-    """Load, F̄ (2, 2) and fluctuation as one vector."""
-    return np.concatenate([[load], gradient.ravel(), fluctuation])
+def load_at(points: Sequence[BranchPoint], amplitude: float) -> float:
+    """The load expected at an amplitude, from one point or the last two."""
+    known = [(p.amplitude, p.load, p.load_rate) for p in points[-2:]]
+    return float(extrapolate(known, amplitude))
 
 
-def predicted(points: Sequence[BranchPoint], amplitude: float) -> FloatArray:
-    """Values at an amplitude, by the tangent of one point or the cubic through two."""
-    if len(points) == 1:
-        return points[0].values + (amplitude - points[0].amplitude) * points[0].rates
-    p, q = points
-    a, b, c, d = hermite_weights(p.amplitude, q.amplitude, amplitude)
-    return a * p.values + b * p.rates + c * q.values + d * q.rates
+def value_at(points: Sequence[BranchPoint], amplitude: float) -> Any:
+    """The state expected at an amplitude, from one point or the last two."""
+    return extrapolate([(p.amplitude, p.value, p.rate) for p in points[-2:]], amplitude)
 
 
-def amplitude_at(load: float, between: tuple[BranchPoint, BranchPoint]) -> float:
-    """Where the cubic through two points, one below the load and one above, meets it."""
-
-    def excess(amplitude: float) -> float:
-        return float(predicted(between, amplitude)[0]) - load
-
-    return float(brentq(excess, between[0].amplitude, between[1].amplitude))
+def amplitude_at(points: Sequence[BranchPoint], load: float, low: float, high: float) -> float:
+    """Where ``load_at`` meets a load that lies between its values at two amplitudes."""
+    return float(brentq(lambda amplitude: load_at(points, amplitude) - load, low, high))

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from modeharvest.fem.experiment import Experiment, PathOptions
 from modeharvest.fem.field import Mesh, Solution
-from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.fem.materials import MATERIALS, Material, material_of, material_table
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import ModeFamily
 from modeharvest.idic.setup import SquareLatticeOptions
@@ -56,7 +56,7 @@ def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
     Returns
     -------
     Solution
-        Of :func:`modeharvest.fem.path.branching.simulate_pattern`.
+        Of :func:`modeharvest.fem.simulate.simulate_pattern`.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
     """
     try:
         from modeharvest.fem.meshing import mesh_specimen
-        from modeharvest.fem.path.branching import simulate_pattern
+        from modeharvest.fem.simulate import simulate_pattern
     except ModuleNotFoundError as error:
         raise MissingDependencyError(NO_DOLFINX) from error
     mesh = mesh_specimen(experiment.specimen, experiment.mesh_size)
@@ -123,7 +123,6 @@ class PatternCells:
         return float(np.abs(blocks.mean(axis=(2, 3))).max())
 
 
-_MATERIALS = {kind.__name__: kind for kind in (Ogden, TwoTermI1)}
 _SPEC = TypeAdapter(ImagingSpec)
 
 
@@ -177,10 +176,9 @@ class SpecimenSpec:
                 "study: expected a perfect specimen that buckles at a strain of its own, got an "
                 "experiment with an imperfection, a tilt or guides; leave them out"
             )
-        if type(e.material) not in _MATERIALS.values():
-            raise InputError(
-                f"study: expected a material among {list(_MATERIALS)}, got {e.material!r}"
-            )
+        if type(e.material) not in MATERIALS.values():
+            known = [kind.__name__ for kind in MATERIALS.values()]
+            raise InputError(f"study: expected a material among {known}, got {e.material!r}")
         critical = subject.solution.info.get("critical")
         if not critical or critical["strain"] >= strain:
             raise InputError(
@@ -248,7 +246,7 @@ class SpecimenSpec:
 
     def plain(self) -> dict[str, Any]:
         """As plain JSON values."""
-        material = {"kind": type(self.material).__name__, **vars(self.material)}
+        material = material_table(self.material)
         imaging = _SPEC.dump_python(self.imaging, mode="json")
         specimen = self.specimen.plain()
         return {**asdict(self), "specimen": specimen, "material": material, "imaging": imaging}
@@ -257,11 +255,9 @@ class SpecimenSpec:
     def read(cls, path: Path) -> SpecimenSpec:
         """Read what :meth:`leave` wrote."""
         values = dict(read_json(path))
-        material = dict(values["material"])
-        kind = _MATERIALS[material.pop("kind")]
         made = {
             "specimen": Specimen(**values["specimen"]),
-            "material": TypeAdapter(kind).validate_python(material),
+            "material": material_of(values["material"]),
             "path": PathOptions(**values["path"]),
             "imaging": _SPEC.validate_python(values["imaging"]),
             "correlation": SquareLatticeOptions(**values["correlation"]),

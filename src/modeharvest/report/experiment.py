@@ -10,7 +10,6 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
-from modeharvest.fem.materials import material_text
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.report.figures.curves import draw_convergence, draw_eigenvalues, draw_load
 from modeharvest.report.figures.experiment import (
@@ -20,7 +19,7 @@ from modeharvest.report.figures.experiment import (
     draw_hero,
 )
 from modeharvest.report.figures.style import to_svg
-from modeharvest.report.model import Picture, render
+from modeharvest.report.model import Picture, material_text, render
 from modeharvest.util.files import atomic
 from modeharvest.util.progress import Progress, silent
 

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from modeharvest.fem.bloch.modes import Branch
 from modeharvest.fem.lattice.options import Wave
-from modeharvest.fem.materials import material_text
 from modeharvest.idic.spectra.lattice_spectrum import upward
 from modeharvest.report.figures.lattice import (
     draw_amplitudes,
@@ -32,7 +31,7 @@ from modeharvest.report.figures.lattice import (
 )
 from modeharvest.report.figures.outlines import LatticePatch
 from modeharvest.report.figures.style import to_svg
-from modeharvest.report.model import Picture, render, short
+from modeharvest.report.model import Picture, material_text, render, short
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
     FoundPattern,

@@ -14,6 +14,7 @@ import jinja2
 import pandas as pd
 from matplotlib.figure import Figure
 
+from modeharvest.fem.materials import Ogden
 from modeharvest.report.figures.style import to_svg
 from modeharvest.util.files import atomic
 
@@ -233,3 +234,22 @@ def _study_picture(plot: Plot, run: StudyRun) -> dict[str, Any]:
 def _together(words: str) -> str:
     """No line ends between a number and its unit or error."""
     return re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", "\N{NO-BREAK SPACE}", words)
+
+
+def material_text(table: Mapping[str, Any]) -> str:
+    """A material's kind and constants, and whether they are this project's default.
+
+    Parameters
+    ----------
+    table
+        ``kind`` and the constants, as in a case or in a solution's ``info``.
+    """
+    constants = {name: value for name, value in table.items() if name != "kind"}
+    values = ", ".join(f"{name} {_plain_number(value)}" for name, value in constants.items())
+    usual = {name: _plain_number(value) for name, value in vars(Ogden()).items()}
+    is_usual = {name: _plain_number(value) for name, value in constants.items()} == usual
+    return f"{'default ' * is_usual}material {table['kind']}: {values} (moduli in MPa)"
+
+
+def _plain_number(value: Any) -> str:
+    return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"

@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from modeharvest.fem.materials import material_text
-from modeharvest.report.model import short
+from modeharvest.report.model import material_text, short
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.util.stages import Stages
 from modeharvest.validation.resolution.grading import GRADE_COLUMNS, StarGrading, grade_numbers
