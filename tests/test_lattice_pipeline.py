@@ -158,7 +158,9 @@ def test_running_again_does_nothing(case: Path, folder: Path) -> None:
     summary = run(case, folder)
     before = stamps(folder)
     assert run(case, folder) == summary
-    assert LatticeAnalysis(case, folder).bloch() == summary  # shows all that is there
+    assert (
+        LatticeAnalysis(LatticeCase.read(case), folder, source=str(case)).bloch() == summary
+    )  # shows all that is there
     assert stamps(folder) == before
 
 
@@ -177,7 +179,7 @@ def test_bloch_shows_nothing_of_another_case(case: Path, folder: Path) -> None:
     """Modes of the case before stay in the folder, but not in the report."""
     other = case.with_name("softer.toml")
     other.write_text(COARSE.replace('"two-term-I1"', '"two-term-I1"\nc1 = 0.5'), "utf-8")
-    summary = LatticeAnalysis(other, folder).bloch()
+    summary = LatticeAnalysis(LatticeCase.read(other), folder, source=str(other)).bloch()
     assert summary["modes"] is None
     assert summary["branches"] == summary["families"] == []
 
