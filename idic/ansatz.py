@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, square_family
+from modeharvest.idic.modes import FAMILIES, FourierMode, ModeFamily, Taper
 from modeharvest.idic.slow_fields import Box, Brightness, ChebyshevField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -182,27 +182,42 @@ class Ansatz:
         fixed_mode: bool = False,
         options: AnsatzOptions | None = None,
     ) -> Ansatz:
-        """Make the paper's ansatz for a specimen with square stacking of holes: 77 unknowns.
+        """:meth:`of_specimen` in square stacking; InputError for any other."""
+        if specimen.stacking != "square":
+            raise InputError(
+                f"Ansatz.square: expected a specimen in square stacking, got {specimen.stacking} "
+                "stacking; take Ansatz.of_specimen"
+            )
+        return cls.of_specimen(specimen, fixed_mode=fixed_mode, options=options)
 
-        The mode's phases put its origin on a solid junction between four holes, whatever the
-        number of holes: [1, 1, 1, -1, 1, 0, 0] where it is even both ways.
+    @classmethod
+    def of_specimen(
+        cls,
+        specimen: Specimen,
+        *,
+        fixed_mode: bool = False,
+        options: AnsatzOptions | None = None,
+    ) -> Ansatz:
+        """Make the ansatz with a specimen's modes; the paper's 77 unknowns in square stacking.
+
+        The modes start as those of the specimen's infinite lattice (``idic.modes.FAMILIES``),
+        with their phases anchored at its holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with
+        an even number of holes both ways.
 
         Parameters
         ----------
         specimen
             Whose middle is the origin.
         fixed_mode
-            Keep phi_1 at the ideal pattern, for images without a pattern to find it from.
+            Keep the modes at the ideal pattern, for images without a pattern to find them from.
         options
             Degrees; the paper's by default.
         """
         (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
-        x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
-        y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.pitch
-        family = square_family("junction").moved((x0, y0))
-        family = family.fixed() if fixed_mode else family
+        families = FAMILIES[specimen.stacking](specimen)
+        modes = [(f.fixed() if fixed_mode else f, Box(-a, a, -b, b)) for f in families]
         domain = Box(-width, width, -height, height)
-        return cls.on(domain, [(family, Box(-a, a, -b, b))], specimen.pitch, options)
+        return cls.on(domain, modes, specimen.pitch, options)
 
     @property
     def v0_space(self) -> ChebyshevField:

@@ -8,11 +8,13 @@ the paper's Eq. (mode) is one of them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.slow_fields import Box, sum_of_products
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -178,6 +180,76 @@ def square_family(origin: str = "junction") -> ModeFamily:
     return ModeFamily(
         f"square, origin at a {origin}", matrix, offset, np.array(starts[origin]), units=units
     )
+
+
+def rotation_family(specimen: Specimen) -> ModeFamily:
+    """Eq. (mode) on a specimen with rows that aren't staggered, its origin at a solid junction.
+
+    With rows at another distance than the holes in them, the waves start with the lattice's own
+    lengths, and a1 with the ratio of amplitudes by which junctions turn without changing shape.
+    """
+    (a, b), ratio = specimen.cellular_half_size, specimen.pitch / specimen.row_distance
+    x0 = 0.0 if specimen.holes_x % 2 == 0 else a % specimen.pitch
+    y0 = 0.0 if specimen.holes_y % 2 == 0 else b % specimen.row_distance
+    family = square_family("junction")
+    start = family.start * [1.0 / ratio, 1.0, ratio, 1.0, ratio, 1.0, 1.0]
+    return replace(family, start=start).moved((x0, y0))
+
+
+T2 = -0.45
+"""Second over first amplitude of a triangular lattice's modes [-]; -0.42 to -0.46 were found for
+d/l = 0.87 and 0.92 and five loadings (docs/families.md)."""
+
+
+def zone_boundary_families(specimen: Specimen) -> tuple[ModeFamily, ...]:
+    """Families of the modes at the three M points of a specimen's lattice of staggered rows.
+
+    Each has a wave towards its M point, of mostly transverse motion, and one across, the shortest
+    that the lattice couples to it; both are zero at the holes' centres (docs/families.md). For a
+    transverse amplitude of 1 of the first wave the parameters are L1, its longitudinal amplitude,
+    T2, the second one's transverse one, the first one's wave vector, which the second one's turns
+    and grows with, and the phases.
+    """
+    reciprocal = 2.0 * specimen.pitch * np.linalg.inv(specimen.vectors).T  # of waves [pi/l]
+    steps = np.array([(m, n) for m in range(-2, 3) for n in range(-2, 3)])
+    centres = specimen.hole_centres
+    hole = centres[np.argmin(np.linalg.norm(centres, axis=1))]
+    families = []
+    for point in ((1, 0), (0, 1), (1, 1)):
+        waves = (0.5 * np.array(point) + steps) @ reciprocal
+        lengths = np.round(np.linalg.norm(waves, axis=1), 9)
+        first, _, second, _ = waves[np.lexsort((waves[:, 0] < 0, lengths))][:4]  # and opposites
+        families.append(_two_waves(f"zone boundary {point}", first, second).moved(hole))
+    return tuple(families)
+
+
+def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
+    """Two waves of given wave vectors [pi/l], the second transverse, phases zero at the origin."""
+    n, m = _along_and_across(first)
+    turn = np.column_stack([first, (-first[1], first[0])])  # times (1, 0) it is the first wave
+    turn = np.column_stack([second, (-second[1], second[0])]) @ np.linalg.inv(turn)
+    matrix, offset = np.zeros((2, PER_WAVE, 6)), np.zeros((2, PER_WAVE))
+    offset[0, :2] = m
+    matrix[0, :2, 0], matrix[1, :2, 1] = n, _along_and_across(second)[1]
+    matrix[:, 2:4, 2:4] = np.eye(2), turn
+    matrix[0, 4, 4] = matrix[1, 4, 5] = 1.0
+    names, units = ("L1", "T2", "kx", "ky", "c1", "c2"), ("-",) * 4 + ("mm",) * 2
+    start = np.array([0.0, T2, *first, 0.0, 0.0])
+    return ModeFamily(name, matrix.reshape(-1, 6), offset.ravel(), start, names, units)
+
+
+def _along_and_across(k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors along a wave vector, and that turned by +90 degrees."""
+    along = k / np.linalg.norm(k)
+    return along, np.array([-along[1], along[0]])
+
+
+FAMILIES: dict[str, Callable[[Specimen], tuple[ModeFamily, ...]]] = {
+    "square": lambda specimen: (rotation_family(specimen),),
+    "rectangular": lambda specimen: (rotation_family(specimen),),
+    "triangular": zone_boundary_families,
+}
+"""The families of a specimen's modes, by its stacking."""
 
 
 def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:

@@ -127,10 +127,10 @@ class PhotographOptions(AnsatzOptions):
 
 @dataclass(frozen=True)
 class SquareLatticeOptions(AnsatzOptions):
-    """Table ``[correlation]`` of a virtual experiment, for a square stacking of holes.
+    """Table ``[correlation]`` of a virtual experiment.
 
-    The defaults are the paper's (section "Virtual Experiments"): 42 + 28 unknowns of v0 and v1,
-    and the mode's 7 make 77.
+    The defaults are the paper's (section "Virtual Experiments"): in square stacking 42 + 28 unknowns
+    of v0 and v1, and the mode's 7 make 77.
 
     Parameters
     ----------
@@ -172,5 +172,5 @@ class SquareLatticeOptions(AnsatzOptions):
         )
 
     def ansatz(self, specimen: Specimen) -> Ansatz:
-        """The paper's ansatz on a specimen."""
-        return Ansatz.square(specimen, fixed_mode=self.fixed_mode, options=self)
+        """The ansatz with the modes of a specimen's hole lattice."""
+        return Ansatz.of_specimen(specimen, fixed_mode=self.fixed_mode, options=self)

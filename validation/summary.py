@@ -11,12 +11,15 @@ Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation
 ``snapshots``
     A list, one entry for each strain: ``nominal_strain`` [-], ``branch``, ``negative_pivots``,
     ``pattern_amplitude_px``, ``pattern_inner_px``, ``pattern_corners_px`` (largest length of
-    v1 phi1), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
+    v1 phi1, or of the sum over all modes), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
     [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
     ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
     ``mode_standard_error`` (by noise) and ``mode_model_error`` (by what the ansatz can't
     describe; empty where the mode is not observable), ``mode_deviation_percent``,
-    ``mode_best_fit``, ``iterations`` (on the full image), ``iterations_all_levels``,
+    ``mode_best_fit``; in staggered rows instead of these ``modes``, for each its ``name``, parameters
+    (``names``, ``units``, ``found``, ``ideal``, ``standard_error``, ``model_error``, ``best_fit``),
+    ``amplitude_px`` (rms of v_i phi_i per component) and whether it is ``observable``;
+    ``iterations`` (on the full image), ``iterations_all_levels``,
     ``outcome``, ``outcome_why``,
     ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
     ``mode_observable``, ``model_error_estimate_px`` (of w, from the images alone),
@@ -58,7 +61,7 @@ from modeharvest.idic.spectra.pattern import (
 )
 from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.idic.uncertainty.covariance import MatchedImages
-from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -261,11 +264,11 @@ def snapshot_summary(
         "rms_best_fit_px": px["best_fit"]["rms_per_component"],
         "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
         "rms_residual": result.residual_rms,
-        **_mode_numbers(comparison, measured, 0 not in seen.unobservable),
+        **_mode_numbers(comparison, measured, seen),
         **_brightness(comparison),
         "mode_observable": not seen.unobservable,
         "model_error_estimate_px": seen.model_error_px,
-        "mode_polynomial_overlap": seen.overlap[0],
+        "mode_polynomial_overlap": max(seen.overlap),
         "worst_determined": [str(combination) for combination in seen.worst],
         "residual_correlation": result.residual_correlation,
         "noise_sd": None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
@@ -316,20 +319,42 @@ def _brightness(comparison: Comparison) -> dict[str, float]:
 
 
 def _mode_numbers(
-    comparison: Comparison, measured: MeasuredExperiment, is_seen: bool
+    comparison: Comparison, measured: MeasuredExperiment, seen: Identifiability
 ) -> dict[str, Any]:
-    """The mode's parameters against the ideal ones; nothing where the mode was held."""
+    """The modes' parameters against the ideal ones; nothing where they were fixed."""
     result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
-    phi = result.ansatz.phi_slice(0)
-    ideal = result.ansatz.initial_guess(comparison.strain, measured.how.start_amplitude)[phi]
-    if not ideal.size:
+    ansatz = result.ansatz
+    start = ansatz.initial_guess(comparison.strain, measured.how.start_amplitude)
+    parts = [ansatz.phi_slice(i) for i in range(len(ansatz.modes))]
+    if not any(start[part].size for part in parts):
         return {}
-    found = result.mode_parameters()
+    noise = result.standard_errors()
+    is_any = len(seen.unobservable) < len(parts)
+    model = _model_errors(comparison, measured) if is_any else [None] * ansatz.size
+    if measured.specimen.is_staggered:
+        return {
+            "modes": [
+                {
+                    "name": mode.family.name,
+                    "names": list(mode.family.names),
+                    "units": list(mode.family.units),
+                    "found": result.mode_parameters(i).tolist(),
+                    "ideal": start[part].tolist(),
+                    "standard_error": _finite_or_none(noise[part]),
+                    "model_error": model[part] if i not in seen.unobservable else [],
+                    "best_fit": best.mode_parameters(i).tolist(),
+                    "amplitude_px": seen.amplitude_px[i],
+                    "observable": i not in seen.unobservable,
+                }
+                for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True))
+            ]
+        }
+    found, ideal = result.mode_parameters(), start[parts[0]]
     return {
         "mode": mode_equivalent(found, pitch, ideal)[0].tolist(),
         "mode_ideal": ideal.tolist(),
-        "mode_standard_error": _finite_or_none(result.standard_errors()[phi]),
-        "mode_model_error": _model_errors(comparison, measured)[phi] if is_seen else [],
+        "mode_standard_error": _finite_or_none(noise[parts[0]]),
+        "mode_model_error": model[parts[0]] if not seen.unobservable else [],
         "mode_deviation_percent": mode_deviation(found, pitch, ideal).tolist(),
         "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
     }

@@ -157,7 +157,7 @@ def compare(
 
 @dataclass(frozen=True)
 class PatternSize:
-    """How strong the pattern v1 phi1 is: the largest length of the vector field [px].
+    """Largest length of the pattern, v1 phi1 or the sum of several modes [px].
 
     Parameters
     ----------
@@ -174,12 +174,18 @@ class PatternSize:
     corners: float
 
 
+def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:
+    """(rows, cols, 2) the pattern: sum of v_i phi_i over all modes [mm]."""
+    parts = [result.fluctuation(i, grid) for i in range(len(result.ansatz.modes))]
+    return np.asarray(np.sum(parts, axis=0)) if len(parts) > 1 else parts[0]
+
+
 def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
     """Measure the identified pattern by regions of the specimen."""
     grid = comparison.grid
     a, b = specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]
-    length = lengths(comparison.result.fluctuation()) / grid.pixel_size
+    length = lengths(pattern_field(comparison.result)) / grid.pixel_size
     outermost = 0.5 * specimen.row_distance + specimen.cell_heights[1]
     outer_x, outer_y = x > a - specimen.pitch, y > b - outermost
 

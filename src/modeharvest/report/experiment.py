@@ -13,10 +13,10 @@ from modeharvest.fem.field import Solution
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.report.figures.curves import draw_convergence, draw_eigenvalues, draw_load
 from modeharvest.report.figures.experiment import (
-    PANELS,
     ExperimentReportData,
     SnapshotPanel,
     draw_hero,
+    panels_of,
 )
 from modeharvest.report.figures.style import to_svg
 from modeharvest.report.model import Picture, material_text, render
@@ -61,12 +61,10 @@ def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
     critical = summary.get("critical_strain")
     expected = summary.get("expected", [])
     met = sum(bool(row["ok"]) for row in expected)
-    return [
+    keys = [
         _key("critical strain", None if critical is None else 100 * critical, "%",
              "none found" if critical is None else "where the pattern sets in", 4),
-        _key("pattern", last["pattern_amplitude_px"], "px", f"largest v₁φ₁ {at}", 3),
-        _key("mode off the ideal", _largest_deviation(last), "%",
-             f"the worst of a₁ … a₇ {at}" if _is_free(last) else "held at the ideal pattern", 2),
+        _key("pattern", last["pattern_amplitude_px"], "px", f"largest {_symbol(last)} {at}", 3),
         _key("best possible fit", last["rms_best_fit_px"], "px", "rms, what the model can't say",
              3),
         _key("IDIC − best fit", last["rms_idic_to_best_fit_px"], "px",
@@ -74,28 +72,56 @@ def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
         {"name": "expected values met", "value": f"{met} of {len(expected)}" if expected else "–",
          "unit": "", "remark": "table below" if expected else "none known for this specimen"},
     ]  # fmt: skip
+    if "modes" in last:
+        observable = [mode["observable"] for mode in last["modes"]]
+        text = f"{sum(observable)} of {len(observable)}"
+        mode = {"name": "modes", "value": text, "unit": "", "remark": f"observable {at}"}
+    else:
+        free = bool(last.get("mode_deviation_percent"))
+        remark = f"the worst of a₁ … a₇ {at}" if free else "held at the ideal pattern"
+        mode = _key("mode off the ideal", _largest_deviation(last), "%", remark, 2)
+    return [*keys[:2], mode, *keys[2:]]
 
 
 def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Rows of the table of numbers: label, unit, a value for each snapshot."""
     snapshots = summary["snapshots"]
     return [
-        {"label": label, "unit": unit, "values": [s.get(key) for s in snapshots]}
+        {
+            "label": label.replace("v₁φ₁", _symbol(snapshots[0])),
+            "unit": unit,
+            "values": [s.get(key) for s in snapshots],
+        }
         for label, unit, key in _NUMBERS
         if any(s.get(key) is not None for s in snapshots)
     ]
 
 
 def mode_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the mode's parameters: for each snapshot value, standard errors and best fit."""
+    """Rows of the modes' parameters: for each snapshot value, standard errors and best fit."""
     snapshots = [s for s in summary["snapshots"] if len(s.get("mode", ())) == len(_MODE)]
-    ideal = snapshots[0].get("mode_ideal", REFERENCE_MODE) if snapshots else REFERENCE_MODE
+    if not snapshots:
+        return _rows_of_modes([s["modes"] for s in summary["snapshots"] if "modes" in s])
+    ideal = snapshots[0].get("mode_ideal", REFERENCE_MODE)
     return [
         {"name": name, "unit": unit, "ideal": ideal[k],
          "cells": [{"value": s["mode"][k], "error": _item(s.get("mode_standard_error"), k),
                     "model": _item(s.get("mode_model_error"), k),
                     "best": _item(s.get("mode_best_fit"), k)} for s in snapshots]}
-        for k, (name, unit) in enumerate(_MODE) if snapshots
+        for k, (name, unit) in enumerate(_MODE)
+    ]  # fmt: skip
+
+
+def _rows_of_modes(snapshots: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """The same for several modes, their parameters one below the other."""
+    return [
+        {"name": f"φ{'₁₂₃'[i]} {name}", "unit": mode["units"][k].replace("-", "–"),
+         "ideal": mode["ideal"][k],
+         "cells": [{"value": s[i]["found"][k], "error": _item(s[i]["standard_error"], k),
+                    "model": _item(s[i]["model_error"], k),
+                    "best": _item(s[i]["best_fit"], k)} for s in snapshots]}
+        for i, mode in enumerate(snapshots[0] if snapshots else ())
+        for k, name in enumerate(mode["names"])
     ]  # fmt: skip
 
 
@@ -113,7 +139,7 @@ def panel_numbers(key: str, snapshot: Snapshot) -> str:
         return f"rms {snapshot['rms_residual']:.3g} of full scale"
     if key == "v1" and "pattern_inner_px" in snapshot:
         return (
-            f"v₁φ₁: at most {snapshot['pattern_inner_px']:.3g} px inside, "
+            f"{_symbol(snapshot)}: at most {snapshot['pattern_inner_px']:.3g} px inside, "
             f"{snapshot['pattern_corners_px']:.3g} px in the corner cells"
         )
     return ""
@@ -206,16 +232,24 @@ def _about(snapshot: Snapshot) -> list[str]:
     inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
     if inner is not None and corners is not None and inner < corners:
         describes = (
-            f"The mode's parameters (up to {_largest_deviation(snapshot):.0f} % off the ideal) describe"
+            "The modes describe"
+            if "modes" in snapshot
+            else f"The mode's parameters (up to {_largest_deviation(snapshot):.0f} % off the ideal) "
+            "describe"
             if _is_free(snapshot)
             else "Held at the ideal pattern, the mode describes"
         )
         said.append(
-            f"{at} there is no pattern to be observed: v₁φ₁ is at most {inner:.2g} px inside. "
+            f"{at} there is no pattern to be observed: {_symbol(snapshot)} is at most {inner:.2g} px inside. "
             f"{describes} the edge effect in the corner cells ({corners:.2g} px) that the mode "
             "takes up, as in the paper; the best fit to the truth does the same."
         )
     return said
+
+
+def _symbol(snapshot: Snapshot) -> str:
+    """The pattern, of one mode or of several."""
+    return "Σ vᵢφᵢ" if "modes" in snapshot else "v₁φ₁"
 
 
 def _is_free(snapshot: Snapshot) -> bool:
@@ -293,7 +327,7 @@ def draw(atlas: ExperimentReportData, progress: Progress = silent) -> Drawings:
         _picture("convergence", "Convergence", heading, draw_convergence(result))
         for heading, result in zip(headings, atlas.results, strict=True)
     ]
-    shown = [panel for panel in PANELS if atlas.has_mode or not panel.needs_mode]
+    shown = panels_of(len(atlas.results[0].ansatz.modes))
     pictures = {}
     for n, panel in enumerate(sorted(shown, key=lambda panel: panel.needs_truth)):
         progress(n, len(shown), "report")
@@ -345,7 +379,8 @@ def write_experiment_report(
 
 def _sections(drawings: Drawings, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The groups of panels, the numbers of each snapshot below its pictures."""
-    panels = {panel.key: panel for panel in PANELS}
+    modes = sum(key.startswith("phi") for key in drawings.panels)
+    panels = {panel.key: panel for panel in panels_of(modes)}
 
     def card(key: str) -> dict[str, Any]:
         pictures = [
@@ -355,15 +390,21 @@ def _sections(drawings: Drawings, summary: Mapping[str, Any]) -> list[dict[str, 
         return {"panel": panels[key], "pictures": pictures}
 
     return [
-        {"id": anchor, "title": title, "cards": [card(k) for k in keys if k in drawings.panels]}
+        {"id": anchor, "title": title, "cards": [card(k) for k in panels if _is_in(k, keys)]}
         for anchor, title, keys in EXPERIMENT_SECTIONS
     ]
 
 
+def _is_in(key: str, section: Sequence[str]) -> bool:
+    """Whether a panel belongs to a section; those of further modes, where the first one's are."""
+    return key in section or (key[-1] in "23" and f"{key[:-1]}1" in section)
+
+
 def _panel_caption(panel: SnapshotPanel, atlas: ExperimentReportData, k: int) -> str:
     """What the drawing itself has to say."""
-    if panel.key == "phi1":
-        return f"drawn as with v₁ = {atlas.shape_scale(k):.3g} mm everywhere"
+    if panel.key.startswith("phi"):
+        i = int(panel.key[3:])
+        return f"drawn as with v{'₁₂₃'[i - 1]} = {atlas.shape_scale(k, i - 1):.3g} mm everywhere"
     return ""
 
 

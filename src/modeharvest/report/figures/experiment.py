@@ -23,7 +23,7 @@ from modeharvest.report.figures.curves import draw_density, pattern_density
 from modeharvest.report.figures.maps import ColourScale, DisplacementFunction, MapFrame
 from modeharvest.report.figures.style import GLOW
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.truth import Comparison, lengths
+from modeharvest.validation.truth import Comparison, lengths, pattern_field
 
 UM = 1e3  # micrometres in a millimetre
 DRAWN_SHAPE = 0.16
@@ -84,9 +84,9 @@ class ExperimentReportData:
         """Whether the ansatz has a mode to show."""
         return all(result.ansatz.modes for result in self.results)
 
-    def shape_scale(self, k: int) -> float:
-        """By how much phi_1 of snapshot k is drawn, for a largest displacement of SHAPE l [mm]."""
-        largest = lengths(self.results[k].phi(grid=self.sheet.grid))
+    def shape_scale(self, k: int, i: int = 0) -> float:
+        """By how much phi of mode i (from 0) of snapshot k is drawn, to displace by SHAPE l [mm]."""
+        largest = lengths(self.results[k].phi(i, self.sheet.grid))
         top = float(largest.max())
         return DRAWN_SHAPE * self.pitch / top if top > 0 else 1.0
 
@@ -154,31 +154,40 @@ def _v0(component: int) -> Callable[[ExperimentReportData, int], Figure]:
     return draw
 
 
-def _v1(atlas: ExperimentReportData, k: int) -> Figure:
-    result, grid = atlas.results[k], atlas.sheet.grid
-    taper = result.ansatz.modes[0].taper
-    support = taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :]
-    v1 = np.where(support > 0.0, UM * result.v(grid=grid), np.nan)
-    inside = _on_material(atlas, np.where(support == 1.0, v1, np.nan))
-    return fields.draw_field(
-        atlas.sheet, v1, replace(ColourScale.signed(inside, "µm"), extend="both")
-    )
+def _v(i: int) -> Callable[[ExperimentReportData, int], Figure]:
+    def draw(atlas: ExperimentReportData, k: int) -> Figure:
+        result, grid = atlas.results[k], atlas.sheet.grid
+        taper = result.ansatz.modes[i].taper
+        support = taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :]
+        v = np.where(support > 0.0, UM * result.v(i, grid), np.nan)
+        inside = _on_material(atlas, np.where(support == 1.0, v, np.nan))
+        return fields.draw_field(
+            atlas.sheet, v, replace(ColourScale.signed(inside, "µm"), extend="both")
+        )
+
+    return draw
 
 
-def _phi1(atlas: ExperimentReportData, k: int) -> Figure:
-    result, scale = atlas.results[k], atlas.shape_scale(k)
-    return fields.draw_shape(
-        atlas.sheet, lambda x, y: scale * result.ansatz.phi(0, result.unknowns, x, y)
-    )
+def _phi(i: int) -> Callable[[ExperimentReportData, int], Figure]:
+    def draw(atlas: ExperimentReportData, k: int) -> Figure:
+        result, scale = atlas.results[k], atlas.shape_scale(k, i)
+        return fields.draw_shape(
+            atlas.sheet, lambda x, y: scale * result.ansatz.phi(i, result.unknowns, x, y)
+        )
+
+    return draw
 
 
 def _fluctuation(component: int) -> Callable[[ExperimentReportData, int], Figure]:
     def draw(atlas: ExperimentReportData, k: int) -> Figure:
         result = atlas.results[k]
-        field = UM * result.fluctuation(grid=atlas.sheet.grid)[..., component]
+        field = UM * pattern_field(result, atlas.sheet.grid)[..., component]
+        modes = range(len(result.ansatz.modes))
         return fields.draw_field(
             atlas.sheet, field, ColourScale.signed(_on_material(atlas, field), "µm"),
-            lambda x, y: result.ansatz.fluctuation(0, result.unknowns, x, y),
+            lambda x, y: np.sum(
+                [result.ansatz.fluctuation(i, result.unknowns, x, y) for i in modes], axis=0
+            ),
         )  # fmt: skip
 
     return draw
@@ -207,7 +216,7 @@ def _length_of(name: str) -> Callable[[ExperimentReportData, int], Figure]:
 def draw_hero(atlas: ExperimentReportData, k: int) -> Figure:
     """The deformed image of snapshot k turning into the pattern that was measured in it."""
     images, strain, sheet, result = atlas.images, atlas.strains[k], atlas.sheet, atlas.results[k]
-    field = result.fluctuation(grid=sheet.grid) if atlas.has_mode else atlas.comparisons[k].w
+    field = pattern_field(result, sheet.grid) if atlas.has_mode else atlas.comparisons[k].w
     length = UM * lengths(field)
     if not atlas.has_mode:
         length = sheet.average(length)
@@ -260,13 +269,13 @@ PANELS = (
         "Where the pattern lives; blank where φ<sub>1</sub> is zero and v<sub>1</sub> means "
         "nothing. The values are large because φ<sub>1</sub> is scaled to 0.04. Near the corners "
         "it also takes up part of the edge effect.",
-        _v1, True,
+        _v(0), True,
     ),
     SnapshotPanel(
         "phi1", "φ<sub>1</sub>", "The mode", "virt (d) and (l)",
         "The identified mode as a deformed configuration over the undeformed outline, enlarged "
         "to a largest displacement of 0.16 l.",
-        _phi1, True,
+        _phi(0), True,
     ),
     SnapshotPanel(
         "flucx", "v<sub>1</sub>φ<sub>1</sub> · e<sub>x</sub>", "Correlated fluctuation along x",
@@ -302,3 +311,30 @@ PANELS = (
         _length_of("idic_to_best"), needs_truth=True,
     ),
 )  # fmt: skip
+
+
+def panels_of(modes: int) -> list[SnapshotPanel]:
+    """What is drawn with so many modes: two panels for each, none that needs one without."""
+    panels = []
+    for panel in PANELS:
+        if modes or not panel.needs_mode:
+            panels.append(panel if modes <= 1 else _not_of_one_mode(panel))
+        if panel.key == "phi1":
+            panels += [further for i in range(1, modes) for further in _mode_panels(i)]
+    return panels
+
+
+def _not_of_one_mode(panel: SnapshotPanel) -> SnapshotPanel:
+    """A panel without what is true of the paper's single mode only."""
+    symbol = panel.symbol.replace("v<sub>1</sub>φ<sub>1</sub>", "Σ v<sub>i</sub>φ<sub>i</sub>")
+    caption = "" if panel.key in ("Syy", "v0y") else panel.caption
+    return replace(panel, symbol=symbol, caption=caption, paper="")
+
+
+def _mode_panels(i: int) -> tuple[SnapshotPanel, SnapshotPanel]:
+    """Amplitude and shape of a further mode, its number from 0."""
+    v, phi = f"v<sub>{i + 1}</sub>", f"φ<sub>{i + 1}</sub>"
+    return (
+        SnapshotPanel(f"v{i + 1}", v, "Amplitude of the mode", "", "", _v(i), True),
+        SnapshotPanel(f"phi{i + 1}", phi, "The mode", "", "", _phi(i), True),
+    )
