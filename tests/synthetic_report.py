@@ -184,7 +184,7 @@ def _snapshot(one: Comparison, pattern: WavePattern) -> dict[str, Any]:
         "undetermined": [],
         "pixels": one.result.pixels,
         "details_px": {name: stats for name in ("w", "best_fit", "idic_to_best_fit")},
-        "pattern_reading": list(pattern.sentences),
+        "pattern_reading": list(pattern.text),
     }
 
 

@@ -72,7 +72,7 @@ def test_square_pattern_is_the_papers_mode(origin: str, shift: float) -> None:
     np.testing.assert_allclose(found.family.start, paper.start, atol=INTERPOLATION)
     assert found.amplitude == pytest.approx(-0.3, rel=INTERPOLATION)
     assert_is_field(found, mesh, u)
-    assert f"Eq. (mode) of the paper ({paper.name})" in found.sentences[-1]
+    assert f"Eq. (mode) of the paper ({paper.name})" in found.text[-1]
 
 
 @SETTINGS
@@ -150,8 +150,8 @@ def test_flower_is_three_tied_waves() -> None:
     assert found.family.size == 15 - 6
     assert all(name[0] in "kc" for name in found.family.names)
     assert found.family.units == ("-",) * 6 + ("mm",) * 3
-    assert "transverse" in found.sentences[0]
-    assert "Zero within 2 %: L1,2,3." in found.sentences
+    assert "transverse" in found.text[0]
+    assert "Zero within 2 %: L1,2,3." in found.text
 
 
 def test_rotations_and_mirrors_tie_both_components() -> None:
@@ -177,7 +177,7 @@ def test_what_differs_stays_free() -> None:
     found = mode_family(HEXAGONAL_MESH, OBLIQUE * TWO, field(HEXAGONAL_MESH, waves), PITCH)
     assert_is_field(found, HEXAGONAL_MESH, field(HEXAGONAL_MESH, waves))
     assert found.family.size == 15 - 4  # three L are zero, the largest T is held
-    assert not any("is the same" in sentence for sentence in found.sentences)
+    assert not any("is the same" in sentence for sentence in found.text)
 
 
 def test_components_out_of_phase_become_two_waves() -> None:
@@ -189,7 +189,7 @@ def test_components_out_of_phase_become_two_waves() -> None:
     assert found.family.names == ("T2", "kx1", "ky1", "c1", "c2")
     k = found.family.matrix[:, 1].reshape(-1, 5)
     assert np.array_equal(k, [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
-    assert any("out of phase" in sentence for sentence in found.sentences)
+    assert any("out of phase" in sentence for sentence in found.text)
 
 
 def found_mean(found: FoundFamily, u: np.ndarray) -> np.ndarray:
@@ -223,7 +223,7 @@ def test_tied_and_free_families_start_from_the_same_field() -> None:
     assert free.family.size == 5 * 3 - 1
     difference = evaluated(tied, HEXAGONAL_MESH) - evaluated(free, HEXAGONAL_MESH)
     assert np.abs(difference).max() < 5 * INTERPOLATION
-    assert "14 parameters: all wave vectors and phases, and five amplitudes" in free.sentences[-1]
+    assert "14 parameters: all wave vectors and phases, and five amplitudes" in free.text[-1]
 
 
 def test_captured_is_the_square_of_the_overlap() -> None:

@@ -116,7 +116,7 @@ def test_regions_have_spectra_and_modes_of_their_own(tmp_path: Path) -> None:
     for mode, box in zip(modes, boxes, strict=True):
         own = mode.taper.cellular
         assert (own.y_min, own.y_max) == pytest.approx((box.y_min, box.y_max), abs=1e-9)
-    said = " ".join(measured.sentences)
+    said = " ".join(measured.text)
     assert "Region 'above', v1 phi1:" in said
     assert "Region 'below', v2 phi2:" in said
     assert error_px(measured, scene, truth) < 0.03
@@ -148,7 +148,7 @@ def test_a_pattern_that_becomes_another_one_is_not_followed_as_the_old_one(tmp_p
     results = harvesting(tmp_path).results()
     assert [m.result.ansatz.modes[0].family.name for m in results.values()] == [
         "square", "1 wave, free", "1 wave, free"]  # fmt: skip
-    goes_on = ["of the photograph before" in " ".join(m.sentences) for m in results.values()]
+    goes_on = ["of the photograph before" in " ".join(m.text) for m in results.values()]
     assert goes_on == [False, False, True]
     for name, measured in results.items():
         # The cellular part is found here to some hundredths of a pixel, not given.
@@ -196,5 +196,5 @@ def test_a_column_that_leaves_the_image_does_not_move_the_lattice_by_a_cell(
 
     scene.save(tmp_path, {"frame": truth})
     measured = harvesting(tmp_path).results()["frame"]
-    assert "told by the speckle" in measured.sentences[0]
+    assert "decided by the speckle" in measured.text[0]
     assert error_px(measured, scene, truth) < 0.1

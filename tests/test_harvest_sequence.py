@@ -86,7 +86,7 @@ def test_every_frame_is_measured(harvesting: HarvestRun) -> None:
 def test_each_goes_on_from_the_one_before(harvesting: HarvestRun) -> None:
     """As long as it shows what the one before has shown."""
     results = list(harvesting.results().values())
-    goes_on = ["started from the result of the photograph before" in " ".join(m.sentences)
+    goes_on = ["started from the result of the photograph before" in " ".join(m.text)
                for m in results]  # fmt: skip
     # The second has a held mode as the first; the third shows a pattern that the second has not.
     assert goes_on == [False, True, False, True, True]

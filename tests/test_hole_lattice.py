@@ -102,7 +102,7 @@ def test_more_specks_than_holes_change_nothing() -> None:
     assert len(specked) == len(clean) == 9
     # A speck of 9 px at a hole's edge moves the centre of 5000 px by 9 * 40 / 5000 px.
     np.testing.assert_allclose(specked.centres, clean.centres, atol=0.3)
-    assert "smaller openings" in specked.sentences[-1]
+    assert "smaller openings" in specked.text[-1]
 
 
 @pytest.mark.parametrize("radius", [20.0, 40.3])
@@ -199,7 +199,7 @@ def test_rivals_are_told_when_a_column_left_the_image() -> None:
     assert motions[0].rivals == 1
     np.testing.assert_allclose(motions[0].after - motions[0].before, [[0.0, -30.0]] * 50)
     np.testing.assert_allclose(motions[1].after - motions[1].before, [[0.0, 160.0]] * 50)
-    assert "2 ways" in motions[0].sentences[1]
+    assert "2 ways" in motions[0].text[1]
 
 
 def test_motion_in_mm_has_y_upwards() -> None:

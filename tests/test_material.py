@@ -90,7 +90,7 @@ def test_walls_of_holes_out_of_focus_are_background() -> None:
     blurred = gaussian_filter(Speckle(SpeckleSpec(seed=5), SHAPE).image(), 8.0)
     grey += np.where(seen, 0.6 * blurred * (1.0 - inward / 24.0), 0.0)
     material = find_material(grey)
-    assert "out of focus" in material.sentences[-1]
+    assert "out of focus" in material.text[-1]
     assert (seen & material.mask).sum() < 0.25 * seen.sum()
     # Paid for by some px at the edges there, which hide in the same window.
     assert (truth & ~material.mask).mean() < 0.01
@@ -107,11 +107,11 @@ def test_holes_that_a_window_hardly_fits_into_are_found() -> None:
 def test_without_a_background_all_is_material_and_that_is_said() -> None:
     material = find_material(image(0.0, 0.01, np.ones(SHAPE, dtype=bool)))
     assert material.mask.all()
-    assert "whole image" in material.sentences[0]
+    assert "whole image" in material.text[0]
 
 
 def test_background_like_the_speckle_is_told() -> None:
-    said = find_material(image(0.5, 0.03, specimen())).sentences
+    said = find_material(image(0.5, 0.03, specimen())).text
     assert any("grey levels of the background" in sentence for sentence in said)
 
 

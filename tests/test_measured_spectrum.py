@@ -99,7 +99,7 @@ def test_two_halves_with_patterns_of_their_own_are_read_apart():
     upper = measured_spectrum(field, PITCH, Box(-6, 6, 0, 10))
     lower = measured_spectrum(field, PITCH, Box(-6, 6, -10, 0))
     above, below = read_pattern(upper), read_pattern(lower)
-    assert above.supported, above.sentences
+    assert above.supported, above.text
     assert not below.supported
     np.testing.assert_allclose(np.abs([w.k for w in above.waves]), 1, atol=0.05)
     np.testing.assert_allclose(np.abs([w.k for w in below.waves]), [[0.7, 1]] * 2, atol=0.05)

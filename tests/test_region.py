@@ -72,13 +72,13 @@ def test_unseen_edges_have_no_margin() -> None:
     corners = [(60, 30), (60, 170), (190, 170), (190, 30)]
     region = region_of_polygon(corners, mask, grid)
     np.testing.assert_array_equal(np.isnan(region.margins), [True, True, False, False])
-    assert "leaves the image at the left, right" in region.sentences[-1]
+    assert "leaves the image at the left, right" in region.text[-1]
 
 
 def test_a_region_that_is_no_rectangle_is_told() -> None:
     triangle = [(60.0, 60.0), (60.0, 340.0), (190.0, 60.0)]
     region = region_of_polygon(triangle, specimen_mask(), GRID)
-    assert re.search(r"fills 5[01] % of its bounding box", region.sentences[1])  # rounding of px
+    assert re.search(r"fills 5[01] % of its bounding box", region.text[1])  # rounding of px
 
 
 def test_bad_regions_are_refused() -> None:

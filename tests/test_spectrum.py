@@ -135,7 +135,7 @@ def test_pattern_is_read_as_it_was_made(mode, sign, origin):
     s = spectral_density(patterned(mode, sign * 0.145), moved, MASK, PITCH)
     mode = mode - (0, 0, 0, 0, 0, *(mode[1:5].reshape(2, 2) @ origin))
     pattern = read_pattern(s)
-    assert pattern.supported, pattern.sentences
+    assert pattern.supported, pattern.text
     start, turned = mode_equivalent(pattern.start, PITCH, mode)
     # The phases that count are those in the middle of the specimen.
     for a in (start, mode):
@@ -170,7 +170,7 @@ def test_other_patterns_are_not_called_square(amplitudes):
     pattern = read_pattern(spectrum_of(u))
     assert pattern.family == "unknown"
     assert pattern.start is None
-    assert "not supported" in pattern.sentences[-1]
+    assert "not supported" in pattern.text[-1]
 
 
 def test_no_pattern_is_seen_in_bending():
@@ -178,7 +178,7 @@ def test_no_pattern_is_seen_in_bending():
     assert pattern.waves == ()
     assert pattern.family == "none"
     assert pattern.largest is not None
-    assert pattern.sentences[0].startswith("No pattern: the largest peak is at")
+    assert pattern.text[0].startswith("No pattern: the largest peak is at")
 
 
 def test_edge_lines_are_not_taken_for_peaks():

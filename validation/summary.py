@@ -284,7 +284,7 @@ def snapshot_summary(
         "undetermined": list(result.undetermined),
         "pixels": result.pixels,
         "details_px": px,
-        "pattern_reading": list(pattern.sentences),
+        "pattern_reading": list(pattern.text),
     }
 
 

@@ -1,8 +1,8 @@
 """Displacement fields at points, read from the files of any DIC code and written.
 
-A point that failed stays in the field, marked as not valid: what was lost is counted, not hidden.
+A point that failed stays in the field, marked as not valid.
 
-The frame of the project is x right, y up, in mm. What a file uses is said by its columns' names or
+The frame of the project is x right, y up, in mm. A file's frame is stated by its columns' names or
 by the caller; a field is never guessed to be in millimetres.
 """
 
@@ -143,7 +143,7 @@ class LocalField:
         )
 
     def less(self, displacement: Callable[[FloatArray], FloatArray]) -> LocalField:
-        """What a model leaves over: w = u − model, with the field's own standard deviations.
+        """The microfluctuation field w = u − model, with the field's own standard deviations.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class LocalField:
 
     @property
     def rms_beyond_noise(self) -> float:
-        """√(rms² − sd²) [mm]: what is there beyond the field's own errors; 0 if nothing is.
+        """√(rms² − sd²) [mm]: the rms without the field's own errors, at least 0.
 
         NaN if the standard deviations are not known.
         """
@@ -172,7 +172,7 @@ def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortio
     Parameters
     ----------
     field
-        Measured on photographs as they are.
+        Measured on photographs that are not undistorted.
     grid
         Their pixels.
     distortion
@@ -218,11 +218,11 @@ def read_field(
     grid
         Pixels to millimetres, needed if anything is in pixels.
     units
-        "px" or "mm", of positions and displacements; None: as the columns' names say.
+        "px" or "mm", of positions and displacements; None: as the columns' names state.
     displacement_units
         Of u and v, if they are not those of x and y.
     y_axis
-        "up" or "down": where y grows and v is positive; None: as the columns' names say. In
+        "up" or "down": where y grows and v is positive; None: as the columns' names state. In
         pixels, "up" counts from the lowest row.
     first_pixel
         What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
@@ -270,7 +270,7 @@ def _from_pixels(
 
 
 def write_field(path: Path | str, field: LocalField) -> None:
-    """Write a field as CSV or NPZ, which :func:`read_field` reads without being told anything.
+    """Write a field as CSV or NPZ, which :func:`read_field` reads without any options.
 
     Raises
     ------
@@ -345,7 +345,7 @@ def _same_shape(
 def _quality(
     table: Table, chosen: dict[str, Column], n: int, scale: float, in_px: bool, where: str
 ) -> tuple[FloatArray | None, NDArray[np.bool_]]:
-    """(n, 2) standard deviations [mm] or None, and (n,) what the file itself says is valid."""
+    """(n, 2) standard deviations [mm] or None, and (n,) which points the file marks as valid."""
     values = {}
     for role in ("sd_u", "sd_v", "sigma", "valid"):
         if role in chosen:

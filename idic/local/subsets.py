@@ -42,13 +42,12 @@ def predicted_sd(
     correlation: FloatArray,
     subset_px: int,
 ) -> FloatArray:
-    """Standard deviations that the grey levels left over predict, (n, 2) [mm].
+    """Standard deviations that the residual predicts, (n, 2) [mm].
 
-    The zero-normalised correlation C of a subset tells what is left between its two images,
-    2 (1 − C) of their variance. Were it white noise, the displacement's covariance would be that
-    times (Σ ∇f ∇fᵀ)⁻¹ over the subset. Much of it is not white: it is what an affine subset can't
-    follow, and is alike over a speckle. It is counted as one independent value per
-    ``speckle_area`` pixels, the area of f's autocorrelation.
+    The zero-normalised correlation C of a subset gives its residual, 2 (1 − C) of the images'
+    variance. Were it white noise, the displacement's covariance would be that times
+    (Σ ∇f ∇fᵀ)⁻¹ over the subset. Much of it is model error, which is correlated over a speckle: it
+    counts as one independent value per ``speckle_area`` pixels, the area of f's autocorrelation.
 
     Parameters
     ----------
@@ -77,10 +76,10 @@ def predicted_sd(
         summed(i)[row, col] for i in (right**2, right * down, down**2, mask.astype(float), f, f**2)
     )
     variance = np.maximum(two / count - (one / count) ** 2, 0.0)
-    left = 2.0 * np.clip(1.0 - correlation, 0.0, None) * variance * speckle_area(f, mask)
+    residual = 2.0 * np.clip(1.0 - correlation, 0.0, None) * variance * speckle_area(f, mask)
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = xx * yy - xy**2
-        cov = left[:, None] * np.column_stack([yy, xx]) / determinant[:, None]
+        cov = residual[:, None] * np.column_stack([yy, xx]) / determinant[:, None]
         return np.asarray(grid.pixel_size * np.sqrt(cov))
 
 
@@ -100,7 +99,7 @@ WHERE = "MODEHARVEST_PYVALE"
 """Environment variable: the Python that has pyvale, if it isn't this one."""
 HOW_TO_GET = (
     f"pyvale is not installed; give it an environment of its own and set {WHERE} to the Python "
-    "there (docs/fields.md says how), or read the field of another code"
+    "there (see docs/fields.md), or read the field of another code"
 )
 _TRIES = 3
 """Seeds that are tried."""
@@ -264,7 +263,7 @@ def _arguments(
         "partial_subset": options.filling,
         "max_displacement": min(max(largest, options.subset_px), (min(grid.shape) - 1) // 2),
         "num_threads": options.threads,
-        "image_filter_kernel": 1,  # no blur: the images are taken as they are
+        "image_filter_kernel": 1,  # no blur: the unfiltered images
     }
 
 

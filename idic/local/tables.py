@@ -1,4 +1,4 @@
-"""Named columns of CSV, NPZ, HDF5 and MAT files, and what the names used by DIC codes mean.
+"""Named columns of CSV, NPZ, HDF5 and MAT files, and the meaning of the names of DIC codes.
 
 Known: x, y, u, v with or without a unit, the lower and upper case of VIC-2D and VIC-3D (pixels and
 millimetres), DICe's COORDINATE_X and DISPLACEMENT_X, pyvale's subset_x and disp_u, GOM's and
@@ -105,7 +105,7 @@ def _numbers_at_once(path: Path, begin: int, separator: str | None) -> FloatArra
 def _numbers_by_line(
     path: Path, begin: int, separator: str | None, decimal: str, width: int
 ) -> FloatArray:
-    """(n, width) line by line, to say in which of them something else stands."""
+    """(n, width) line by line, to name the line that holds something else."""
     rows = [(k, _split(line, separator)) for k, line in _numbered(path, begin, None)]
     for k, row in rows:
         if len(row) - width not in (0, 1) or any(row[width:]):
@@ -234,7 +234,7 @@ _UNITS = {"px": "px", "pixel": "px", "pixels": "px", "pix": "px", "mm": "mm"}
 
 @dataclass(frozen=True)
 class Column:
-    """What a column's name says.
+    """The meaning of a column's name.
 
     Parameters
     ----------
@@ -243,9 +243,9 @@ class Column:
     role
         "x", "y", "u", "v", "sd_u", "sd_v", "sigma" or "valid"; None for any other.
     unit
-        "px" or "mm", None if the name doesn't say.
+        "px" or "mm", None if the name doesn't state it.
     y_axis
-        "up" or "down", None if the name doesn't say.
+        "up" or "down", None if the name doesn't state it.
     of_image_code
         Whether only codes that measure everything in pixels use this name.
     """
@@ -326,7 +326,7 @@ def choose(
         if len(best) > 1:
             raise InputError(
                 f"{where}: expected one column for {role}, got {_listed([c.name for c in best])}; "
-                f"say which in columns, or give units"
+                f"name one in columns, or give units"
             )
         chosen[role] = best[0]
     missing = [role for role in ROLES if role not in chosen]

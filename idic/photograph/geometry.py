@@ -188,7 +188,7 @@ class Geometry:
     def motions_in(self, mask: BoolArray) -> tuple[tuple[HoleMotion, ...], str]:
         """How the holes may have moved in a deformed image, the likeliest first.
 
-        Nothing where they can't be followed; the sentence says why. See
+        Nothing where they can't be followed, and why. See
         :func:`modeharvest.idic.photograph.matching.possible_motions`.
 
         Parameters
@@ -251,7 +251,7 @@ def _region(
 
 
 def _polygon(polygon: Corners, mask: BoolArray, grid: PixelGrid, where: str) -> Region:
-    """The region of corners (column, row), its faults told with the table that they come from."""
+    """The region of corners (column, row), its faults reported with their table."""
     try:
         return region_of_polygon([(row, col) for col, row in polygon], mask, grid)
     except InputError as error:
@@ -274,10 +274,10 @@ def _require_apart(parts: tuple[Part, ...], cell_size: float) -> None:
 
 
 def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | None, str]:
-    """How the holes have moved, and a sentence about it; None where they can't be followed.
+    """How the holes have moved, and a text about it; None where they can't be followed.
 
-    Where a column of holes has left the image, the holes alone allow several answers, and the
-    speckle between them tells which is right.
+    Where a column of holes has left the image, the holes alone allow several answers; the
+    speckle between them decides.
 
     Raises
     ------
@@ -287,25 +287,25 @@ def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | Non
     motions, why_not = geometry.motions_in(pair.masks[1])
     if not motions:
         return None, why_not
-    motion, seen = _likeliest(pair, motions)
-    require_same_surface(seen, "the reference", "the deformed one")
-    said = [*motion.sentences, seen.sentence]
+    motion, blocks = _likeliest(pair, motions)
+    require_same_surface(blocks, "the reference", "the deformed one")
+    text = [*motion.text, blocks.text]
     if motion is not motions[0] or motion.rivals:
-        said.append("Which hole is which was told by the speckle between them.")
-    return motion, " ".join(said)
+        text.append("Which hole is which was decided by the speckle between them.")
+    return motion, " ".join(text)
 
 
 def confirmed_by_speckle(pair: ImagePair, expected: Expected) -> str:
-    """A sentence about blocks of the reference that were found where they are expected.
+    """A text about blocks of the reference that were found where they are expected.
 
     Raises
     ------
     InputError
         If the images don't show the same surface.
     """
-    seen = match_blocks(pair.reference, pair.deformed, pair.mask, expected)
-    require_same_surface(seen, "the reference", "the deformed one")
-    return seen.sentence
+    blocks = match_blocks(pair.reference, pair.deformed, pair.mask, expected)
+    require_same_surface(blocks, "the reference", "the deformed one")
+    return blocks.text
 
 
 def _likeliest(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:

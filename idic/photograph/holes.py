@@ -173,8 +173,8 @@ def _oriented(basis: tuple[FloatArray, FloatArray]) -> FloatArray:
 Kind = Literal["square", "hexagonal", "rectangular", "oblique"]
 
 _NEAR = 0.25
-"""A neighbour is where the lattice says within this share of the pitch; locally, strain differs
-from the mean by 10 %, and holes are moulded a little off."""
+"""Distance of a neighbour from its place in the lattice, as a share of the pitch; locally, strain
+differs from the mean by 10 %, and holes are moulded a little off."""
 _BENT = 0.25
 """Rms distance from a straight lattice, as a share of the pitch, that is no lattice any more."""
 _MOST = 0.5
@@ -213,7 +213,7 @@ class HoleLattice:
         Rms distance of the centres from the straight lattice [px].
     kind
         "square", "hexagonal", "rectangular" or "oblique".
-    sentences
+    text
         What was found.
     """
 
@@ -226,7 +226,7 @@ class HoleLattice:
     extra: FloatArray
     misfit_px: float
     kind: Kind
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -285,7 +285,7 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
         raise _no_lattice(len(holes), "they lie in one row")
     index, known = _counted(spots, vectors)
     if known.mean() < _MOST or known.sum() < 4 or np.ptp(index[known], axis=0).min() == 0:
-        raise _no_lattice(len(holes), f"only {known.sum()} are where neighbours say")
+        raise _no_lattice(len(holes), f"only {known.sum()} are a lattice vector from a neighbour")
     origin, vectors, misfit = _straight(spots[known], index[known])
     pitch = float(np.linalg.norm(vectors, axis=1).mean())
     if misfit > _BENT * pitch:
@@ -301,11 +301,11 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
         extra=holes.centres[~known],
         misfit_px=misfit,
         kind=kind,
-        sentences=(),
+        text=(),
     )
     if cell_px is not None:
         require_cell_size(found, cell_px)
-    return _with_sentences(found, holes)
+    return _with_text(found, holes)
 
 
 def require_cell_size(lattice: HoleLattice, cell_px: float) -> None:
@@ -383,21 +383,21 @@ def _kind(vectors: FloatArray) -> Kind:
     return "oblique"
 
 
-def _with_sentences(lattice: HoleLattice, holes: Holes) -> HoleLattice:
+def _with_text(lattice: HoleLattice, holes: Holes) -> HoleLattice:
     d = lattice.diameters
     (i, j), (a, b) = lattice.counts, np.linalg.norm(lattice.vectors, axis=1)
-    said = [
+    text = [
         f"{len(lattice)} holes on a {lattice.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
         f"turned by {lattice.rotation_deg:+.2f} degrees, {lattice.misfit_px:.2f} px rms off it; "
         f"diameters {d.mean():.1f} +- {d.std():.1f} px."
     ]
     if len(lattice.missing):
-        said.append(f"Holes are missing at {len(lattice.missing)} lattice points amid them.")
+        text.append(f"Holes are missing at {len(lattice.missing)} lattice points amid them.")
     if len(lattice.extra):
-        said.append(f"{len(lattice.extra)} holes are not on the lattice and were left out.")
+        text.append(f"{len(lattice.extra)} holes are not on the lattice and were left out.")
     if holes.too_small:
-        said.append(f"{holes.too_small} much smaller openings were left out.")
-    return replace(lattice, sentences=tuple(said))
+        text.append(f"{holes.too_small} much smaller openings were left out.")
+    return replace(lattice, text=tuple(text))
 
 
 def _no_lattice(holes: int, why: str) -> InputError:

@@ -89,9 +89,9 @@ class RegionPattern:
     def text(self) -> tuple[str, ...]:
         """What was found."""
         if len(self.modes) < 2:
-            return self.pattern.sentences
+            return self.pattern.text
         return (
-            *self.pattern.sentences,
+            *self.pattern.text,
             f"The waves share no vector of the reciprocal lattice: {len(self.modes)} modes, each "
             "with an amplitude of its own.",
         )
@@ -99,7 +99,7 @@ class RegionPattern:
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Where a correlation begins, and why there.
+    """Where a correlation begins, and how that was found.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Holes, and blocks of speckle, of the reference matched with those of a deformed photograph.
 
-Holes are told apart by their place in the lattice, not by their distance, so displacements may be
+Holes are identified by their place in the lattice, not by their distance, so displacements may be
 larger than half the pitch.
 
 Blocks of the reference are looked for where they should have moved to, and as a comparison
@@ -45,7 +45,7 @@ class HoleMotion:
         (n, 2) centres in the reference and in the deformed image, (row, col) [px].
     rivals
         Number of other ways to lay the lattices on each other that match as many holes.
-    sentences
+    text
         What was matched.
     """
 
@@ -53,7 +53,7 @@ class HoleMotion:
     before: FloatArray
     after: FloatArray
     rivals: int
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.index)
@@ -97,7 +97,7 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
     ]
     motions.sort(key=lambda found: (-found[0], _length(found[1])))
     rivals = sum(count == most for count, _ in motions) - 1
-    return tuple(_with_sentences(motion, reference, deformed, rivals) for _, motion in motions)
+    return tuple(_with_text(motion, reference, deformed, rivals) for _, motion in motions)
 
 
 def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
@@ -141,21 +141,21 @@ def _length(motion: HoleMotion) -> float:
     return float(np.linalg.norm((motion.after - motion.before).mean(axis=0)))
 
 
-def _with_sentences(
+def _with_text(
     motion: HoleMotion, reference: HoleLattice, deformed: HoleLattice, rivals: int
 ) -> HoleMotion:
     moved = np.linalg.norm(motion.after - motion.before, axis=1)
-    said = [
+    text = [
         f"{len(motion)} holes were found in both images, of {len(reference)} in the reference and "
         f"{len(deformed)} in the deformed one; they moved by {moved.min():.0f} to "
         f"{moved.max():.0f} px."
     ]
     if rivals:
-        said.append(
+        text.append(
             f"{rivals + 1} ways to lay one lattice on the other match as many holes; the one with "
             "the shortest mean displacement comes first."
         )
-    return HoleMotion(motion.index, motion.before, motion.after, rivals, tuple(said))
+    return HoleMotion(motion.index, motion.before, motion.after, rivals, tuple(text))
 
 
 Expected = Callable[[FloatArray], FloatArray]
@@ -216,7 +216,7 @@ class BlockMatch:
         return field_between(self.before[self.found], self.after[self.found], grid, "blocks")
 
     @property
-    def sentence(self) -> str:
+    def text(self) -> str:
         """What was found."""
         return (
             f"{int(self.found.sum())} of {len(self.found)} blocks of {self.block_px} px of the "
@@ -241,7 +241,7 @@ def match_blocks(
     mask
         (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
     expected
-        Where positions should have moved to, as ``HoleMotion.at`` says it; nowhere by default.
+        Where positions should have moved to, as ``HoleMotion.at`` gives it; nowhere by default.
     reach_px
         How far from there a block is searched for, along rows and columns [px].
 

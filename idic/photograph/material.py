@@ -1,9 +1,8 @@
 """Material in a photograph: the speckled surface against holes and background.
 
-The speckle itself tells: within some pixels the material's grey level varies, the background's
-hardly does, whether it is black, grey or white. That finds the background roughly; its own grey
-level, learnt there, then says pixel by pixel how far it goes. What is left at the edges but out of
-focus is the wall of a hole, seen through it.
+Within some pixels the speckled material's grey level varies, the background's hardly does, whether
+it is black, grey or white. That finds the background roughly; its own grey level, learnt there,
+then gives its extent pixel by pixel. What is out of focus at the edges is the wall of a hole.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from modeharvest.util.errors import InputError
 
 
 def material_options(cell_px: float) -> MaterialOptions:
-    """How material is told from background where cells are that large [px].
+    """How material is distinguished from background where cells are that large [px].
 
     Buckled holes are narrow: the window has to fit into them.
     """
@@ -33,7 +32,10 @@ _WINDOW_SHARE = 0.15
 
 
 def grown(mask: BoolArray, px: float) -> BoolArray:
-    """The mask and all pixels within this distance of it [px]."""
+    """The mask and all pixels within this distance of it [px].
+
+    As ``skimage.morphology.isotropic_dilation``, which makes pixels of an empty mask.
+    """
     if not mask.any():  # has no distance
         return mask
     return np.asarray(distance_transform_edt(~mask) <= px)
@@ -85,12 +87,12 @@ _WALL_WINDOW, _WALL_SHARPNESS = 0.6, 0.3
 """Out of focus is what has, in a window of this share of the speckle's, less than this share of
 the material's fine contrast."""
 _SLIGHTEST = 0.02
-"""Share of material with grey levels of the background from which on that is said."""
+"""Share of material with grey levels of the background from which on that is reported."""
 
 
 @dataclass(frozen=True)
 class MaterialOptions:
-    """How material is told from background.
+    """How material is distinguished from background.
 
     Parameters
     ----------
@@ -126,19 +128,14 @@ class MaterialMask:
     alike_share
         Share of the material whose grey level could be the background's [-]: there the edge is
         a guess by its neighbourhood.
-    sentences
-        What a reader should know about how it was found.
+    text
+        How it was found.
     """
 
     mask: BoolArray
     contrast_ratio: float
     alike_share: float
-    sentences: tuple[str, ...]
-
-    @property
-    def share(self) -> float:
-        """Share of the image that is material [-]."""
-        return float(self.mask.mean())
+    text: tuple[str, ...]
 
 
 def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> MaterialMask:
@@ -163,8 +160,8 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
     if not sure.any():
         if not contrast.max() > 0.0:
             raise InputError("expected a speckled material in the image, got a constant grey level")
-        said = ("No background was found: the whole image counts as material.",)
-        return MaterialMask(np.ones(grey.shape, dtype=np.bool_), np.inf, 0.0, said)
+        text = ("No background was found: the whole image counts as material.",)
+        return MaterialMask(np.ones(grey.shape, dtype=np.bool_), np.inf, 0.0, text)
     if sure.all():
         raise InputError(
             "expected a speckled material in the image, got a mask with nothing in it: no part has "
@@ -177,7 +174,7 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
             "background's grey levels are everywhere; give the mask as an image"
         )
     material, walls = _without_walls(grey, material, options)
-    return MaterialMask(material, ratio, alike, _sentences(material, ratio, alike, walls))
+    return MaterialMask(material, ratio, alike, _text(material, ratio, alike, walls))
 
 
 def _checked(image: ArrayLike, options: MaterialOptions) -> FloatImage:
@@ -218,8 +215,8 @@ def _refined(
     """(material, share of it that looks like background), from the background's own level."""
     level, spread = _background_level(grey, sure, 4 * options.window_px)
     away = np.abs(grey - level)
-    least = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
-    first = _background(away < least, sure, options)
+    tolerance = np.maximum(_SIGMAS * spread, _FAINTEST * float(np.ptp(grey)))
+    first = _background(away < tolerance, sure, options)
     some = (slice(None, None, 2),) * 2  # every fourth pixel will do for statistics
     inside = shrunk(~first[some], 0.5 * _LENS_PX)
     if not inside.any():
@@ -227,8 +224,8 @@ def _refined(
     # Half-way to the material's nearest levels where they leave a gap, else as near as the
     # noise allows.
     half = 0.5 * float(np.quantile(away[some][inside], 0.01))
-    background = _background(away < np.maximum(least, half), sure, options)
-    share = float((away < least)[some][inside].mean())
+    background = _background(away < np.maximum(tolerance, half), sure, options)
+    share = float((away < tolerance)[some][inside].mean())
     return without_small(~background, options.window_px**2), share
 
 
@@ -258,8 +255,8 @@ def _without_walls(
     background = ~material
     wall = opened(dull, 0.25 * window) & connected_to(background, dull | background)
     # Near the edge the window holds some sharp material: a wall ends a little further on.
-    left = without_small(material & ~grown(wall, 0.45 * window), options.window_px**2)
-    return left, float((material & ~left).sum() / material.sum())
+    rest = without_small(material & ~grown(wall, 0.45 * window), options.window_px**2)
+    return rest, float((material & ~rest).sum() / material.sum())
 
 
 def _background_level(
@@ -283,18 +280,18 @@ def _around(image: NDArray[Any], reach: int) -> NDArray[Any]:
     return np.asarray(uniform_filter(uniform_filter(image, reach), reach))
 
 
-def _sentences(material: BoolArray, ratio: float, alike: float, walls: float) -> tuple[str, ...]:
-    said = [
+def _text(material: BoolArray, ratio: float, alike: float, walls: float) -> tuple[str, ...]:
+    text = [
         f"Material was found by its speckle, {100 * material.mean():.0f} % of the image, with "
         f"{ratio:.0f} times the contrast of the background."
     ]
     if alike > _SLIGHTEST:
-        said.append(
+        text.append(
             f"{100 * alike:.0f} % of the material has grey levels of the background; there its "
             "edge is known to some pixels only."
         )
     if walls > 0.0:
-        said.append(
+        text.append(
             f"At its edges, {100 * walls:.1f} % of it was out of focus and counts as background."
         )
-    return tuple(said)
+    return tuple(text)

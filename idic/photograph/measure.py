@@ -66,7 +66,7 @@ def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: i
     """
     if result.final_smoothing is None or result.final_smoothing.blur_px == 0.0:
         return result.residual_test(noise)
-    back, inside = pulled_back(pair.deformed, result, result.order)
+    back, inside = warped_back(pair.deformed, result, result.order)
     used = eroded(pair.masks[0], edge_px) & inside
     f, g = pair.reference[used], back[used]
     gain = np.cov(f, g)[0, 1] / g.var(dtype=np.float64)
@@ -89,17 +89,17 @@ class MeasuredPhotograph:
     result
         Of the correlation.
     local
-        The displacement field that the start was read from, a local DIC's if there is one.
+        The displacement field behind the initial guess, a local DIC's if there is one.
     fixed
         Whether the mode was fixed.
-    sentences
-        Where the correlation started from and ended, in words.
+    text
+        Initial guess and final smoothing.
     """
 
     result: Result
     local: LocalField
     fixed: bool
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
 
 def measure(
@@ -111,7 +111,7 @@ def measure(
     before: MeasuredPhotograph | None = None,
     progress: Progress = silent,
 ) -> MeasuredPhotograph:
-    """Find start and ansatz, and correlate.
+    """Find ansatz and initial guess, and correlate.
 
     Parameters
     ----------
@@ -126,9 +126,9 @@ def measure(
     local
         A local DIC's field.
     before
-        What came out of the photograph before. If it shows all waves that are seen now, its
-        ansatz is kept and its unknowns are the start; the start is found anew if that leads
-        nowhere.
+        What came out of the photograph before. If it shows all waves that are observed now, its
+        ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
+        found anew.
     progress
         Listener.
 
@@ -137,40 +137,40 @@ def measure(
     InputError
         If the two images don't show the same surface, or the spectrum contradicts the cell size.
     """
-    motion, said = matched_holes(pair, geometry)
+    motion, matching = matched_holes(pair, geometry)
     holes = None if motion is None else motion.in_mm(geometry.grid)
     if motion is None and before is not None:
         holes = _moved_holes(before.result, geometry)
-        said += " v0 starts from the photograph before. "
-        said += confirmed_by_speckle(pair, partial(_moved_to, before.result))
+        matching += " v0 starts from the photograph before. "
+        matching += confirmed_by_speckle(pair, partial(_moved_to, before.result))
     boxes = [part.box for part in geometry.parts]
     guess = initial_guess(
         pair, cell_size, boxes, local=local, holes=holes, lattice=geometry.lattice_mm,
         domain=geometry.region.domain, options=how,
     )  # fmt: skip
     ansatz, unknowns, fixed = chosen_modes(guess, geometry, cell_size, how)
-    sentences = (said, *_guess_text(guess, ansatz, geometry))
+    text = (matching, *_guess_text(guess, ansatz, geometry))
     options = how.options()
     if before is not None and _goes_on(before, ansatz, unknowns, fixed):
         again, there = _with_brightness(before.result, how)
         found = correlate(pair, again, guess=there, options=options, progress=progress)
         if found.outcome is Outcome.CONVERGED:
             words = "The correlation started from the result of the photograph before."
-            return _measured(found, guess.local, before.fixed, (*sentences, words))
+            return _measured(found, guess.local, before.fixed, (*text, words))
     found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
-    return _measured(found, guess.local, fixed, sentences)
+    return _measured(found, guess.local, fixed, text)
 
 
 def _measured(
-    result: Result, local: LocalField, fixed: bool, sentences: tuple[str, ...]
+    result: Result, local: LocalField, fixed: bool, text: tuple[str, ...]
 ) -> MeasuredPhotograph:
-    """What was measured, with what was done to the images at last."""
+    """A photograph's result with the final smoothing in its text."""
     assert result.final_smoothing is not None
-    return MeasuredPhotograph(result, local, fixed, (*sentences, result.final_smoothing.sentence))
+    return MeasuredPhotograph(result, local, fixed, (*text, result.final_smoothing.sentence))
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:
-    """Ansatz and unknowns of a result with the brightness that was asked for, to start from."""
+    """Ansatz and unknowns of a result with the specified brightness, as an initial guess."""
     ansatz = replace(result.ansatz, brightness=how.brightness)
     first = result.ansatz.phi_offset(len(result.ansatz.modes))
     start = np.zeros(ansatz.size)
@@ -179,7 +179,7 @@ def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, Fl
 
 
 def _goes_on(before: MeasuredPhotograph, ansatz: Ansatz, unknowns: FloatArray, fixed: bool) -> bool:
-    """Whether the photograph before is a start: it was measured, and shows all that is seen now."""
+    """Whether the result before is an initial guess: converged, with all waves observed now."""
     result = before.result
     if result.outcome is not Outcome.CONVERGED or before.fixed != fixed:
         return False
@@ -190,12 +190,12 @@ def _guess_text(guess: InitialGuess, ansatz: Ansatz, geometry: Geometry) -> tupl
     """The initial guess's text; lines about a spectrum name its part, where there are several."""
     if len(geometry.parts) == 1:
         return guess.text
-    read = {line for region in guess.regions for line in region.pattern.sentences}
+    read = {line for region in guess.regions for line in region.pattern.text}
     text = [line for line in guess.text if line not in read]
     for part, region in zip(geometry.parts, guess.regions, strict=True):
         own = [k + 1 for k, mode in enumerate(ansatz.modes) if mode.taper.cellular == part.box]
         modes = " and ".join(f"v{k} phi{k}" for k in own) or "no mode"
-        text.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.sentences)}")
+        text.append(f"Region {part.name!r}, {modes}: {' '.join(region.pattern.text)}")
     return tuple(text)
 
 
@@ -222,7 +222,7 @@ _BAND = 64
 """Rows at a time, so that little memory is needed."""
 
 
-def pulled_back(
+def warped_back(
     deformed: NDArray[Any], result: Result, order: int = 5
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Show a deformed image in the frame of the reference.

@@ -45,7 +45,7 @@ class Region:
     margins
         Width of the bulk beside ``cellular`` [mm]: left, right, bottom, top; NaN where the
         specimen leaves the image, so that it is not known.
-    sentences
+    text
         Where the region comes from, and what is odd about it.
     """
 
@@ -53,7 +53,7 @@ class Region:
     domain: Box
     polygon: FloatArray
     margins: tuple[float, float, float, float]
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
     def inside(self, grid: PixelGrid) -> BoolArray:
         """(rows, cols) True on the pixels within the polygon."""
@@ -77,12 +77,12 @@ def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) ->
     steps = 0.5 * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) @ lattice.vectors
     corners = (lattice.centres[:, None] + steps).reshape(-1, 2)
     polygon = corners[ConvexHull(corners).vertices]
-    said = (
+    text = (
         f"The cellular part is the cells of {len(lattice)} holes on a {lattice.kind} lattice of "
         f"{lattice.pitch_px * grid.pixel_size:.4g} mm."
     )
     box = _box(low, high, grid)
-    return _region(box, polygon, mask, grid, (said,))
+    return _region(box, polygon, mask, grid, (text,))
 
 
 def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -117,9 +117,9 @@ def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> R
     inside = _filled(corners, grid.shape)
     _require_material(inside, np.asarray(mask, dtype=np.bool_), "polygon")
     box = _box(corners.min(axis=0), corners.max(axis=0), grid)
-    said = [f"The cellular part is a polygon of {len(corners)} corners, as given."]
-    said += _unlike_box(inside, corners.min(axis=0), corners.max(axis=0))
-    return _region(box, corners, mask, grid, tuple(said))
+    text = [f"The cellular part is a polygon of {len(corners)} corners, as given."]
+    text += _unlike_box(inside, corners.min(axis=0), corners.max(axis=0))
+    return _region(box, corners, mask, grid, tuple(text))
 
 
 def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -148,8 +148,8 @@ def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Regio
     _require_material(inside, np.asarray(mask, dtype=np.bool_), "mask of the cellular part")
     pixels = np.argwhere(inside).astype(np.float64)
     low, high = _bounds(inside)
-    said = ["The cellular part is a mask image, as given.", *_unlike_box(inside, low, high)]
-    return _region(_box(low, high, grid), _hull(pixels), mask, grid, tuple(said))
+    text = ["The cellular part is a mask image, as given.", *_unlike_box(inside, low, high)]
+    return _region(_box(low, high, grid), _hull(pixels), mask, grid, tuple(text))
 
 
 def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
@@ -159,7 +159,7 @@ def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
 
 
 def _region(
-    box: Box, polygon: FloatArray, mask: ArrayLike, grid: PixelGrid, said: tuple[str, ...]
+    box: Box, polygon: FloatArray, mask: ArrayLike, grid: PixelGrid, text: tuple[str, ...]
 ) -> Region:
     low, high = _bounds(_largest_part(np.asarray(mask, dtype=np.bool_)))
     domain = _box(low, high, grid)
@@ -168,7 +168,7 @@ def _region(
     left, right, bottom, top = np.where(cut, np.nan, widths)
     if any(cut):
         sides = ", ".join(side for side, outside in zip(SIDES, cut, strict=True) if outside)
-        said = (*said, f"The specimen leaves the image at the {sides}.")
+        text = (*text, f"The specimen leaves the image at the {sides}.")
     # Half a cell of rounding or of a crooked edge must not make the domain the smaller one.
     domain = Box(
         min(box.x_min, domain.x_min),
@@ -176,7 +176,7 @@ def _region(
         min(box.y_min, domain.y_min),
         max(box.y_max, domain.y_max),
     )
-    return Region(box, domain, polygon, (left, right, bottom, top), said)
+    return Region(box, domain, polygon, (left, right, bottom, top), text)
 
 
 def box_of(mask: BoolArray, grid: PixelGrid) -> Box:

@@ -7,9 +7,9 @@ wave vector and T across, (A, B) = L n + T m with n = k/|k| and m = n turned by 
 
 * L and T with a common phase: one wave. Otherwise two waves with the same wave vector, one of L
   and one of T, each with a phase of its own.
-* |L|, and |T|, equal within a star of waves: one parameter, the signs held.
-* L or T zero: held at zero.
-* The overall amplitude is held, since v_i carries it.
+* |L|, and |T|, equal within a star of waves: one parameter, the signs fixed.
+* L or T zero: fixed at zero.
+* The overall amplitude is fixed, since v_i carries it.
 
 Wave vectors are free, and so are phases: they make up for a specimen that isn't quite its drawing
 (the paper's a₂ ... a₇). The frames stay those of the wave vectors found.
@@ -86,7 +86,7 @@ class RealWave:
 
 @dataclass(frozen=True)
 class Tie:
-    """Amplitudes of one component that are one parameter, or held.
+    """Amplitudes of one component that are one parameter, or fixed.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Tie:
     waves
         Numbers of the waves, from 0.
     value
-        Their common magnitude [unit of the field]; 0: they are held at zero.
+        Their common magnitude [unit of the field]; 0: they are fixed at zero.
     """
 
     component: int
@@ -156,16 +156,16 @@ def find_ties(waves: list[RealWave]) -> list[Tie]:
 def _clustered(component: int, sizes: dict[int, float], tolerance: float) -> list[Tie]:
     zero = tuple(k for k, size in sizes.items() if size <= tolerance)
     ties = [Tie(component, zero, 0.0)] if zero else []
-    left = {k: size for k, size in sizes.items() if size > tolerance}
-    while left:
-        first = next(iter(left.values()))
-        same = tuple(k for k, size in left.items() if abs(size - first) <= tolerance)
-        ties.append(Tie(component, same, float(np.mean([left.pop(k) for k in same]))))
+    rest = {k: size for k, size in sizes.items() if size > tolerance}
+    while rest:
+        first = next(iter(rest.values()))
+        same = tuple(k for k, size in rest.items() if abs(size - first) <= tolerance)
+        ties.append(Tie(component, same, float(np.mean([rest.pop(k) for k in same]))))
     return ties
 
 
 def fixed_tie(ties: list[Tie]) -> Tie:
-    """The amplitudes that are held at ±1: the largest."""
+    """The amplitudes that are fixed at ±1: the largest."""
     return max(ties, key=lambda tie: tie.value)
 
 
@@ -185,12 +185,12 @@ def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float)
     """
     rows = PER_WAVE * len(waves)
     columns, start, names, units = [], [], [], []
-    held = fixed_tie(ties)
-    offset = _amplitude_column(held, waves)
+    fixed = fixed_tie(ties)
+    offset = _amplitude_column(fixed, waves)
     for tie in ties:
-        if tie is not held and tie.value > 0:
+        if tie is not fixed and tie.value > 0:
             columns.append(_amplitude_column(tie, waves))
-            start.append(tie.value / held.value)
+            start.append(tie.value / fixed.value)
             names.append(tie.name)
             units.append("-")
     for first, both in _by_wave_vector(waves):
@@ -251,10 +251,13 @@ def describe(
     captured: float,
 ) -> tuple[str, ...]:
     """Which waves, what they have in common, and how much of the field they are."""
-    said = [_stars(waves), _energy(selection, captured)]
-    said += _phases(waves)
-    said += [*_amplitudes(waves, ties), _family(family, ties)]
-    return tuple(said)
+    return (
+        _stars(waves),
+        _energy(selection, captured),
+        *_phases(waves),
+        *_amplitudes(waves, ties),
+        _family(family, ties),
+    )
 
 
 def number(count: int, noun: str) -> str:
@@ -278,33 +281,33 @@ def _stars(waves: list[RealWave]) -> str:
 def _energy(selection: Selection, captured: float) -> str:
     text = f"At the start they are {100 * captured:.1f} % of the energy over the material"
     if selection.growth[-1][0] == len(selection.xi):
-        return text + "; no further wave could be told apart from them."
+        return text + "; no further wave could be distinguished from them."
     return text + f"; the next would add {100 * selection.next_gain:.1f} %."
 
 
 def _phases(waves: list[RealWave]) -> list[str]:
     pairs = [w for w in waves if w.shares_k]
-    said = []
+    text = []
     if pairs:
-        said.append(
+        text.append(
             f"In {number(len(pairs), 'wave')} x and y are out of phase; each of these is written "
             "as a wave along x and a wave along y with the same wave vector."
         )
     phases = np.array([w.phase for w in waves])
     if np.all(np.abs(phases) <= SAME_PHASE):
-        said.append("All phases are 0 at the origin: a half turn about it keeps the field.")
+        text.append("All phases are 0 at the origin: a half turn about it keeps the field.")
     elif np.all(np.abs(phases - 0.5) <= SAME_PHASE):
-        said.append("All phases are l/2 at the origin: a half turn about it reverses the field.")
+        text.append("All phases are l/2 at the origin: a half turn about it reverses the field.")
     else:
-        said.append("Phases: " + ", ".join(f"{p:+.2f}" for p in phases) + " l.")
-    return said
+        text.append("Phases: " + ", ".join(f"{p:+.2f}" for p in phases) + " l.")
+    return text
 
 
 def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
-    said = []
+    text = []
     for tie in ties:
         if len(tie.waves) > 1 and tie.value > 0:
-            said.append(
+            text.append(
                 f"The amplitude {_ACROSS[tie.component]} the wave vector is the same in waves "
                 f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
                 f"signs {_signs(tie, waves)}."
@@ -313,8 +316,8 @@ def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
     split |= {w - 1 for w in split}
     zero = [tie.name for tie in ties if tie.value == 0 and not split & set(tie.waves)]
     if zero:
-        said.append(f"Zero within {100 * SAME_AMPLITUDE:.0f} %: {', '.join(zero)}.")
-    return said
+        text.append(f"Zero within {100 * SAME_AMPLITUDE:.0f} %: {', '.join(zero)}.")
+    return text
 
 
 def _signs(tie: Tie, waves: list[RealWave]) -> str:
@@ -332,8 +335,8 @@ def _family(family: ModeFamily, ties: list[Tie]) -> str:
             f"start [{start}]."
         )
     names = f" ({', '.join(free)})" if free else ""
-    held = f"; {fixed_tie(ties).name} is held, since v carries the amplitude" if ties else ""
+    fixed = f"; {fixed_tie(ties).name} is fixed, since v carries the amplitude" if ties else ""
     return (
         f"{number(family.size, 'parameter').capitalize()}: all wave vectors and phases, and "
-        f"{number(len(free), 'amplitude')}{names}{held}."
+        f"{number(len(free), 'amplitude')}{names}{fixed}."
     )

@@ -297,7 +297,7 @@ def upward(xi: FloatArray) -> NDArray[np.bool_]:
 def _checked_field(
     mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Field (n, 2) and lattice (2, 2) as arrays, or an InputError that says what is wrong."""
+    """Field (n, 2) and lattice (2, 2) as arrays, or an InputError."""
     u, vectors = np.asarray(values, dtype=np.float64), np.asarray(lattice, dtype=np.float64)
     if u.shape != mesh.nodes.shape:
         raise InputError(f"periodic field: expected shape {mesh.nodes.shape}, got {u.shape}")

@@ -2,7 +2,7 @@
 
 What the paper does by eye in its Section "Parametrization and Initial Guess of the Patterning
 Modes": find the peaks, take the waves that matter (``waves``), see what they have in common
-(``constraints``), and say it in words. For the (π, π) mode of a square lattice this is Eq. (mode)
+(``constraints``), and describe it. For the (π, π) mode of a square lattice this is Eq. (mode)
 with its seven parameters.
 
 The normalised overlap |∫ u·φ dA| / (‖u‖ ‖φ‖) is 1 for fields that differ by a factor. Both are
@@ -134,8 +134,8 @@ class FoundFamily:
         describe [-].
     growth
         (number of waves, share captured by as many, nothing tied); goes on beyond those taken.
-    sentences
-        What was found, in words.
+    text
+        What was found.
     info
         Plain JSON values of the caller: lattice, material, loading, critical strain.
     """
@@ -145,7 +145,7 @@ class FoundFamily:
     amplitude: float
     captured: float
     growth: tuple[tuple[int, float], ...]
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
     info: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -252,7 +252,7 @@ _CONVENTIONS = {
     "wave": ["A [-]", "B [-]", "kx [-]", "ky [-]", "c [mm]"],
     "parameters": "flattened waves = matrix . parameters + offset",
     "axes": "x to the right, y up, mm; the origin is that of the cell's mesh",
-    "normalisation": "the amplitude held by the family is 1 or -1; amplitude has the field's unit",
+    "normalisation": "the amplitude fixed by the family is 1 or -1; amplitude has the field's unit",
     "captured": "share of the integral of |u|^2 over the material, rigid translation apart",
     "coefficients": "integral over the cell of u exp(-2 pi i xi.x/pitch) dA, u = 0 in the holes",
 }
@@ -291,7 +291,7 @@ def write_family(
         "amplitude": found.amplitude,
         "captured": found.captured,
         "growth": [list(step) for step in found.growth],
-        "text": list(found.sentences),
+        "text": list(found.text),
         "waves": found.waves.tolist(),
         "matrix": family.matrix.tolist(),
         "offset": family.offset.tolist(),

@@ -5,7 +5,7 @@ The square family of modes is (Eq. (mode) of the paper), with θᵢ the argument
     φ = a₁ [−sin θ₁ − sin θ₂] e_x + [sin θ₁ − sin θ₂] e_y
     θ₁ = π/l (a₂ x + a₃ y + a₆)        θ₂ = π/l (a₄ x + a₅ y + a₇)
 
-Only the product v₁φ can be seen, and these changes leave it as it is:
+Only the product v₁φ is observable, and these changes don't change it:
 
 * turning a wave round: (k, c) → (−k, l − c), because sin(π − θ) = sin θ;
 * shifting a phase c by a multiple of 2l;
@@ -183,8 +183,8 @@ class WavePattern:
     start_amplitude
         Amplitude to start v₁φ₁ with: mean amplitude of the waves' y components, with the sign
         that belongs to ``start`` [mm].
-    sentences
-        What was found, in words.
+    text
+        What was found.
     """
 
     waves: tuple[PlaneWave, ...]
@@ -192,7 +192,7 @@ class WavePattern:
     family: str
     start: tuple[float, ...] | None
     start_amplitude: float
-    sentences: tuple[str, ...]
+    text: tuple[str, ...]
 
     @property
     def supported(self) -> bool:
@@ -237,29 +237,29 @@ def _pursued(spectrum: Spectrum, peaks: list[Peak]) -> list[Peak]:
     return chosen
 
 
-def _no_pattern(largest: Peak | None, sentence: str) -> WavePattern:
-    return WavePattern((), largest, "none", None, 0.0, (sentence,))
+def _no_pattern(largest: Peak | None, why: str) -> WavePattern:
+    return WavePattern((), largest, "none", None, 0.0, (why,))
 
 
 def _described(waves: tuple[PlaneWave, ...], largest: Peak, pitch: float) -> WavePattern:
-    """Check the observations behind Eq. (mode), one sentence each."""
+    """Check the observations behind Eq. (mode), one line each."""
     vectors = " and ".join(f"[{w.k[0]:+.3f}, {w.k[1]:+.3f}]" for w in waves)
     count = {1: "One wave", 2: "Two waves"}.get(len(waves), f"{len(waves)} waves")
-    said = [f"{count}, {vectors} π/l; the largest peak is {largest.contrast:.0f} times the median."]
+    text = [f"{count}, {vectors} π/l; the largest peak is {largest.contrast:.0f} times the median."]
     if len(waves) != 2:
-        said.append("Eq. (mode) is not supported: it has two waves.")
-        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(said))
+        text.append("Eq. (mode) is not supported: it has two waves.")
+        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(text))
     checks = (_directions(waves), _equality(waves), _signs(waves, pitch), _standing(waves))
-    said += [sentence for _, sentence in checks]
+    text += [line for _, line in checks]
     if not all(passed for passed, _ in checks):
-        said.append("Eq. (mode) is not supported by these observations.")
-        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(said))
+        text.append("Eq. (mode) is not supported by these observations.")
+        return WavePattern(waves, largest, "unknown", None, 0.0, tuple(text))
     mode, v1 = square_parameters(np.array([w.row for w in waves]), pitch)
     start, sign = mode_equivalent(mode, pitch)
     numbers = ", ".join(f"{value:.2f}" for value in np.round(start, 2) + 0.0)
-    said.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
+    text.append(f"Eq. (mode) is supported: {SQUARE}, start [{numbers}].")
     return WavePattern(
-        waves, largest, SQUARE, tuple(float(v) for v in start), sign * v1, tuple(said)
+        waves, largest, SQUARE, tuple(float(v) for v in start), sign * v1, tuple(text)
     )
 
 

@@ -227,7 +227,7 @@ ON_GRID = 0.1
 """Distance [steps] from a regular grid's points up to which points are taken to lie on them; it
 moves a wave of 10 steps by 6 % of its amplitude at most, at random."""
 FEWEST_A_CELL = 6
-"""Points along a unit cell: fewer, and waves of a cell's length can't be told from longer ones."""
+"""Points along a unit cell: fewer can't distinguish waves of a cell's length from longer ones."""
 MOST_POINTS = 4e7
 """Of the regular grid: more, and a stray point far away is the likelier reason."""
 

@@ -8,19 +8,19 @@ vectors within two such widths (``EDGE_LINE_WIDTHS``) of a whole number in eithe
 left out, unless they stand out against the line itself, which falls off slowly along its length,
 where a wave is a peak (one of the three waves of a hexagonal lattice lies on such a line).
 
-The peak tells where a wave is. Its amplitude and phase can't be read off û alone, because the
+A peak is where a wave is. Its amplitude and phase can't be taken from û alone, because the
 holes couple waves whose vectors differ by whole numbers of 1/l, and the diagonals of the
 square pattern do: a third of one shows up at the other. So all waves are fitted at once, by
 least squares over the material, under a Hann taper that keeps the edges out.
 
-Of a periodic field on a mesh: the spectral density says where waves may be, not how large they
+Of a periodic field on a mesh: the spectral density shows where waves may be, not how large they
 are: the holes couple waves that differ by a vector of the lattice of holes, so a wave shows up at
 each of those (see above). What counts is how much of the field's energy over the material the
 waves explain together, by least squares.
 
 Waves are added as stars: peaks of equal density and wavelength, which a symmetry of the field may
 turn into each other, stay together. The first star is that of the largest peak; from then on the
-star that explains most of what is left is next (orthogonal matching pursuit, Pati, Rezaiifar &
+star that explains most of the rest is next (orthogonal matching pursuit, Pati, Rezaiifar &
 Krishnaprasad, 1993, doi 10.1109/ACSSC.1993.342465).
 """
 
@@ -250,7 +250,7 @@ def _sum_over(spectrum: Spectrum, values: FloatArray, xi: FloatArray) -> Complex
 
 PEAK_SHARE = 0.02
 """Least density of a candidate, of the largest peak's. A wave this weak is 14 % as strong, and
-what a fit over the holes' gaps can't tell from others only makes it ill-conditioned."""
+what a fit over the holes' gaps can't distinguish only makes it ill-conditioned."""
 SAME_DENSITY = 0.02
 """Relative difference of densities that are called equal, 1 % of the amplitude. Symmetric meshes
 reach 1e-7."""

@@ -346,7 +346,7 @@ def _family(found: FoundPattern) -> dict[str, Any]:
         "captured": family.captured,
         "waves": family.waves.tolist(),
         "parameters": family.family.size,
-        "found": list(family.sentences),
+        "found": list(family.text),
         "peaks": [asdict(peak) for peak in found.spectrum.peaks[:_PEAKS]],
     }
 

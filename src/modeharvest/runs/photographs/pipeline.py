@@ -19,7 +19,7 @@ from typing import Any
 
 from modeharvest.idic.local.field import LocalField, read_field, write_field
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
-from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, pulled_back
+from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, warped_back
 from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
@@ -204,7 +204,7 @@ class HarvestRun(StagedRun[PhotographCase]):
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            record = _StartRecord("", measured.fixed, measured.sentences)
+            record = _StartRecord("", measured.fixed, measured.text)
             write_json(start, to_plain(record))
             return result, field, start
 
@@ -231,7 +231,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         reference, mask = prepared.image(), prepared.mask()
         if self.case.correlation.formulation == "updated" and before is not None:
             result = found[before].result
-            reference, inside = pulled_back(prepared.image(before), result, result.order)
+            reference, inside = warped_back(prepared.image(before), result, result.order)
             mask = mask & inside
         return ImagePair(reference, prepared.image(name), prepared.grid, mask, prepared.mask(name))
 

@@ -330,7 +330,7 @@ class _Maker:
         else:
             material = find_material(photograph.image, self._options)
             mask = material.mask
-            self.text += [s for s in material.sentences if s not in self.text]
+            self.text += [s for s in material.text if s not in self.text]
         image, shown = photograph.image, mask
         if self._distortion is not None:
             image, shown = (

@@ -348,7 +348,7 @@ def gather_harvest(
         calibration=optics.calibration,
         distortion=optics.distortion,
         full_scale=float(prepared.info["full_scale"]),
-        text=(*prepared.info["notes"], *geometry.region.sentences),
+        text=(*prepared.info["notes"], *geometry.region.text),
         truth=truth,
         command=f"modeharvest harvest {source} --out {folder}",
         toml=path.read_text("utf-8") if path.is_file() else "",
@@ -395,7 +395,7 @@ def _frame(
         pattern=pattern,
         parts=_parts(measured, geometry, cell),
         local=measured.local if case.local.code != "none" else None,
-        start_text=tuple(s for s in measured.sentences if s not in pattern.sentences),
+        start_text=tuple(s for s in measured.text if s not in pattern.text),
         warnings=found.warnings,
     )
 

@@ -215,7 +215,7 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         },
         "local": _local(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
-        "pattern_reading": () if frame.pattern is None else frame.pattern.sentences,
+        "pattern_reading": () if frame.pattern is None else frame.pattern.text,
         "start": frame.start_text,
         "warnings": (*_frame_warnings(frame), *frame.warnings),
     }  # fmt: skip
@@ -280,7 +280,7 @@ def _lattice(harvest: Harvest) -> dict[str, Any] | None:
         "vectors_px": lattice.vectors,
         "origin_px": lattice.origin,
         "rotation_deg": lattice.rotation_deg,
-        "text": lattice.sentences,
+        "text": lattice.text,
     }
 
 
