@@ -18,7 +18,8 @@ NUMBERS = {"numpy", "scipy", "h5py", "numba", "pydantic"}
 DRAWING = {"matplotlib", "jinja2", "typer"}  # rich comes with meshio
 EXPERIMENTS = ("Experiment", "Ogden", "Specimen")
 MEASURED = (
-    "Ansatz", "ImagePair", "ImagingSpec", "Result", "Solution", "correlate", "make_images", "run",
+    "Ansatz", "ImagePair", "ImagingSpec", "Result", "Solution", "best_fit", "correlate",
+    "harvest", "make_images", "run", "score",
 )  # fmt: skip
 
 

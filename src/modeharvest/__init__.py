@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.fem.simulate import simulate
     from modeharvest.fem.specimen import Specimen
     from modeharvest.idic.ansatz import Ansatz
-    from modeharvest.idic.correlate import correlate
+    from modeharvest.idic.correlate import best_fit, correlate
     from modeharvest.idic.result import Result
     from modeharvest.imaging.imageset import make_images
     from modeharvest.imaging.pair import ImagePair
@@ -44,6 +44,7 @@ __all__ = [
     "Solution",
     "Specimen",
     "__version__",
+    "best_fit",
     "correlate",
     "harvest",
     "make_images",
@@ -61,6 +62,7 @@ _HOMES = {
     "Result": "idic.result",
     "Solution": "fem.field",
     "Specimen": "fem.specimen",
+    "best_fit": "idic.correlate",
     "correlate": "idic.correlate",
     "harvest": "runs.photographs.pipeline",
     "make_images": "imaging.imageset",

@@ -11,13 +11,19 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_args, get_type_hints
-
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 from modeharvest.util.errors import InputError
 
-CHECKS = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
+if TYPE_CHECKING:
+    from pydantic import ConfigDict, ValidationError
+
+CHECKS: ConfigDict = {
+    "extra": "forbid",
+    "frozen": True,
+    "arbitrary_types_allowed": True,
+    "allow_inf_nan": False,
+}
 """No unknown keys, no infinite numbers; nested dataclasses have the same rules."""
 
 _LARGEST = 1e15
@@ -34,6 +40,8 @@ def made(kind: type[T], values: object) -> T:
         If a key is unknown (the nearest known one is suggested) or missing, or a value is of
         another type or out of its range; the place is named as ``table.key``.
     """
+    from pydantic import TypeAdapter, ValidationError  # here: a fifth of a second
+
     try:
         (thing,) = TypeAdapter(tuple[kind], config=CHECKS).validate_python((values,))  # type: ignore[valid-type]
     except ValidationError as error:

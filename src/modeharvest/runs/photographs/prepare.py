@@ -49,7 +49,7 @@ from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.typed import made
+from modeharvest.util.typed import made, to_plain
 
 PREPARED_FILE = "prepared.json"
 
@@ -61,42 +61,35 @@ class PreparedPhotographs:
     Parameters
     ----------
     folder
-        Where they are.
-    info
-        The content of ``prepared.json``.
+        Where they are; its ``prepared.json`` has the rest.
+    names
+        Of the deformed images that can be used, in the order of the test.
+    skipped
+        Name of each file that can't be used, and why.
+    noise
+        The camera's.
+    grid
+        The ideal pixels; the physical origin is the middle of the image.
+    full_scale
+        Largest grey level of the camera.
+    notes
+        What was done to the photographs.
     """
 
     folder: Path
-    info: dict[str, Any]
+    names: tuple[str, ...]
+    skipped: tuple[tuple[str, str], ...]
+    noise: CameraNoise
+    grid: PixelGrid
+    full_scale: float
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> PreparedPhotographs:
         """Open a finished folder; raises InputError if it isn't one."""
         path = folder / PREPARED_FILE
         with reading(path, "prepared photographs", "remove it, and harvest again"):
-            found = cls(folder, dict(read_json(path)))
-            _ = found.names, found.skipped, found.noise, found.grid
-            return found
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the deformed images that can be used, in the order of the test."""
-        return tuple(map(str, self.info["names"]))
-
-    @property
-    def skipped(self) -> tuple[tuple[str, str], ...]:
-        """Name of each file that can't be used, and why."""
-        return tuple((name, reason) for name, reason in self.info["skipped"])
-
-    @property
-    def noise(self) -> CameraNoise:
-        """The camera's."""
-        return made(CameraNoise, self.info["noise"])
-
-    @property
-    def grid(self) -> PixelGrid:
-        """The ideal pixels; the physical origin is the middle of the image."""
-        return made(PixelGrid, self.info["grid"])
+            return made(cls, {**dict(read_json(path)), "folder": folder})
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -301,16 +294,19 @@ def prepare(
         )
     rows, cols = reference.shape
     grid = PixelGrid.centred(rows, cols, case.scale.mm_per_px)
-    info = {
-        "names": names,
-        "skipped": skipped,
-        "noise": vars(_noise(case, reference, mask)),
-        "grid": vars(grid),
-        "full_scale": reference.full_scale,
-        "notes": notes,
-    }
-    write_json(folder / PREPARED_FILE, info)
-    return PreparedPhotographs(folder, info)
+    prepared = PreparedPhotographs(
+        folder,
+        tuple(names),
+        tuple(skipped),
+        _noise(case, reference, mask),
+        grid,
+        float(reference.full_scale),
+        tuple(notes),
+    )
+    content = to_plain(prepared)
+    del content["folder"]
+    write_json(folder / PREPARED_FILE, content)
+    return prepared
 
 
 class _Maker:
