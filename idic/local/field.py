@@ -40,7 +40,7 @@ class LocalField:
     sd
         (n, 2) standard deviations of u [mm]; None if not known.
     source
-        Where the field comes from, in a few words.
+        Where the field comes from.
     """
 
     x: FloatArray

@@ -91,7 +91,7 @@ def degree_for(count: int, most: int) -> int:
 def fit_unknowns(
     ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int
 ) -> RobustFit:
-    """Fit v0, and every v_i, to displacements at points; the modes stay as they are.
+    """Fit v0, and every v_i, to displacements at points; the modes are fixed.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def fit_unknowns(
     free = _low_orders(ansatz, v0_degree, v_degree)
     if 2 * len(points) < free.size:
         raise InputError(
-            f"automatic start: expected at least {-(-free.size // 2)} points, got {len(points)}"
+            f"initial guess: expected at least {-(-free.size // 2)} points, got {len(points)}"
         )
     columns = ansatz.sensitivities(a, points[:, None, 0], points[:, None, 1])[..., free]
     a[free] = 0.0
@@ -198,13 +198,13 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
 def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> FloatArray | None:
     """Affine motion that takes one outline to the other, by centre and second moments.
 
-    The holes are filled, so that it doesn't matter how they close. A rotation or a shear can't be
-    seen in these moments and is taken to be none.
+    The holes are filled, so that it doesn't matter how they close. A rotation or a shear isn't
+    observable in these moments and is taken to be none.
 
     Returns
     -------
     (2, 3) u_i = affine[i] · (1, x, y) [mm], [-], [-]; None if material reaches the image's border,
-    where an outline says nothing.
+    where an outline is unknown.
     """
     moments = []
     for inside in (mask, deformed_mask):
@@ -270,7 +270,7 @@ def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
     keep = (level.mask & inside)[row, col]
     if not keep.any():
         raise InputError(
-            "automatic start: expected the two images to overlap, but the known part of the motion "
+            "initial guess: expected the two images to overlap, but the known part of the motion "
             "leads out of the deformed image everywhere; check the hole centres and the masks"
         )
     row, col = row[keep], col[keep]

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import center_of_mass, label
 from scipy.spatial import Delaunay, KDTree
 
-from modeharvest.util.arrays import FloatArray, IntArray
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
 _MUCH_SMALLER = 0.25
@@ -137,11 +137,7 @@ def spanning_vectors(spots: FloatArray) -> FloatArray | None:
 
 
 def _sine(a: FloatArray, b: FloatArray) -> float:
-    return abs(float(_cross(a, b))) / float(np.linalg.norm(a) * np.linalg.norm(b))
-
-
-def _cross(a: FloatArray, b: FloatArray) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
+    return abs(float(a[0] * b[1] - a[1] * b[0])) / float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
 def _reduced(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -290,7 +286,6 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
     pitch = float(np.linalg.norm(vectors, axis=1).mean())
     if misfit > _BENT * pitch:
         raise _no_lattice(len(holes), f"they are {misfit:.0f} px off one of {pitch:.0f} px")
-    kind = _kind(vectors)
     found = HoleLattice(
         centres=holes.centres[known],
         index=index[known],
@@ -300,7 +295,7 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
         missing=_missing(index[known]),
         extra=holes.centres[~known],
         misfit_px=misfit,
-        kind=kind,
+        kind=_kind(vectors),
         text=(),
     )
     if cell_px is not None:
@@ -319,7 +314,7 @@ def require_cell_size(lattice: HoleLattice, cell_px: float) -> None:
         )
 
 
-def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, BoolArray]:
     """(index from 0, known): count from neighbour to neighbour, in the largest connected part."""
     steps = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
     tree, reach = KDTree(spots), _NEAR * float(np.linalg.norm(vectors, axis=1).min())
@@ -340,7 +335,7 @@ def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, NDArray[
 
 
 def _connected(
-    start: int, there: IntArray, exists: NDArray[np.bool_], steps: IntArray
+    start: int, there: IntArray, exists: BoolArray, steps: IntArray
 ) -> dict[int, tuple[int, int]]:
     """Index of every hole that can be reached from one."""
     index, queue = {start: (0, 0)}, deque([start])

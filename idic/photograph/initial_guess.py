@@ -192,7 +192,7 @@ def initial_guess(
         modes = [InitialMode(fixed_square(cells), 0.0, boxes[0])]
         text.append(
             "The mode is fixed at the square pattern that the lattice of holes allows: without a "
-            "pattern, its parameters can't be seen."
+            "pattern, its parameters aren't observable."
         )
     elif fixed:
         text.append("The lattice of holes isn't square, and what it allows not known: v0 alone.")
@@ -227,7 +227,7 @@ def require_cell_size(pattern: WavePattern, cell_size: float) -> None:
     if abs(found - cell_size) > WRONG_CELL * cell_size:
         xi = 0.5 * float(k.mean())
         raise InputError(
-            f"automatic start: expected the spectrum's peaks at ξ = (±0.50, ±0.50) for a cell of "
+            f"initial guess: expected the spectrum's peaks at ξ = (±0.50, ±0.50) for a cell of "
             f"{cell_size:g} mm, got (±{xi:.2f}, ±{xi:.2f}), which belong to a cell of {found:.3g} "
             f"mm; give that cell size, or the lattice of the holes if the pattern isn't theirs"
         )

@@ -39,8 +39,6 @@ class HoleMotion:
 
     Parameters
     ----------
-    index
-        (n, 2) their (i, j) in the reference's lattice.
     before, after
         (n, 2) centres in the reference and in the deformed image, (row, col) [px].
     rivals
@@ -49,14 +47,13 @@ class HoleMotion:
         What was matched.
     """
 
-    index: IntArray
     before: FloatArray
     after: FloatArray
     rivals: int
     text: tuple[str, ...]
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.before)
 
     def in_mm(self, grid: PixelGrid) -> LocalField:
         """The centres in the reference and their displacements."""
@@ -90,14 +87,13 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
         (int(a[0] - b[0]), int(a[1] - b[1])) for a, b in product(reference.index, index)
     )
     most = max(steps.values())
+    rivals = sum(count == most for count in steps.values()) - 1
     motions = [
-        (count, _motion_by(reference, deformed, index + step))
+        _motion(reference, deformed, index + step, rivals)
         for step, count in steps.items()
         if count >= _RIVAL * most
     ]
-    motions.sort(key=lambda found: (-found[0], _length(found[1])))
-    rivals = sum(count == most for count, _ in motions) - 1
-    return tuple(_with_text(motion, reference, deformed, rivals) for _, motion in motions)
+    return tuple(sorted(motions, key=lambda motion: (-len(motion), _length(motion))))
 
 
 def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
@@ -124,7 +120,10 @@ def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
     return np.asarray(deformed.index @ back)
 
 
-def _motion_by(reference: HoleLattice, deformed: HoleLattice, index: IntArray) -> HoleMotion:
+def _motion(
+    reference: HoleLattice, deformed: HoleLattice, index: IntArray, rivals: int
+) -> HoleMotion:
+    """The holes matched where the deformed ones have these indices in the reference's lattice."""
     place = {(int(i), int(j)): k for k, (i, j) in enumerate(index)}
     pairs = [
         (n, place[key])
@@ -132,21 +131,10 @@ def _motion_by(reference: HoleLattice, deformed: HoleLattice, index: IntArray) -
         if (key := (int(i), int(j))) in place
     ]
     first, second = np.array(pairs).T
-    return HoleMotion(
-        reference.index[first], reference.centres[first], deformed.centres[second], 0, ()
-    )
-
-
-def _length(motion: HoleMotion) -> float:
-    return float(np.linalg.norm((motion.after - motion.before).mean(axis=0)))
-
-
-def _with_text(
-    motion: HoleMotion, reference: HoleLattice, deformed: HoleLattice, rivals: int
-) -> HoleMotion:
-    moved = np.linalg.norm(motion.after - motion.before, axis=1)
+    before, after = reference.centres[first], deformed.centres[second]
+    moved = np.linalg.norm(after - before, axis=1)
     text = [
-        f"{len(motion)} holes were found in both images, of {len(reference)} in the reference and "
+        f"{len(pairs)} holes were found in both images, of {len(reference)} in the reference and "
         f"{len(deformed)} in the deformed one; they moved by {moved.min():.0f} to "
         f"{moved.max():.0f} px."
     ]
@@ -155,7 +143,11 @@ def _with_text(
             f"{rivals + 1} ways to lay one lattice on the other match as many holes; the one with "
             "the shortest mean displacement comes first."
         )
-    return HoleMotion(motion.index, motion.before, motion.after, rivals, tuple(text))
+    return HoleMotion(before, after, rivals, tuple(text))
+
+
+def _length(motion: HoleMotion) -> float:
+    return float(np.linalg.norm((motion.after - motion.before).mean(axis=0)))
 
 
 Expected = Callable[[FloatArray], FloatArray]

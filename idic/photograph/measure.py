@@ -155,8 +155,8 @@ def measure(
         again, there = _with_brightness(before.result, how)
         found = correlate(pair, again, guess=there, options=options, progress=progress)
         if found.outcome is Outcome.CONVERGED:
-            words = "The correlation started from the result of the photograph before."
-            return _measured(found, guess.local, before.fixed, (*text, words))
+            text = (*text, "The correlation started from the result of the photograph before.")
+            return _measured(found, guess.local, before.fixed, text)
     found = correlate(pair, ansatz, guess=unknowns, options=options, progress=progress)
     return _measured(found, guess.local, fixed, text)
 
@@ -238,7 +238,7 @@ def warped_back(
 
     Returns
     -------
-    image, seen
+    image, inside
         (rows, cols) (1 + b) g(x + u) + c, and where x + u lies inside the image.
     """
     grid, ansatz, a = result.grid, result.ansatz, result.unknowns
@@ -252,6 +252,6 @@ def warped_back(
         value, _, _ = spline.sample(row - u[..., 1], col + u[..., 0])
         gain, offset = ansatz.gain_and_offset(a, grid.x, grid.y[band])
         image[band] = gain * value + offset
-    seen = np.isfinite(image)
-    image[~seen] = 0.0
-    return image, seen
+    inside = np.isfinite(image)
+    image[~inside] = 0.0
+    return image, inside

@@ -283,7 +283,7 @@ class Cells:
     ) -> Cells:
         """Take what is given, and the rest from the mask; raises InputError if they differ."""
         if not cell_size > 0:
-            raise InputError(f"automatic start: expected a positive cell size, got {cell_size} mm")
+            raise InputError(f"initial guess: expected a positive cell size, got {cell_size} mm")
         vectors = lattice_vectors(cell_size, lattice)
         centres = np.zeros((0, 2)) if holes is None else np.column_stack([holes.x, holes.y])
         if holes is None and pair.mask is not None and not pair.mask.all():
@@ -318,13 +318,13 @@ def hole_centres(pair: ImagePair, boxes: Sequence[Box], cell_size: float) -> Flo
 
 
 def require_hole_distance(centres: FloatArray, cell_size: float) -> None:
-    """Raise InputError if neighbouring holes are not a cell size apart; few holes say nothing."""
+    """Raise InputError if neighbouring holes are not a cell size apart; not of too few holes."""
     if len(centres) < _FEWEST_HOLES:
         return
     apart = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
     if abs(apart - cell_size) > WRONG_CELL * cell_size:
         raise InputError(
-            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got "
+            f"initial guess: expected holes {cell_size:g} mm apart, the cell size given, got "
             f"{apart:.3g} mm between neighbours of {len(centres)} holes; give cell size "
             f"{apart:.3g} mm, or check the pixel size"
         )
@@ -351,14 +351,14 @@ def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     vectors = np.asarray(lattice, dtype=np.float64)
     if vectors.shape != (2, 2) or not abs(np.linalg.det(vectors)) > 1e-6 * np.sum(vectors**2):
         raise InputError(
-            f"automatic start: expected two lattice vectors [mm] as rows, got {vectors.tolist()}"
+            f"initial guess: expected two lattice vectors [mm] as rows, got {vectors.tolist()}"
         )
     i = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
     lengths = np.linalg.norm(i[np.any(i != 0, axis=1)] @ vectors, axis=1)
     shortest = float(lengths.min())
     if abs(shortest - cell_size) > WRONG_CELL * cell_size:
         raise InputError(
-            f"automatic start: expected holes {cell_size:g} mm apart, the cell size given, got a "
+            f"initial guess: expected holes {cell_size:g} mm apart, the cell size given, got a "
             f"lattice of holes {shortest:.3g} mm apart; give cell size {shortest:.3g} mm, or check "
             "the pixel size"
         )
