@@ -7,12 +7,12 @@ mask image; modes live there. The domain of v0 is the whole specimen as far as t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import find_objects, label
-from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial import KDTree
 from skimage.draw import polygon2mask
 
 from modeharvest.idic.local.field import LocalField
@@ -40,24 +40,13 @@ class Region:
         Smallest axis-parallel box around the cellular part [mm].
     domain
         Box around all material in the image [mm].
-    polygon
-        (n, 2) outline of the cellular part, (row, col) [px].
-    margins
-        Width of the bulk beside ``cellular`` [mm]: left, right, bottom, top; NaN where the
-        specimen leaves the image, so that it is not known.
     text
         Where the region comes from, and what is odd about it.
     """
 
     cellular: Box
     domain: Box
-    polygon: FloatArray
-    margins: tuple[float, float, float, float]
     text: tuple[str, ...]
-
-    def inside(self, grid: PixelGrid) -> BoolArray:
-        """(rows, cols) True on the pixels within the polygon."""
-        return _filled(self.polygon, grid.shape)
 
 
 def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -74,15 +63,11 @@ def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) ->
     """
     reach = 0.5 * np.abs(lattice.vectors).max(axis=0)  # rows and columns of a cell
     low, high = lattice.centres.min(axis=0) - reach, lattice.centres.max(axis=0) + reach
-    steps = 0.5 * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) @ lattice.vectors
-    corners = (lattice.centres[:, None] + steps).reshape(-1, 2)
-    polygon = corners[ConvexHull(corners).vertices]
     text = (
         f"The cellular part is the cells of {len(lattice)} holes on a {lattice.kind} lattice of "
         f"{lattice.pitch_px * grid.pixel_size:.4g} mm."
     )
-    box = _box(low, high, grid)
-    return _region(box, polygon, mask, grid, (text,))
+    return _region(_box(low, high, grid), mask, grid, [text])
 
 
 def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -114,12 +99,12 @@ def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> R
             f"expected a polygon inside the image of {grid.rows} x {grid.cols} px, got corners "
             f"from {corners.min(axis=0).tolist()} to {corners.max(axis=0).tolist()} (row, col)"
         )
-    inside = _filled(corners, grid.shape)
+    inside = np.asarray(polygon2mask(grid.shape, corners))  # type: ignore[no-untyped-call]
     _require_material(inside, np.asarray(mask, dtype=np.bool_), "polygon")
-    box = _box(corners.min(axis=0), corners.max(axis=0), grid)
+    low, high = corners.min(axis=0), corners.max(axis=0)
     text = [f"The cellular part is a polygon of {len(corners)} corners, as given."]
-    text += _unlike_box(inside, corners.min(axis=0), corners.max(axis=0))
-    return _region(box, corners, mask, grid, tuple(text))
+    text += _unlike_box(inside, low, high)
+    return _region(_box(low, high, grid), mask, grid, text)
 
 
 def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
@@ -146,10 +131,11 @@ def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Regio
             f"images, got shape {inside.shape}"
         )
     _require_material(inside, np.asarray(mask, dtype=np.bool_), "mask of the cellular part")
-    pixels = np.argwhere(inside).astype(np.float64)
     low, high = _bounds(inside)
+    if min(high - low) < 2.0:
+        raise InputError("expected a cellular part with an area, got pixels that lie in one line")
     text = ["The cellular part is a mask image, as given.", *_unlike_box(inside, low, high)]
-    return _region(_box(low, high, grid), _hull(pixels), mask, grid, tuple(text))
+    return _region(_box(low, high, grid), mask, grid, text)
 
 
 def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
@@ -158,17 +144,13 @@ def junction(lattice: HoleLattice, grid: PixelGrid) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def _region(
-    box: Box, polygon: FloatArray, mask: ArrayLike, grid: PixelGrid, text: tuple[str, ...]
-) -> Region:
+def _region(box: Box, mask: ArrayLike, grid: PixelGrid, text: list[str]) -> Region:
     low, high = _bounds(_largest_part(np.asarray(mask, dtype=np.bool_)))
     domain = _box(low, high, grid)
     cut = (low[1] < 0.5, high[1] > grid.cols - 1.5, high[0] > grid.rows - 1.5, low[0] < 0.5)
-    widths = np.abs(np.subtract(astuple(box), astuple(domain)))
-    left, right, bottom, top = np.where(cut, np.nan, widths)
     if any(cut):
         sides = ", ".join(side for side, outside in zip(SIDES, cut, strict=True) if outside)
-        text = (*text, f"The specimen leaves the image at the {sides}.")
+        text = [*text, f"The specimen leaves the image at the {sides}."]
     # Half a cell of rounding or of a crooked edge must not make the domain the smaller one.
     domain = Box(
         min(box.x_min, domain.x_min),
@@ -176,7 +158,7 @@ def _region(
         min(box.y_min, domain.y_min),
         max(box.y_max, domain.y_max),
     )
-    return Region(box, domain, polygon, (left, right, bottom, top), text)
+    return Region(box, domain, tuple(text))
 
 
 def box_of(mask: BoolArray, grid: PixelGrid) -> Box:
@@ -207,21 +189,6 @@ def _box(low: FloatArray, high: FloatArray, grid: PixelGrid) -> Box:
     """The box [mm] between two (row, col) [px]."""
     (left, right), (top, bottom) = grid.to_mm([low[0], high[0]], [low[1], high[1]])
     return Box(float(left), float(right), float(bottom), float(top))
-
-
-def _filled(polygon: FloatArray, shape: tuple[int, int]) -> BoolArray:
-    inside = polygon2mask(shape, polygon)  # type: ignore[no-untyped-call]
-    return np.asarray(inside, dtype=np.bool_)
-
-
-def _hull(pixels: FloatArray) -> FloatArray:
-    try:
-        corners = ConvexHull(pixels)
-    except Exception as error:  # Qhull: all pixels in one line
-        raise InputError(
-            "expected a cellular part with an area, got pixels that lie in one line"
-        ) from error
-    return np.asarray(pixels[corners.vertices])
 
 
 def _require_material(inside: BoolArray, mask: BoolArray, what: str) -> None:
