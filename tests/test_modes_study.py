@@ -24,7 +24,12 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies import modes as modes_specimen
 from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
-from modeharvest.validation.studies.modes import MeasuredModesStudy, likeness, one_specimen
+from modeharvest.validation.studies.modes import (
+    MeasuredModesStudy,
+    ModesAnalysis,
+    likeness,
+    one_specimen,
+)
 from modeharvest.validation.studies.modes_specimen import (
     LatticeMode,
     PatternCells,
@@ -169,7 +174,14 @@ def test_the_size_of_the_cells_changes_nothing(measured: tuple[Any, ...]) -> Non
         assert large[f"{name}_sd_model_error"] == pytest.approx(
             base[f"{name}_sd_model_error"], rel=1e-3
         )
-    for name in ("w_px", "best_px", "lost_px", "overlap_truth", "overlap_lattice", "amplitude"):
+    for name in (
+        "w_px",
+        "model_error_px",
+        "measurement_error_px",
+        "overlap_truth",
+        "overlap_lattice",
+        "amplitude",
+    ):
         assert large[name] == pytest.approx(base[name], rel=1e-4), name
 
 
@@ -177,7 +189,8 @@ def test_what_is_measured_of_the_paper_s_specimen(measured: tuple[Any, ...]) -> 
     """The best fit is the best; parameters lie within their error bars of its."""
     _, table, _ = measured
     base = table.iloc[0]
-    assert base["best_px"] < base["w_px"] < base["best_px"] + base["lost_px"]
+    assert base["model_error_px"] < base["w_px"]
+    assert base["w_px"] < base["model_error_px"] + base["measurement_error_px"]
     assert base["overlap_truth"] < base["best_overlap_truth"] < 1.0
     apart = [(base[n] - base[f"best_{n}"]) / base[f"{n}_sd_model_error"]
              for n in modes_specimen.PARAMETERS]  # fmt: skip
@@ -207,7 +220,7 @@ def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "local_minimum"
-    said = " ".join(modes_findings(odd, folder, "seed 0").sentences)
+    said = " ".join(modes_findings(ModesAnalysis.of(odd), folder, "seed 0").sentences)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said

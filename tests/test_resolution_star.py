@@ -12,6 +12,7 @@ from html_page import Page
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from polynomial_fits import polynomial_transfer
 from scipy import ndimage
 
 from modeharvest.cli import root
@@ -33,7 +34,6 @@ from modeharvest.validation.resolution.star import (
 )
 from modeharvest.validation.resolution.transfer import (
     finest_period,
-    polynomial_transfer,
     savitzky_golay,
     subset_noise,
     subset_transfer,

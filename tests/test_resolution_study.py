@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
+from polynomial_fits import polynomial_transfer
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
@@ -17,7 +18,7 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
-from modeharvest.report import study_resolution as told
+from modeharvest.report.study_resolution import measured_waves, noise_floors, resolution_findings
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.validation.resolution.buckled import (
@@ -26,18 +27,18 @@ from modeharvest.validation.resolution.buckled import (
     BuckledMotion,
     ResolutionSpec,
 )
-from modeharvest.validation.resolution.transfer import TangentFit, polynomial_transfer, wave_share
-from modeharvest.validation.resolution.waves import (
+from modeharvest.validation.resolution.transfer import (
     AXES,
     QUANTITIES,
     WAVED,
     Passband,
+    TangentFit,
     TransferCurves,
+    wave_share,
 )
 from modeharvest.validation.studies.resolution import (
+    ResolutionAnalysis,
     ResolutionStudy,
-    measured_waves,
-    noise_floors,
     one_case,
 )
 from modeharvest.validation.studies.study import ImagePairSpec as Experiment
@@ -196,16 +197,16 @@ def test_images_give_what_best_fits_promise(
 def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: ResolutionSpec) -> None:
     floors = noise_floors(table, subject)
     assert len(floors) == 2 * len(QUANTITIES)
-    z = (floors["Monte Carlo / told"] - 1.0) / floors["±"]
+    z = (floors["Monte Carlo / predicted"] - 1.0) / floors["±"]
     # Twelve realisations: Student's t, and eight numbers that hang together.
     assert z.abs().max() < 5.0
-    assert floors["Monte Carlo / told"].mean() == pytest.approx(1.0, abs=0.1)
+    assert floors["Monte Carlo / predicted"].mean() == pytest.approx(1.0, abs=0.1)
 
 
 def test_findings_of_a_resolution_study(
     table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
 ) -> None:
-    found = told.resolution_findings(table, subject, curves, "seed 0")
+    found = resolution_findings(ResolutionAnalysis.of(table, subject, curves), "seed 0")
     degrees = found.numbers["degrees"]
     finest = [d["finest_px"]["v0 x"] for d in degrees]
     floor = [d["floor_px"]["v0"] for d in degrees]

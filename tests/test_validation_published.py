@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from modeharvest.validation.summary import expectations
 
 
-def snapshot(strain: float, **changes: Any) -> dict[str, Any]:
+def snapshot(strain: float, **changes: Any) -> SimpleNamespace:
     sound = {
         "nominal_strain": strain,
         "negative_pivots": 0,
@@ -18,19 +19,19 @@ def snapshot(strain: float, **changes: Any) -> dict[str, Any]:
         "pattern_corners_px": 2.0,
         "rms_best_fit_px": 1.9,
         "rms_idic_to_best_fit_px": 0.24,
-        "details_px": {"idic_to_best_fit": {"rms_length": 0.34}},
+        "details_px": {"idic_to_best_fit": SimpleNamespace(rms_length=0.34)},
         "mode_deviation_percent": [0.1, -1.5, 0, 0, 0, 0.3, 0],
     }
-    return sound | changes
+    return SimpleNamespace(**sound | changes)
 
 
-def summary(before: dict[str, Any], after: dict[str, Any], **changes: Any) -> dict[str, Any]:
+def summary(before: SimpleNamespace, after: SimpleNamespace, **changes: Any) -> Any:
     whole = {
         "critical_strain": 0.0963,
         "inverse_map_max_residual_px": 1e-12,
         "snapshots": [before, after],
     }
-    return whole | changes
+    return SimpleNamespace(**whole | changes)
 
 
 SOUND = summary(snapshot(0.078), snapshot(0.128))
@@ -38,8 +39,8 @@ SOUND = summary(snapshot(0.078), snapshot(0.128))
 
 def test_sound_run_meets_everything() -> None:
     rows = expectations(SOUND)
-    assert all(row["ok"] for row in rows)
-    assert all(row["source"] and row["expected"] for row in rows)
+    assert all(row.ok for row in rows)
+    assert all(row.source and row.expected for row in rows)
     # Critical strain, residual; two before and six after buckling.
     assert len(rows) == 10
 
@@ -57,7 +58,7 @@ def test_sound_run_meets_everything() -> None:
         (
             summary(
                 snapshot(0.078),
-                snapshot(0.128, details_px={"idic_to_best_fit": {"rms_length": 0.36}}),
+                snapshot(0.128, details_px={"idic_to_best_fit": SimpleNamespace(rms_length=0.36)}),
             ),
             "vector's length",
         ),
@@ -67,12 +68,12 @@ def test_sound_run_meets_everything() -> None:
         ),
     ],
 )
-def test_one_wrong_number_fails_one_verdict(bad: dict[str, Any], words: str) -> None:
-    failed = [row["quantity"] for row in expectations(bad) if not row["ok"]]
+def test_one_wrong_number_fails_one_verdict(bad: Any, words: str) -> None:
+    failed = [row.quantity for row in expectations(bad) if not row.ok]
     assert len(failed) == 1
     assert words in failed[0]
 
 
 def test_run_without_a_critical_point_claims_nothing_about_it() -> None:
-    rows = expectations(SOUND | {"critical_strain": None})
-    assert not any("critical" in row["quantity"] for row in rows)
+    rows = expectations(summary(*SOUND.snapshots, critical_strain=None))
+    assert not any("critical" in row.quantity for row in rows)

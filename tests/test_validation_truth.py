@@ -22,7 +22,7 @@ from modeharvest.idic.correlate import best_fit, fit_displacement
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import Truth
 from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.validation.truth import Comparison, describe, pattern_size
+from modeharvest.validation.truth import Comparison, VectorStatistics, pattern_size
 
 GRID = PixelGrid.centred(150, 130, 0.02)
 # The body that `manufactured.one_mode` is made for: a cellular part of 2.0 x 2.4 mm, l = 1 mm.
@@ -88,11 +88,11 @@ def test_rms_is_per_component_and_the_length_is_root_two_of_it() -> None:
     field[0, 0] = np.nan
     mask = np.ones((4, 5), dtype=bool)
     mask[0, 0] = False
-    found = describe(field, mask, unit=0.5)
-    assert found["mean"] == [6.0, -8.0]
-    assert found["rms"] == [6.0, 8.0]
-    assert found["rms_length"] == found["max_length"] == found["median_length"] == 10.0
-    assert found["rms_per_component"] == pytest.approx(10 / math.sqrt(2))
+    found = VectorStatistics.of(field, mask, unit=0.5)
+    assert found.mean == (6.0, -8.0)
+    assert found.rms == (6.0, 8.0)
+    assert found.rms_length == found.max_length == found.median_length == 10.0
+    assert found.rms_per_component == pytest.approx(10 / math.sqrt(2))
 
 
 def test_error_of_measurement_is_the_step_that_was_made(comparison: Comparison) -> None:
@@ -110,20 +110,20 @@ def test_parts_add_up_to_w(comparison: Comparison) -> None:
 def test_best_fit_leaves_what_the_ansatz_cannot_say(comparison: Comparison) -> None:
     """Nothing of the same ansatz is nearer to the truth, nor can it follow the fluctuation."""
     mask, best = comparison.mask, comparison.best
-    left = describe(comparison.best_error, mask)["rms_per_component"]
-    fluctuation = describe(beyond_the_ansatz(), mask)["rms_per_component"]
+    left = VectorStatistics.of(comparison.best_error, mask).rms_per_component
+    fluctuation = VectorStatistics.of(beyond_the_ansatz(), mask).rms_per_component
     assert 0.8 * fluctuation < left <= fluctuation
     rng = np.random.default_rng(1)
     for _ in range(5):
         other = best.unknowns + 1e-3 * rng.normal(size=best.unknowns.size)
         error = comparison.displacement - best.ansatz.displacement(other, GRID.x, GRID.y)
-        assert describe(error, mask)["rms_per_component"] > left
+        assert VectorStatistics.of(error, mask).rms_per_component > left
 
 
 def test_pythagoras_of_the_errors(comparison: Comparison) -> None:
     """A uniform step lies in the ansatz, so what the best fit leaves is orthogonal to it."""
     w, model, loss = (
-        describe(part, comparison.mask)["rms_per_component"]
+        VectorStatistics.of(part, comparison.mask).rms_per_component
         for part in (comparison.w, comparison.best_error, comparison.idic_to_best)
     )
     # The fit stops at steps of 1e-4 px = 2e-6 mm, 1e-3 of the step made here.

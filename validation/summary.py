@@ -1,49 +1,10 @@
-"""The numbers of a validated virtual experiment: the content of its ``summary.json``.
-
-Keys of ``summary.json`` (rms is per component, see :mod:`modeharvest.validation.truth`):
-
-``title``, ``case``
-    What was run.
-``critical_strain``, ``critical``
-    Critical nominal strain [-] or null, and how it was found and proven.
-``energy_below_unstable``
-    For each buckled snapshot: stored energy of the branch and of the unstable path [N].
-``snapshots``
-    A list, one entry for each strain: ``nominal_strain`` [-], ``branch``, ``negative_pivots``,
-    ``pattern_amplitude_px``, ``pattern_inner_px``, ``pattern_corners_px`` (largest length of
-    v1 phi1, or of the sum over all modes), ``rms_w_px``, ``rms_best_fit_px``, ``rms_idic_to_best_fit_px``, ``rms_residual``
-    [fraction of full scale], ``mode`` (the 7, of all equivalents the one nearest to the ideal),
-    ``mode_ideal`` (the exact pattern with its origin on a solid junction of this specimen),
-    ``mode_standard_error`` (by noise) and ``mode_model_error`` (by what the ansatz can't
-    describe; empty where the mode is not observable), ``mode_deviation_percent``,
-    ``mode_best_fit``; in staggered rows instead of these ``modes``, for each its ``name``, parameters
-    (``names``, ``units``, ``found``, ``ideal``, ``standard_error``, ``model_error``, ``best_fit``),
-    ``amplitude_px`` (rms of v_i phi_i per component) and whether it is ``observable``;
-    ``iterations`` (on the full image), ``iterations_all_levels``,
-    ``outcome``, ``outcome_why``,
-    ``condition_number``, ``undetermined``, ``worst_determined`` (combinations of unknowns),
-    ``mode_observable``, ``model_error_estimate_px`` (of w, from the images alone),
-    ``mode_polynomial_overlap`` (largest cosine), ``residual_correlation``,
-    ``noise_sd`` (of the images that were correlated, rms over the material and both images
-    [fraction of full scale]; null for the noise-free ones), ``chi_square`` (the residual against
-    that noise, or null), ``gain_min``, ``gain_max``, ``offset_min``, ``offset_max`` (over the
-    material, where they were unknowns), ``residual_verdict`` and ``weighting``
-    (sentences), ``identifiability_warnings``, ``pixels``, ``details_px`` (more statistics of w,
-    best-fit error and IDIC - best fit), ``pattern_reading`` (the spectral densities, in words).
-``expected``
-    Rows of expected and obtained values.
-``inverse_map_max_residual_px``, ``factorisations``, ``versions``
-    How good the images are, what the path took, and with which software. Seconds are in
-    ``timings.json``, so that two runs leave the same summary.
-``simulation_outcome``, ``warnings``
-    How far the simulation got, and what to beware of.
-"""
+"""The numbers of a validated virtual experiment: the content of its ``summary.json``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass
-from typing import Any, TypeVar
+from dataclasses import astuple, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -63,93 +24,190 @@ from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.validation.truth import Comparison, compare, describe, pattern_size
+from modeharvest.util.typed import quantity, to_plain
+from modeharvest.validation.truth import Comparison, VectorStatistics, compare, pattern_size
 
 PAPER = "Maraghechi et al. 2024, doi 10.1016/j.ijsolstr.2024.112916"
 INDEPENDENT = "independent calculation"
+_BRIGHTNESS = ("gain_min", "gain_max", "offset_min", "offset_max")
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """An expected value against the one obtained.
-
-    Parameters
-    ----------
-    quantity, unit
-        What, and in what.
-    expected
-        In words, with its range.
-    obtained
-        The value of this run.
-    ok
-        Whether it lies in the range.
-    source
-        Where the expectation comes from.
-    """
+    """An expected value, in words with its range, against the one obtained, and its source."""
 
     quantity: str
     unit: str
     expected: str
-    obtained: float
+    obtained: float | None
     ok: bool
     source: str
 
 
-def expectations(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class BuckledEnergy:
+    """Stored energy of a buckled snapshot and of the unstable path at its strain [N]."""
+
+    nominal_strain: float
+    branch_N: float
+    unstable_N: float
+
+
+@dataclass(frozen=True)
+class ModeSummary:
+    """One of several modes: parameters as for a single one, rms of v_i phi_i per component."""
+
+    name: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    found: tuple[float, ...]
+    ideal: tuple[float, ...]
+    standard_error: tuple[float | None, ...]
+    model_error: tuple[float | None, ...]
+    best_fit: tuple[float, ...]
+    amplitude_px: float
+    observable: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapshotSummary:
+    """One strain of a virtual experiment; rms is per component.
+
+    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``, which staggered
+    rows have instead of a single mode. The mode's parameters are, of all equivalents, the
+    ones nearest to ``mode_ideal``, the exact pattern with its origin on a solid junction; their
+    standard errors are by noise, and by model error (empty where the mode is not observable).
+    Without free parameters the lists are empty; without gain and offset as unknowns they are
+    None, and so is what belongs to noise for noise-free images. ``noise_sd`` is rms over the
+    material and both images. ``details_px`` has statistics of w, best-fit error, and
+    IDIC - best fit.
+    """
+
+    nominal_strain: float
+    branch: str
+    negative_pivots: int | None = quantity("negative pivots of the tangent stiffness", "–")
+    pattern_amplitude_px: float = quantity("pattern v₁φ₁, largest length", "px")
+    pattern_inner_px: float = quantity("… without the outermost ring of cells", "px")
+    pattern_corners_px: float = quantity("… in the four corner cells", "px")
+    rms_w_px: float = quantity("w = truth − IDIC, rms", "px")
+    rms_best_fit_px: float = quantity("model error: truth − best fit, rms", "px")
+    rms_idic_to_best_fit_px: float = quantity("measurement error: IDIC − best fit, rms", "px")
+    rms_residual: float = quantity("residual, rms, as a fraction of full scale", "–")
+    pixels: int = quantity("pixels compared", "–")
+    iterations: int = quantity("iterations on the full image", "–")
+    iterations_all_levels: int = quantity("iterations on all levels", "–")
+    condition_number: float = quantity("condition number", "–")
+    residual_correlation: float = quantity("autocorrelation of the residual, 4 to 12 px", "–")
+    noise_sd: float | None = quantity(
+        "noise of the camera images, rms, as a fraction of full scale", "–"
+    )
+    chi_square: float | None = quantity(
+        "χ² of the residual: 1 if it is that noise and no more", "–"
+    )
+    gain_min: float | None = quantity("gain between the images, smallest", "–", default=None)
+    gain_max: float | None = quantity("… largest", "–", default=None)
+    offset_min: float | None = quantity(
+        "offset between the images, smallest, as a fraction of full scale", "–", default=None
+    )
+    offset_max: float | None = quantity("… largest", "–", default=None)
+    model_error_estimate_px: float = quantity("w, estimated from the images alone, rms", "px")
+    mode_polynomial_overlap: float = quantity("overlap of the mode's part with v₀", "–")
+    outcome: str = quantity("outcome")
+    outcome_why: str
+    mode: tuple[float, ...] = ()
+    mode_ideal: tuple[float, ...] = ()
+    mode_standard_error: tuple[float | None, ...] = ()
+    mode_model_error: tuple[float | None, ...] = ()
+    mode_deviation_percent: tuple[float, ...] = ()
+    mode_best_fit: tuple[float, ...] = ()
+    modes: tuple[ModeSummary, ...] = ()
+    mode_observable: bool
+    worst_determined: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    identifiability_warnings: tuple[str, ...]
+    residual_verdict: str
+    weighting: str
+    details_px: Mapping[str, VectorStatistics]
+    pattern_reading: tuple[str, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, without what was not measured: parameters of modes, gain, offset."""
+        content = to_plain(self)
+        single = "mode", "mode_ideal", "mode_standard_error", "mode_model_error"
+        absent = [name for name in _BRIGHTNESS if content[name] is None]
+        absent += [] if self.mode else [*single, "mode_deviation_percent", "mode_best_fit"]
+        absent += [] if self.modes else ["modes"]
+        return {name: value for name, value in content.items() if name not in absent}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentSummary:
+    """What was run, how it buckles, how far each snapshot's measurement is from the truth.
+
+    ``critical``: how the critical point was found and proven. ``simulation_outcome``: how far the
+    simulation got. Seconds are in ``timings.json``, so that two runs leave the same summary.
+    """
+
+    title: str
+    case: Mapping[str, Any]
+    critical_strain: float | None
+    critical: Mapping[str, Any] | None
+    energy_below_unstable: tuple[BuckledEnergy, ...]
+    snapshots: tuple[SnapshotSummary, ...]
+    inverse_map_max_residual_px: float
+    factorisations: int | None
+    simulation_outcome: str | None
+    warnings: tuple[str, ...]
+    versions: Mapping[str, str]
+    expected: tuple[Expectation, ...] = ()
+
+    def plain(self) -> dict[str, Any]:
+        """The content of ``summary.json``."""
+        return {**to_plain(self), "snapshots": [part.plain() for part in self.snapshots]}
+
+
+def expectations(summary: ExperimentSummary) -> tuple[Expectation, ...]:
     """Compare a summary of the paper's specimen with what is expected of it.
 
-    Parameters
-    ----------
-    summary
-        The content of ``summary.json``.
-
-    Returns
-    -------
-    list of dict
-        The fields of :class:`Expectation`, a row each; snapshots that are not there, and a
-        critical strain that was not found, are left out.
+    Snapshots that are not there, and a critical strain that was not found, are left out.
     """
+    residual, critical = summary.inverse_map_max_residual_px, summary.critical_strain
     rows = [
-        Expectation(
-            "largest residual of the inverse mapping", "px", "at most 1e-10",
-            summary["inverse_map_max_residual_px"],
-            summary["inverse_map_max_residual_px"] <= 1e-10, "this project's promise",
-        )
+        Expectation("largest residual of the inverse mapping", "px", "at most 1e-10", residual,
+                    residual <= 1e-10, "this project's promise")
     ]  # fmt: skip
-    critical = summary.get("critical_strain")
     if critical is not None:
         ok = abs(100 * critical - 9.6) <= 0.3
         rows.insert(0, Expectation("critical strain", "%", "9.6 ± 0.3", 100 * critical, ok,
                                    INDEPENDENT))  # fmt: skip
-    for snapshot in summary["snapshots"]:
-        is_buckled = critical is not None and snapshot["nominal_strain"] > critical
+    for snapshot in summary.snapshots:
+        is_buckled = critical is not None and snapshot.nominal_strain > critical
         rows += _after(snapshot) if is_buckled else _before(snapshot)
-    return [asdict(row) for row in rows]
+    return tuple(rows)
 
 
-def _before(snapshot: Mapping[str, Any]) -> list[Expectation]:
-    at = f" at {100 * snapshot['nominal_strain']:.1f} %"
-    inner, corners = snapshot["pattern_inner_px"], snapshot["pattern_corners_px"]
+def _before(snapshot: SnapshotSummary) -> list[Expectation]:
+    at = f" at {100 * snapshot.nominal_strain:.1f} %"
+    inner, corners = snapshot.pattern_inner_px, snapshot.pattern_corners_px
     return [
-        Expectation("negative pivots" + at, "-", "0", snapshot["negative_pivots"],
-                    snapshot["negative_pivots"] == 0, "stability"),
+        Expectation("negative pivots" + at, "-", "0", snapshot.negative_pivots,
+                    snapshot.negative_pivots == 0, "stability"),
         Expectation("pattern inside over pattern in the corners" + at, "-",
                     "below 1: v₁ near zero except at the corners", inner / corners,
                     inner < corners, PAPER + ", Fig. (virt)"),
     ]  # fmt: skip
 
 
-def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
-    at = f" at {100 * snapshot['nominal_strain']:.1f} %"
-    worst = max((abs(v) for v in snapshot.get("mode_deviation_percent", ())), default=0.0)
-    pattern, best = snapshot["pattern_amplitude_px"], snapshot["rms_best_fit_px"]
-    loss = snapshot["rms_idic_to_best_fit_px"]
-    length = snapshot["details_px"]["idic_to_best_fit"]["rms_length"]
+def _after(snapshot: SnapshotSummary) -> list[Expectation]:
+    at = f" at {100 * snapshot.nominal_strain:.1f} %"
+    worst = max((abs(v) for v in snapshot.mode_deviation_percent), default=0.0)
+    pattern, best = snapshot.pattern_amplitude_px, snapshot.rms_best_fit_px
+    loss = snapshot.rms_idic_to_best_fit_px
+    length = snapshot.details_px["idic_to_best_fit"].rms_length
     return [
-        Expectation("negative pivots" + at, "-", "0", snapshot["negative_pivots"],
-                    snapshot["negative_pivots"] == 0, "stability"),
+        Expectation("negative pivots" + at, "-", "0", snapshot.negative_pivots,
+                    snapshot.negative_pivots == 0, "stability"),
         Expectation("pattern amplitude" + at, "px", "about 28 (25 to 31)", pattern,
                     25 <= pattern <= 31, INDEPENDENT),
         Expectation("mode's largest deviation from [1, 1, 1, −1, 1, 0, 0]" + at, "%", "at most 2",
@@ -163,19 +221,16 @@ def _after(snapshot: Mapping[str, Any]) -> list[Expectation]:
     ]  # fmt: skip
 
 
-T = TypeVar("T")
-
-
 @dataclass(frozen=True, eq=False)
 class MeasuredExperiment:
-    """What is to be judged.
+    """What is to be assessed.
 
     Parameters
     ----------
     experiment
         What was simulated: geometry, material, strains.
-    how
-        How the images were correlated.
+    options
+        Of the correlation.
     solution, images
         Where the truth comes from.
     results
@@ -183,7 +238,7 @@ class MeasuredExperiment:
     """
 
     experiment: Experiment
-    how: SquareLatticeOptions
+    options: SquareLatticeOptions
     solution: Solution
     images: ImageSet
     results: Mapping[float, Result]
@@ -195,32 +250,33 @@ class MeasuredExperiment:
 
 
 def experiment_summary(
-    measured: MeasuredExperiment, case: Mapping[str, Any], snapshots: list[dict[str, Any]]
-) -> dict[str, Any]:
+    measured: MeasuredExperiment, case: Mapping[str, Any], snapshots: Sequence[SnapshotSummary]
+) -> ExperimentSummary:
+    """All numbers of an experiment, from those of its snapshots."""
     info, images = measured.solution.info, measured.images
     critical = info.get("critical")
-    summary: dict[str, Any] = {
-        "title": case.get("title", ""),
-        "case": dict(case),
-        "critical_strain": None if critical is None else critical["strain"],
-        "critical": critical,
-        "energy_below_unstable": _energies(measured.solution),
-        "snapshots": snapshots,
-        "inverse_map_max_residual_px": images.max_residual_px,
-        "factorisations": info.get("factorisations"),
-        "simulation_outcome": info.get("outcome"),
-        "warnings": list(info.get("warnings", [])),
-        "versions": {**info.get("versions", {}), **images.info.get("versions", {})},
-    }
+    summary = ExperimentSummary(
+        title=case.get("title", ""),
+        case=case,
+        critical_strain=None if critical is None else critical["strain"],
+        critical=critical,
+        energy_below_unstable=_energies(measured.solution),
+        snapshots=tuple(snapshots),
+        inverse_map_max_residual_px=images.max_residual_px,
+        factorisations=info.get("factorisations"),
+        simulation_outcome=info.get("outcome"),
+        warnings=tuple(info.get("warnings", [])),
+        versions={**info.get("versions", {}), **images.info.get("versions", {})},
+    )
     # What is expected is known for the paper's experiment at its resolution, and no other.
     is_known = measured.experiment == Experiment() and images.spec.pixel_size == 0.01
-    summary["expected"] = expectations(summary) if is_known else []
-    return summary
+    return replace(summary, expected=expectations(summary)) if is_known else summary
 
 
 def displacement_spectrum(
     comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
 ) -> tuple[Spectrum, WavePattern]:
+    """Spectral densities of the k-th true displacement, and the pattern read from them."""
     comparison = comparisons[k]
     spectrum = spectral_density(
         comparison.displacement, comparison.grid, comparison.mask, measured.specimen.pitch
@@ -229,9 +285,10 @@ def displacement_spectrum(
 
 
 def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
-    result, how = measured.results[strain], measured.how
-    start = result.ansatz.initial_guess(strain, how.start_amplitude)
-    return compare(measured.images, strain, result, start, how.camera)
+    """Set the result at a strain against the truth."""
+    result, options = measured.results[strain], measured.options
+    start = result.ansatz.initial_guess(strain, options.start_amplitude)
+    return compare(measured.images, strain, result, start, options.camera)
 
 
 def snapshot_summary(
@@ -239,53 +296,47 @@ def snapshot_summary(
     spectra: Sequence[tuple[Spectrum, WavePattern]],
     k: int,
     measured: MeasuredExperiment,
-) -> dict[str, Any]:
+) -> SnapshotSummary:
+    """The numbers of the k-th snapshot."""
     comparison, (_, pattern) = comparisons[k], spectra[k]
-    result, mask = comparison.result, comparison.mask
-    specimen, state = measured.specimen, measured.solution.at(comparison.strain)
-    size = pattern_size(comparison, specimen)
-    parts = {
-        "w": comparison.w,
-        "best_fit": comparison.best_error,
-        "idic_to_best_fit": comparison.idic_to_best,
-    }
-    px = {n: describe(part, mask, comparison.grid.pixel_size) for n, part in parts.items()}
-    seen = identifiability(result, mask)
+    result, state = comparison.result, measured.solution.at(comparison.strain)
+    size, px = pattern_size(comparison, measured.specimen), comparison.statistics()
+    found = identifiability(result, comparison.mask)
     noise = _snapshot_noise(measured, comparison.strain)
     test = result.residual_test(noise)
-    return {
-        "nominal_strain": comparison.strain,
-        "branch": state.branch,
-        "negative_pivots": state.negative_pivots,
-        "pattern_amplitude_px": size.anywhere,
-        "pattern_inner_px": size.inner,
-        "pattern_corners_px": size.corners,
-        "rms_w_px": px["w"]["rms_per_component"],
-        "rms_best_fit_px": px["best_fit"]["rms_per_component"],
-        "rms_idic_to_best_fit_px": px["idic_to_best_fit"]["rms_per_component"],
-        "rms_residual": result.residual_rms,
-        **_mode_numbers(comparison, measured, seen),
+    return SnapshotSummary(
+        nominal_strain=comparison.strain,
+        branch=state.branch,
+        negative_pivots=state.negative_pivots,
+        pattern_amplitude_px=size.anywhere,
+        pattern_inner_px=size.inner,
+        pattern_corners_px=size.corners,
+        rms_w_px=px["w"].rms_per_component,
+        rms_best_fit_px=px["best_fit"].rms_per_component,
+        rms_idic_to_best_fit_px=px["idic_to_best_fit"].rms_per_component,
+        rms_residual=result.residual_rms,
+        **_mode_numbers(comparison, measured, found),
         **_brightness(comparison),
-        "mode_observable": not seen.unobservable,
-        "model_error_estimate_px": seen.model_error_px,
-        "mode_polynomial_overlap": max(seen.overlap),
-        "worst_determined": [str(combination) for combination in seen.worst],
-        "residual_correlation": result.residual_correlation,
-        "noise_sd": None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
-        "chi_square": None if noise is None else test.chi_square,
-        "identifiability_warnings": list(seen.warnings),
-        "residual_verdict": test.sentence,
-        "weighting": result.weighting.sentence,
-        "iterations": result.iterations,
-        "iterations_all_levels": len(result.history),
-        "outcome": result.outcome.name.lower(),
-        "outcome_why": result.outcome.explanation,
-        "condition_number": result.condition_number,
-        "undetermined": list(result.undetermined),
-        "pixels": result.pixels,
-        "details_px": px,
-        "pattern_reading": list(pattern.text),
-    }
+        mode_observable=not found.unobservable,
+        model_error_estimate_px=found.model_error_px,
+        mode_polynomial_overlap=max(found.overlap),
+        worst_determined=tuple(str(combination) for combination in found.worst),
+        residual_correlation=result.residual_correlation,
+        noise_sd=None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
+        chi_square=None if noise is None else test.chi_square,
+        identifiability_warnings=tuple(found.warnings),
+        residual_verdict=test.sentence,
+        weighting=result.weighting.sentence,
+        iterations=result.iterations,
+        iterations_all_levels=len(result.history),
+        outcome=result.outcome.name.lower(),
+        outcome_why=result.outcome.explanation,
+        condition_number=result.condition_number,
+        undetermined=tuple(result.undetermined),
+        pixels=result.pixels,
+        details_px=px,
+        pattern_reading=tuple(pattern.text),
+    )
 
 
 def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise | None:
@@ -293,7 +344,7 @@ def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise |
 
     The roots of mean variances, since chi squared compares sums of squares.
     """
-    if not measured.how.camera:
+    if not measured.options.camera:
         return None
     images = measured.images
     in_f = images.noise_sd()[images.mask()]
@@ -301,7 +352,7 @@ def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise |
     return ImageNoise(*(float(np.sqrt((sd**2).mean())) for sd in (in_f, in_g)))
 
 
-def _brightness(comparison: Comparison) -> dict[str, float]:
+def _brightness(comparison: Comparison) -> dict[str, Any]:
     """Gain [-] and offset [fraction of full scale] over the material; nothing if not unknown."""
     result, grid = comparison.result, comparison.grid
     fields = zip(
@@ -310,86 +361,80 @@ def _brightness(comparison: Comparison) -> dict[str, float]:
         result.ansatz.gain_and_offset(result.unknowns, grid.x, grid.y),
         strict=True,
     )
-    found: dict[str, float] = {}
+    found: dict[str, Any] = {}
     for name, degree, values in fields:
         if degree is not None:
-            seen = np.broadcast_to(values, grid.shape)[comparison.mask]
-            found |= {f"{name}_min": float(seen.min()), f"{name}_max": float(seen.max())}
+            on_material = np.broadcast_to(values, grid.shape)[comparison.mask]
+            found |= {
+                f"{name}_min": float(on_material.min()),
+                f"{name}_max": float(on_material.max()),
+            }
     return found
 
 
 def _mode_numbers(
-    comparison: Comparison, measured: MeasuredExperiment, seen: Identifiability
+    comparison: Comparison, measured: MeasuredExperiment, found: Identifiability
 ) -> dict[str, Any]:
     """The modes' parameters against the ideal ones; nothing where they were fixed."""
     result, best, pitch = comparison.result, comparison.best, measured.specimen.pitch
     ansatz = result.ansatz
-    start = ansatz.initial_guess(comparison.strain, measured.how.start_amplitude)
+    start = ansatz.initial_guess(comparison.strain, measured.options.start_amplitude)
     parts = [ansatz.phi_slice(i) for i in range(len(ansatz.modes))]
     if not any(start[part].size for part in parts):
         return {}
     noise = result.standard_errors()
-    is_any = len(seen.unobservable) < len(parts)
-    model = _model_errors(comparison, measured) if is_any else [None] * ansatz.size
+    is_any = len(found.unobservable) < len(parts)
+    model = _model_errors(comparison, measured) if is_any else (None,) * ansatz.size
     if measured.specimen.is_staggered:
-        return {
-            "modes": [
-                {
-                    "name": mode.family.name,
-                    "names": list(mode.family.names),
-                    "units": list(mode.family.units),
-                    "found": result.mode_parameters(i).tolist(),
-                    "ideal": start[part].tolist(),
-                    "standard_error": _finite_or_none(noise[part]),
-                    "model_error": model[part] if i not in seen.unobservable else [],
-                    "best_fit": best.mode_parameters(i).tolist(),
-                    "amplitude_px": seen.amplitude_px[i],
-                    "observable": i not in seen.unobservable,
-                }
-                for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True))
-            ]
-        }
-    found, ideal = result.mode_parameters(), start[parts[0]]
+        modes = (
+            ModeSummary(
+                mode.family.name,
+                tuple(mode.family.names),
+                tuple(mode.family.units),
+                tuple(result.mode_parameters(i)),
+                tuple(start[part]),
+                tuple(noise[part]),
+                model[part] if i not in found.unobservable else (),
+                tuple(best.mode_parameters(i)),
+                found.amplitude_px[i],
+                i not in found.unobservable,
+            )
+            for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True))
+        )
+        return {"modes": tuple(modes)}
+    parameters, ideal = result.mode_parameters(), start[parts[0]]
     return {
-        "mode": mode_equivalent(found, pitch, ideal)[0].tolist(),
-        "mode_ideal": ideal.tolist(),
-        "mode_standard_error": _finite_or_none(noise[parts[0]]),
-        "mode_model_error": model[parts[0]] if not seen.unobservable else [],
-        "mode_deviation_percent": mode_deviation(found, pitch, ideal).tolist(),
-        "mode_best_fit": mode_equivalent(best.mode_parameters(), pitch, ideal)[0].tolist(),
+        "mode": tuple(mode_equivalent(parameters, pitch, ideal)[0]),
+        "mode_ideal": tuple(ideal),
+        "mode_standard_error": tuple(noise[parts[0]]),
+        "mode_model_error": model[parts[0]] if not found.unobservable else (),
+        "mode_deviation_percent": tuple(mode_deviation(parameters, pitch, ideal)),
+        "mode_best_fit": tuple(mode_equivalent(best.mode_parameters(), pitch, ideal)[0]),
     }
 
 
-def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> list[float | None]:
-    """Standard deviations of the unknowns by what the ansatz can't describe; None if not known.
+def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> tuple[float | None, ...]:
+    """Standard deviations of the unknowns by model error; None if not known.
 
     Each unit cell's share of the residual counts as one draw: where noise says how well the
     images determine the unknowns, this says how far w moves them.
     """
-    how, result = measured.how, comparison.result
-    pair = measured.images.pair(comparison.strain, camera=how.camera)
+    options, result = measured.options, comparison.result
+    pair = measured.images.pair(comparison.strain, camera=options.camera)
     try:
-        matched = MatchedImages.of(result, pair, how.edge_px)
-        found = matched.sandwich_covariance(measured.specimen.pitch)
+        matched = MatchedImages.of(result, pair, options.edge_px)
+        covariance = matched.sandwich_covariance(measured.specimen.pitch)
     except InputError:  # a specimen of too few cells
-        return [None] * result.ansatz.size
-    return _finite_or_none(np.sqrt(np.diag(found)))
+        return (None,) * result.ansatz.size
+    return tuple(np.sqrt(np.diag(covariance)))
 
 
-def _energies(solution: Solution) -> list[dict[str, float]]:
-    """Energies [N] of the buckled snapshots and of the primary path at the same strain."""
+def _energies(solution: Solution) -> tuple[BuckledEnergy, ...]:
+    """Of the buckled snapshots."""
     primary = solution.info.get("path", {}).get("primary", {})
     at = dict(zip(primary.get("nominal_strain", []), primary.get("energy_N", []), strict=True))
-    return [
-        {
-            "nominal_strain": s.nominal_strain,
-            "branch_N": s.energy,
-            "unstable_N": at[s.nominal_strain],
-        }
+    return tuple(
+        BuckledEnergy(s.nominal_strain, s.energy, at[s.nominal_strain])
         for s in solution.snapshots
         if s.branch != "primary" and s.nominal_strain in at
-    ]
-
-
-def _finite_or_none(values: FloatArray) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]
+    )

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -36,38 +35,50 @@ def lengths(field: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(x * x + y * y))
 
 
-def describe(field: FloatArray, mask: BoolArray, unit: float = 1.0) -> dict[str, Any]:
-    """Bias, rms, percentiles and maximum of a vector field.
+@dataclass(frozen=True)
+class VectorStatistics:
+    """Bias, rms and percentiles of a vector field; ``mean`` and ``rms`` are (x, y).
 
-    Parameters
-    ----------
-    field
-        (rows, cols, 2).
-    mask
-        (rows, cols) True where the field counts.
-    unit
-        The size of the unit to give the numbers in, e.g. the pixel size [mm/px] to turn a
-        field in mm into px.
-
-    Returns
-    -------
-    dict
-        ``mean`` and ``rms`` as (x, y); ``rms_per_component``; ``rms_length``, ``median_length``,
-        ``p95_length`` and ``max_length`` of the vectors' Euclidean length.
+    The last four are of the vectors' Euclidean length.
     """
-    x, y = (field[..., c][mask] / unit for c in (0, 1))
-    mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
-    length = np.sqrt(x * x + y * y)
-    median, p95, largest = np.quantile(length, (0.5, 0.95, 1.0), overwrite_input=True)
-    return {
-        "mean": [float(x.mean()), float(y.mean())],
-        "rms": [math.sqrt(square) for square in mean_squares],
-        "rms_per_component": math.sqrt(0.5 * sum(mean_squares)),
-        "rms_length": math.sqrt(sum(mean_squares)),
-        "median_length": float(median),
-        "p95_length": float(p95),
-        "max_length": float(largest),
-    }
+
+    mean: tuple[float, float]
+    rms: tuple[float, float]
+    rms_per_component: float
+    rms_length: float
+    median_length: float
+    p95_length: float
+    max_length: float
+
+    @classmethod
+    def of(cls, field: FloatArray, mask: BoolArray, unit: float = 1.0) -> VectorStatistics:
+        """Of a field (rows, cols, 2) where a mask (rows, cols) is True.
+
+        ``unit``: the size of the unit to give the numbers in, e.g. the pixel size [mm/px] to turn
+        a field in mm into px.
+        """
+        x, y = (field[..., c][mask] / unit for c in (0, 1))
+        mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
+        length = np.sqrt(x * x + y * y)
+        median, p95, largest = np.quantile(length, (0.5, 0.95, 1.0), overwrite_input=True)
+        return cls(
+            (float(x.mean()), float(y.mean())),
+            (math.sqrt(mean_squares[0]), math.sqrt(mean_squares[1])),
+            math.sqrt(0.5 * sum(mean_squares)),
+            math.sqrt(sum(mean_squares)),
+            float(median),
+            float(p95),
+            float(largest),
+        )
+
+
+@dataclass(frozen=True)
+class ErrorParts:
+    """Rms per component of truth - IDIC, truth - best fit and IDIC - best fit [px]."""
+
+    w_px: float
+    model_error_px: float
+    measurement_error_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +118,39 @@ class Comparison:
 
     @cached_property
     def best_error(self) -> FloatArray:
-        """(rows, cols, 2) truth - best fit [mm]: what the model can't say."""
+        """(rows, cols, 2) truth - best fit [mm]: the model (ansatz) error."""
         return _difference(self.displacement, self.best.displacement())
 
     @cached_property
     def idic_to_best(self) -> FloatArray:
-        """(rows, cols, 2) IDIC - best fit [mm]: what the measurement loses; NaN off the mask."""
+        """(rows, cols, 2) IDIC - best fit [mm]: the measurement error; NaN off the mask."""
         return self.best_error - self.w
+
+    def statistics(self) -> dict[str, VectorStatistics]:
+        """Of the error ``w`` and of its parts ``best_fit`` and ``idic_to_best_fit`` [px]."""
+        parts = {
+            "w": self.w,
+            "best_fit": self.best_error,
+            "idic_to_best_fit": self.idic_to_best,
+        }
+        px = self.grid.pixel_size
+        return {name: VectorStatistics.of(part, self.mask, px) for name, part in parts.items()}
+
+    def error_parts(self) -> ErrorParts:
+        """Rms of the error and of its two parts."""
+        return ErrorParts(*(part.rms_per_component for part in self.statistics().values()))
+
+    def cellular(self, specimen: Specimen) -> BoolArray:
+        """(rows, cols) True on material of the part with holes."""
+        a, b = specimen.cellular_half_size
+        x, y = np.abs(self.grid.x)[None, :], np.abs(self.grid.y)[:, None]
+        return self.mask & (x <= a) & (y <= b)
+
+    def v1_percent(self, specimen: Specimen) -> float:
+        """Rms difference of v1 from the best fit's over the cellular part, of its largest [%]."""
+        inside = self.cellular(specimen)
+        v, at_best = (fit.v(0)[inside] for fit in (self.result, self.best))
+        return 100.0 * float(np.sqrt(np.mean((v - at_best) ** 2)) / np.abs(at_best).max())
 
 
 def _difference(minuend: FloatArray, subtrahend: FloatArray) -> FloatArray:
@@ -129,10 +166,8 @@ def compare(
 
     Parameters
     ----------
-    images
-        The set that the result was measured on.
-    strain
-        Which of its snapshots [-].
+    images, strain
+        The set that the result was measured on, and which of its snapshots [-].
     result
         The measurement.
     start
@@ -140,33 +175,25 @@ def compare(
         and from the result, and the better of the two is taken.
     camera
         Whether the quantised images were measured.
-    progress
-        Listener.
     """
     grid, mask, ansatz = images.grid, images.mask(), result.ansatz
     truth = images.truth(strain).displacement
     best = best_fit(images.truth(strain), result, guesses=(start,), progress=progress)
-    left = residual(
+    unmatched = residual(
         Assembly(ansatz, grid, mask),
         result.unknowns,
         images.reference(camera=camera),
         SplineImage.of(images.deformed(strain, camera=camera)),
     )
-    return Comparison(strain, grid, mask, truth, result, best, left.astype(np.float64))
+    return Comparison(strain, grid, mask, truth, result, best, unmatched.astype(np.float64))
 
 
 @dataclass(frozen=True)
 class PatternSize:
-    """Largest length of the pattern, v1 phi1 or the sum of several modes [px].
+    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px].
 
-    Parameters
-    ----------
-    anywhere
-        Over the material of the cellular part.
-    inner
-        Without the outermost ring of unit cells.
-    corners
-        Over the four corner cells.
+    ``anywhere`` in the cellular part; ``inner``, without its outermost ring of unit cells; in its
+    four ``corners`` cells.
     """
 
     anywhere: float
@@ -192,7 +219,7 @@ def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
     def largest(where: BoolArray) -> float:
         return float(np.max(length, initial=0.0, where=where))
 
-    cellular = comparison.mask & (x <= a) & (y <= b)
+    cellular = comparison.cellular(specimen)
     return PatternSize(
         largest(cellular),
         largest(cellular & ~outer_x & ~outer_y),

@@ -1,9 +1,9 @@
 """Workers of a campaign: local processes or a dask scheduler's, and what they do with one case.
 
 Processes of this machine are those of dask's own ``LocalCluster``. They listen on 127.0.0.1 only,
-have no dashboard, and no timeout takes a slow one for a dead one: a process that has ended is known
-by its end. Workers elsewhere are asked at once whether they can do the work at all. A worker imports
-this module and the case's function, nothing else of a campaign: it must start fast.
+have no dashboard, and no timeout takes a slow one for a dead one: a process that has ended is
+known by its end. Workers elsewhere are asked at once whether they can do the work at all. A worker
+imports this module and the case's function, nothing else of a campaign: it must start fast.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,9 @@ from modeharvest.util.stages import digest, source_digest, stage_key
 
 Case = Mapping[str, Any]
 """Plain values, the seed among them."""
-CaseFunction = Callable[[Case, Path], Mapping[str, Any]]
-"""Takes a case and the campaign's folder, returns plain values: the row of the table."""
+CaseFunction = Callable[[Case, Path], Any]
+"""Takes a case and the campaign's folder, returns a dataclass or a mapping of plain values: the
+row of the table."""
 
 
 def named(function: str) -> CaseFunction:
@@ -49,6 +50,24 @@ def result_path(function: str, case: Case, folder: Path) -> Path:
     """Where the result of a case is stored: under a digest of all that it depends on."""
     key = stage_key([function, dict(case)])[:24]
     return folder / "cases" / f"{key}.json"
+
+
+def plain_row(result: Any) -> dict[str, Any]:
+    """What a case's function returned as the row of a table."""
+    return asdict(result) if is_dataclass(result) else dict(result)  # type: ignore[arg-type]
+
+
+def leave(content: Mapping[str, Any], folder: Path, path: str) -> str:
+    """Leave in a campaign's folder what cases read, under its digest; returns that, their name.
+
+    Parameters
+    ----------
+    path
+        Of the file in the folder, with {} for the name.
+    """
+    name = digest(content)[:16]
+    write_json(folder / path.format(name), content)
+    return name
 
 
 def run_case(function: str, case: Case, folder: str, code: str) -> None:
@@ -82,7 +101,7 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
     result, error = None, ""
     try:
-        result = dict(named(function)(case, Path(folder)))
+        result = plain_row(named(function)(case, Path(folder)))
     except Exception:  # a case may fail in any way: that is its result
         error = traceback.format_exc()
     store(path, case, result, error)

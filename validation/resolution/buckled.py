@@ -26,8 +26,8 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, write_json
-from modeharvest.util.stages import digest
+from modeharvest.util.files import read_json
+from modeharvest.validation.workers import leave
 
 SPACING = 0.2
 
@@ -44,10 +44,8 @@ class ResolutionSpec:
         The base motion and its images.
     measured
         Degrees of v0 and v1 that images are measured with.
-    amplitude_px
-        Of a wave [px].
-    noise
-        Standard deviation in each image [fraction of full scale].
+    amplitude_px, noise
+        Of a wave [px], and standard deviation in each image [fraction of full scale].
     """
 
     buckled: BuckledMotion
@@ -59,9 +57,7 @@ class ResolutionSpec:
         """Leave it for workers; returns its name."""
         content = asdict(self)
         content["buckled"]["specimen"] = self.buckled.specimen.plain()
-        name = digest(content)[:16]
-        write_json(folder / "subjects" / f"{name}.json", content)
-        return name
+        return leave(content, folder, "subjects/{}.json")
 
     @classmethod
     def read(cls, folder: Path, name: str) -> ResolutionSpec:
@@ -84,7 +80,7 @@ class ResolutionSpec:
         return some, (np.abs(some[:, 0]) <= a) & (np.abs(some[:, 1]) <= b)
 
     def ansatz(self, degree: int, motion: str) -> Ansatz:
-        """The paper's at a degree; without a pattern its mode is held."""
+        """The paper's at a degree; without a pattern its mode is fixed."""
         return self.buckled.ansatz(degree, degree, fixed_mode=motion == "still")
 
     def start(self, degree: int, motion: str) -> FloatArray:
@@ -94,14 +90,13 @@ class ResolutionSpec:
             return np.zeros(ansatz.size)
         return ansatz.initial_guess(self.buckled.strain, self.buckled.pattern)
 
-    def correlate(self, pair: AnalyticPair, degree: int, motion: str) -> Result:
+    def correlate(self, pair: ImagePair, degree: int, motion: str) -> Result:
         """Measure a pair from what is nearly its motion, on the full images."""
         options = CorrelationOptions(
             (Level(1, 0.0),), self.buckled.how.edge_px, self.buckled.how.order
         )
-        images = ImagePair(pair.f, pair.g, self.buckled.grid, pair.mask, pair.deformed_mask)
         guess = self.start(degree, motion)
-        return correlate(images, self.ansatz(degree, motion), guess=guess, options=options)
+        return correlate(pair, self.ansatz(degree, motion), guess=guess, options=options)
 
 
 _ADAPTER = TypeAdapter(ResolutionSpec)
@@ -159,19 +154,11 @@ class AddedWave:
         return np.asarray(np.cos(2.0 * np.pi / self.period * points[..., self.axis] + self.phase))
 
 
-@dataclass(frozen=True, eq=False)
-class AnalyticPair:
-    """Two images and where they show material, (rows, cols) each."""
-
-    f: NDArray[np.float32]
-    g: NDArray[np.float32]
-    mask: BoolArray
-    deformed_mask: BoolArray
-
-    def noisy(self, level: float, rng: np.random.Generator) -> AnalyticPair:
-        """The pair with white noise of that standard deviation in both images."""
-        n = rng.normal(scale=level, size=(2, *self.f.shape)).astype(np.float32)
-        return AnalyticPair(self.f + n[0], self.g + n[1], self.mask, self.deformed_mask)
+def noisy(pair: ImagePair, level: float, rng: np.random.Generator) -> ImagePair:
+    """The pair with white noise of that standard deviation in both images."""
+    f, g = pair.reference, pair.deformed
+    n = rng.normal(scale=level, size=(2, *f.shape)).astype(np.float32)
+    return pair.with_images(f + n[0], g + n[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +190,7 @@ class BuckledMotion:
     specimen
         The undeformed geometry.
     how
-        The correlation; its degrees are varied.
+        Options of the correlation; its degrees are varied.
     speckle
         The pattern on it.
     pixel_size
@@ -235,9 +222,9 @@ class BuckledMotion:
         return self.ansatz(1, 0), self.start(1, 0)
 
     def ansatz(self, v0_degree: int, v_degree: int, fixed_mode: bool = False) -> Ansatz:
-        """The paper's ansatz of these degrees; its mode held if nothing tells its parameters."""
-        how = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, fixed_mode=fixed_mode)
-        return how.ansatz(self.specimen)
+        """The paper's ansatz of these degrees; its mode fixed if the motion has none."""
+        options = replace(self.how, v0_degree=v0_degree, v_degree=v_degree, fixed_mode=fixed_mode)
+        return options.ansatz(self.specimen)
 
     def start(self, v0_degree: int, v_degree: int) -> FloatArray:
         """The base in the unknowns of an ansatz of these degrees."""
@@ -276,7 +263,7 @@ class BuckledMotion:
             u[..., wave.axis] += wave.amplitude * wave.shape(points)
         return np.asarray(u)
 
-    def images(self, wave: AddedWave | None = None) -> AnalyticPair:
+    def images(self, wave: AddedWave | None = None) -> ImagePair:
         """Exact images before and after the motion."""
         grid = self.grid
         speckle = Speckle(self.speckle, grid.shape)
@@ -292,14 +279,14 @@ class BuckledMotion:
         g = np.zeros(grid.shape, dtype=np.float32)
         g[deformed_mask] = speckle(*grid.to_px(*point[inside].T))
         f = np.where(mask, speckle.image(), 0.0).astype(np.float32)
-        return AnalyticPair(f, g, mask, deformed_mask)
+        return ImagePair(f, g, grid, mask, deformed_mask)
 
-    def still(self) -> AnalyticPair:
+    def still(self) -> ImagePair:
         """The image before the motion, twice."""
         mask = self.material(self.grid.x[None, :], self.grid.y[:, None])
         image = Speckle(self.speckle, self.grid.shape).image()
         f = np.where(mask, image, 0.0).astype(np.float32)
-        return AnalyticPair(f, f, mask, mask)
+        return ImagePair(f, f, self.grid, mask, mask)
 
     @cached_property
     def _base(self) -> InverseMotion:

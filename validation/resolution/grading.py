@@ -22,8 +22,7 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.star import Star, StarSet
-from modeharvest.validation.resolution.transfer import KEPT
+from modeharvest.validation.resolution.star import KEPT, Star, StarSet
 
 RESOLUTION_FORMAT = "modeharvest-resolution-1"
 

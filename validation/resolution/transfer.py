@@ -17,21 +17,25 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
-from scipy.special import spherical_jn
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.slow_fields import orders
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.resolution.buckled import AddedWave, BuckledMotion, ResolutionSpec
+from modeharvest.validation.resolution.star import KEPT
 
-KEPT = 0.9
-"""Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
 _SCAN = 4001
 
 
@@ -79,33 +83,6 @@ def savitzky_golay(width: int, degree: int) -> tuple[FloatArray, FloatArray]:
     offsets = np.asarray(np.arange(width) - 0.5 * (width - 1), dtype=np.float64)
     basis = np.polynomial.legendre.legvander(offsets / offsets[-1], degree)
     return offsets, np.asarray(np.linalg.pinv(basis).T @ basis[width // 2])
-
-
-def polynomial_transfer(degree: int, waves_x: ArrayLike, waves_y: ArrayLike = 0.0) -> FloatArray:
-    """T of a polynomial of total degree ``degree`` fitted to a wave over a full rectangle [-].
-
-    The share of the wave's power, mean over its phases, that the polynomials describe; with
-    Legendre's P_n and exp(i k t) = sum_n (2n + 1) i^n j_n(k) P_n(t),
-
-        T = sum_{m + n <= degree} (2m + 1) j_m(k_x)^2 (2n + 1) j_n(k_y)^2,   k = pi waves.
-
-    It is also the slope of the fit's values against the wave's, all over the rectangle.
-
-    Parameters
-    ----------
-    degree
-        i + j of the polynomials x^i y^j, at most.
-    waves_x, waves_y
-        Periods along the width and the height of the rectangle [-]; they broadcast together.
-    """
-    k_x, k_y = (np.pi * np.abs(np.asarray(w, dtype=np.float64)) for w in (waves_x, waves_y))
-    along_x, along_y = ([_power(n, k) for n in range(degree + 1)] for k in (k_x, k_y))
-    return np.asarray(sum(along_x[m] * along_y[n] for m, n in orders(degree)))
-
-
-def _power(n: int, k: FloatArray) -> FloatArray:
-    """Share of a wave's power in Legendre's polynomial n."""
-    return np.asarray((2 * n + 1) * spherical_jn(n, k) ** 2)
 
 
 def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high: float) -> float:
@@ -190,3 +167,261 @@ class TangentFit:
 def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
     """(k,) slope of what was found (m, 2, k) against the waves (m, 2, k) [-]."""
     return np.asarray((found * wave).sum(axis=(0, 1)) / (wave**2).sum(axis=(0, 1)))
+
+
+Kind = tuple[str, int, int]
+"""Part, axis and degree."""
+WAVED = ("v0", "v1")
+"""What a wave is of."""
+AXES = ("x", "y")
+_PERIODS = 80
+_SHORTEST, _LONGEST = 0.6, 8.0
+"""Of the periods, in cells and in lengths of the specimen."""
+_PHASES = (0.0, 0.5 * np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class TransferCurves:
+    """Transfers T over the period.
+
+    Parameters
+    ----------
+    periods
+        (n,) [mm], ascending.
+    own, whole
+        For each (part, axis, degree) the share (n,) of a wave that is found in its own part, and
+        in the whole displacement, over both phases [-].
+    """
+
+    periods: FloatArray
+    own: dict[Kind, FloatArray]
+    whole: dict[Kind, FloatArray]
+
+    @classmethod
+    def of(
+        cls, spec: ResolutionSpec, degrees: Sequence[int], progress: Progress = silent
+    ) -> TransferCurves:
+        """Fit waves of v0 and v1 along both axes at all degrees."""
+        buckled, points = spec.buckled, spec.points
+        pitch, longer = buckled.specimen.pitch, 2.0 * max(buckled.specimen.half_size)
+        periods = np.asarray(np.geomspace(_SHORTEST * pitch, _LONGEST * longer, _PERIODS))
+        own: dict[Kind, FloatArray] = {}
+        whole: dict[Kind, FloatArray] = {}
+        kinds = [(part, axis) for part in WAVED for axis in range(len(AXES))]
+        waves = np.concatenate(
+            [_waves(buckled, part, axis, periods, points) for part, axis in kinds], axis=-1
+        )
+        for n, degree in enumerate(degrees):
+            progress(n, len(degrees), "resolution: best fits")
+            start = spec.start(degree, "buckled")
+            fit = TangentFit(spec.ansatz(degree, "buckled"), start, points).fit(waves)
+            for k, (part, axis) in enumerate(kinds):
+                here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
+                wave = waves[..., here]
+                for found, among in ((own, fit.of(part)), (whole, fit.whole)):
+                    found[part, axis, degree] = _over_phases(among[..., here], wave)
+        progress(len(degrees), len(degrees), "resolution: best fits")
+        return cls(periods, own, whole)
+
+    def at(self, part: str, axis: int, degree: int, period: float) -> float:
+        """T of a wave in its own part at a period [mm]."""
+        return float(np.interp(period, self.periods, self.own[part, axis, degree]))
+
+    def finest(self, part: str, axis: int, degree: int) -> float:
+        """l10 [mm]: the period from which on less than 10 % of the amplitude is lost.
+
+        Raises
+        ------
+        InputError
+            If there is none among the periods.
+        """
+        curve = self.own[part, axis, degree]
+
+        def transfer(period: FloatArray) -> FloatArray:
+            return np.asarray(np.interp(period, self.periods, curve))
+
+        return finest_period(transfer, float(self.periods[0]), float(self.periods[-1]))
+
+    def cross_talk(self) -> tuple[float, float]:
+        """Largest share of a wave of one part found in the other: at any period, from l10 on."""
+        everywhere, resolved = [], []
+        for key, own in self.own.items():
+            other = np.abs(self.whole[key] - own)
+            everywhere.append(other.max())
+            resolved.append(other[self.periods >= self.finest(*key)].max())
+        return float(max(everywhere)), float(max(resolved))
+
+
+def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
+    """(n,) shares of waves (m, 2, 2 n), those of the two phases weighted by their power."""
+    power = (wave**2).sum(axis=(0, 1)).reshape(-1, len(_PHASES))
+    shares = wave_share(found, wave).reshape(-1, len(_PHASES))
+    return np.asarray((shares * power).sum(axis=1) / power.sum(axis=1))
+
+
+def _waves(
+    buckled: BuckledMotion, part: str, axis: int, periods: FloatArray, points: FloatArray
+) -> FloatArray:
+    """(m, 2, 2 n) waves of amplitude 1 mm in both phases."""
+    waves = [
+        buckled.wave_at(AddedWave(part, axis, float(period), phase, 1.0), points)
+        for period in periods
+        for phase in _PHASES
+    ]
+    return np.stack(waves, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Passband:
+    """What becomes of a pattern of another wavelength than the mode's.
+
+    Parameters
+    ----------
+    stretch
+        (n,) its wave numbers over the mode's [-].
+    added
+        (n,) share that is found of a small one beside the mode [-]: a filter.
+    itself
+        (n,) share that is found of the pattern itself where it is that long, by a fit that starts
+        from the mode [-].
+    wavelength_error
+        (n,) relative error of the wavelength that fit finds [-].
+    """
+
+    stretch: FloatArray
+    added: FloatArray
+    itself: FloatArray
+    wavelength_error: FloatArray
+
+    @classmethod
+    def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
+        """At one degree of v0 and v1."""
+        points = spec.points
+        ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
+        stretch = np.concatenate([np.linspace(0.05, 0.8, 26), np.linspace(0.82, 1.3, 33)])
+        waves = np.stack([_stretched(spec, s, points) for s in stretch], axis=-1)
+        added = wave_share(TangentFit(ansatz, start, points).fit(waves).whole, waves)
+        near = np.abs(stretch - 1.0) <= 0.18
+        itself, error = np.full(stretch.shape, np.nan), np.full(stretch.shape, np.nan)
+        for k in np.flatnonzero(near):
+            itself[k], error[k] = _refitted(spec, degree, float(stretch[k]))
+        return cls(stretch, added, itself, error)
+
+    @property
+    def retuned(self) -> float:
+        """How far off its wave numbers may be for the pattern to be found whole, both ways [-]."""
+        whole, off = self.itself > 0.999, np.abs(self.stretch - 1.0)
+        lost = off[~whole & np.isfinite(self.itself)].min(initial=np.inf)
+        return float(off[whole & (off < lost)].max(initial=0.0))
+
+
+def _stretched(spec: ResolutionSpec, stretch: float, points: FloatArray) -> FloatArray:
+    """(..., 2) the pattern with wave numbers so many times the mode's, v1 = 1 mm."""
+    ansatz, a = spec.buckled.truth
+    a = a.copy()
+    a[ansatz.v_slice(0)] = 1.0
+    phi = ansatz.phi_slice(0)
+    a[phi.start + 1 : phi.start + 5] *= stretch
+    at = points[..., None, 0], points[..., None, 1]
+    return np.asarray(ansatz.fluctuation(0, a, *at)[..., 0, :])
+
+
+def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float, float]:
+    """Share of a stretched pattern that a fit from the mode finds; its wave number's error."""
+    buckled = spec.buckled
+    size = np.array(buckled.specimen.half_size)
+    step = 4.0 * buckled.pixel_size
+    cols, rows = (2 * int(np.ceil(half / step)) + 1 for half in size)
+    grid = PixelGrid.centred(rows, cols, step)
+    at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    mask = buckled.material(at[..., 0], at[..., 1])
+    pattern = buckled.pattern * _stretched(spec, stretch, at)
+    u = pattern.copy()
+    u[..., 0] -= buckled.strain * at[..., 0]
+    ansatz = spec.ansatz(degree, "buckled")
+    try:
+        found = fit_displacement(u, grid, ansatz, spec.start(degree, "buckled"), mask)
+    except InputError:
+        return float("nan"), float("nan")
+    fluctuation = found.fluctuation(0)[mask][..., None]
+    wave_numbers = found.mode_parameters(0)[1:5]
+    error = float(np.abs(np.abs(wave_numbers) / stretch - 1.0).max())
+    return float(wave_share(fluctuation, pattern[mask][..., None])[0]), error
+
+
+QUANTITIES = ("v0", "v1", "v1phi1", "u")
+FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
+"""Whose noise counts against the waves of a part."""
+_SUBSET_PX = 33
+"""A subset whose indicator stands for all: theory gives nearly the same for every size."""
+
+
+@dataclass(frozen=True)
+class DegreeResolution:
+    """A degree of v0 and v1, and what it costs.
+
+    Parameters
+    ----------
+    degree, unknowns
+        Of the ansatz.
+    finest_px
+        l10 of waves by part and axis, as "v0 x" [px].
+    floor_px
+        n by quantity, :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px].
+    indicator_px2
+        n l10 by part; l10 is the geometric mean of both axes' [px^2].
+    fixed_px2
+        That of v1 phi1 without motion, its phi1 fixed [px^2].
+    """
+
+    degree: int
+    unknowns: int
+    finest_px: Mapping[str, float]
+    floor_px: Mapping[str, float]
+    indicator_px2: Mapping[str, float]
+    fixed_px2: float
+
+
+def degrees_of(
+    done: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
+) -> list[DegreeResolution]:
+    """Every degree whose floor is known."""
+    floors = done[done["task"] == "floor"]
+    buckled = floors[floors["motion"] == "buckled"].sort_values("degree")
+    still = floors[floors["motion"] == "still"].set_index("degree")
+    if not len(buckled):
+        raise InputError("study: expected the noise floor of a degree at least, got none")
+    return [
+        _degree(row, still["v1phi1"].get(row["degree"], np.nan), spec, curves)
+        for _, row in buckled.iterrows()
+    ]
+
+
+def _degree(
+    row: pd.Series, still_px: float, spec: ResolutionSpec, curves: TransferCurves
+) -> DegreeResolution:
+    """One of them; ``still_px`` is the floor of v1 phi1 without motion [px]."""
+    degree, px = int(row["degree"]), spec.buckled.pixel_size
+    finest = {
+        f"{part} {name}": curves.finest(part, axis, degree) / px
+        for part in WAVED
+        for axis, name in enumerate(AXES)
+    }
+    mean = {part: float(np.sqrt(finest[f"{part} x"] * finest[f"{part} y"])) for part in WAVED}
+    floor = {name: float(row[name]) for name in QUANTITIES}
+    indicator = {part: floor[FLOOR_OF[part]] * mean[part] for part in WAVED}
+    unknowns = int(row["unknowns"])
+    return DegreeResolution(
+        degree, unknowns, finest, floor, indicator, float(still_px) * mean["v1"]
+    )
+
+
+def subset_indicator(spec: ResolutionSpec) -> float:
+    """n l10 of an affine subset on the same speckle under the same noise, by theory [px^2]."""
+    grid = spec.buckled.grid
+    speckle = Speckle(spec.buckled.speckle, grid.shape)
+    row, col = np.meshgrid(np.arange(0.0, grid.rows, 7), np.arange(0.0, grid.cols, 7))
+    slope = float(np.sqrt(np.mean(speckle.gradient(row, col) ** 2)))
+    floor = np.sqrt(2.0) * spec.noise / slope * subset_noise(_SUBSET_PX, 1)
+    finest = finest_period(lambda p: subset_transfer(_SUBSET_PX, 1, p), 10.0, 1000.0)
+    return float(floor * finest)

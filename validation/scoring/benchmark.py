@@ -17,6 +17,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -54,70 +55,7 @@ RETURNED = {
 }
 """How displacements are to be returned."""
 
-_README = """\
-# Benchmark {id} for digital image correlation
-
-Images of a specimen with holes, before and after a deformation, made by computer: the displacement
-of every point is known, and is not in this folder. Measure it, and have your field graded.
-
-## What is here
-
-| file | content |
-|---|---|
-{files}
-
-The float images hold grey levels as fractions of full scale, as exact as they could be made; the
-{bits}-bit images are what a camera would have stored. Say which you used. Holes and surroundings
-are {background:g}. The specimen's unit cells measure {unit_cell_mm:g} mm, a pixel
-{pixel_size_mm:g} mm. `{mask}` is white where the reference image shows material.
-`benchmark.json` says the same to programs, with the SHA-256 of every image.
-
-## What to return
-
-For each deformed image one file with the displacement *u, v* of material points at their positions
-*x, y* in the **reference** image: CSV, NPZ, HDF5, MAT or VTU, points in any order or a grid. For
-example, in pixels, *y* and *v* down, the centre of the upper left pixel being (0, 0):
-
-```
-# benchmark: {id}
-x [px],y down [px],u [px],v down [px]
-120,85,3.217,-0.482
-125,85,nan,nan
-```
-
-Points that your code could not measure stay in the file, as NaN: they are counted. In millimetres,
-with *y* up, the centre of the upper left pixel is at x = {x0:.6g} mm, y = {y0:.6g} mm.
-
-## How it is graded
-
-Who has the truth runs
-
-```sh
-modeharvest score FIELD.csv --truth TRUTH --strain {strain:g} --out graded
-```
-
-The error is the returned displacement less the true one at the returned positions, evaluated on
-the finite elements that the images were made of. Told are its mean (bias), its rms per component,
-percentiles and the largest length, over all and by region (within 10 px of an edge, ligaments,
-junctions, bulk), the share of points that were measured, the share of the material that they
-cover, and the error's spectrum. Fields are ranked by rms; those that cover less than half of the
-material come after those that cover more.
-
-## How it was made
-
-A hyperelastic finite-element simulation deforms the specimen; a random speckle pattern moves with
-it. For each pixel of a deformed image the material point that it shows is found by inverting the
-isoparametric mapping, and the pattern is evaluated there, not interpolated. Method: section
-"Virtual Experiments" of doi 10.1016/j.ijsolstr.2024.112916. Made with {made_with}.
-
-Whoever made this set of a case that is public has not hidden its truth from those who can simulate
-it again.
-
-## Licence
-
-The images are free under CC-BY 4.0, https://creativecommons.org/licenses/by/4.0/: use them, and
-name where they are from.
-"""
+_README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
 
 
 def readme(info: Mapping[str, Any]) -> str:

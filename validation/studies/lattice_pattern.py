@@ -1,4 +1,4 @@
-"""The pattern of one square lattice: its mode at (π, π) against Eq. (mode), and its row of the table.
+"""The pattern of one square lattice: its mode at (π, π) against Eq. (mode), and its table row.
 
 The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
 variations, and of the material (Section "Graded Microstructures and Size Independence of the

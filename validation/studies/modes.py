@@ -10,9 +10,9 @@ One case in ``specimens/NAME/`` of the study's folder, NAME the digest of the de
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,6 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.spectra.pattern import mode_equivalent
 from modeharvest.idic.uncertainty.covariance import MatchedImages
-from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -37,24 +36,23 @@ from modeharvest.validation.studies.modes_specimen import (
 )
 from modeharvest.validation.studies.study import (
     ImagePairSpec,
+    Study,
     VirtualImagePair,
     require_different,
     require_mode,
 )
-from modeharvest.validation.truth import Comparison, compare, describe
+from modeharvest.validation.truth import Comparison
 from modeharvest.validation.workers import Case
 
-
-def measured_patterns(ran: pd.DataFrame) -> pd.DataFrame:
-    """The specimens whose pattern was there to be measured and was: converged on a pattern."""
-    if "outcome" not in ran:
-        return ran.iloc[:0]
-    return ran[(ran["first"] == "pattern") & (ran["outcome"] == "converged")]
-
-
-def hole_sizes(rows: pd.DataFrame) -> pd.DataFrame:
-    """Those that differ from the base in d/l only, and the base."""
-    return rows[rows["varied"].isin(["base", "d/l"])]
+PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
+WAVE_VECTORS = list(PARAMETERS[1:5])
+IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
+"""Eq. (mode) with a solid junction at the origin; the phases a₆ and a₇ in shares of l."""
+NOISE = 0.01
+"""For which error bars are predicted; the images have none [fraction of full scale]."""
+PATTERN_SHARE = 0.8
+"""A critical mode of which less is the pattern, whatever its amplitude in each cell, is another."""
+BASE = "base"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,15 +101,6 @@ class SpecimenPatterns:
         )
 
 
-IDEAL = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0])
-
-
-PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
-
-
-WAVE_VECTORS = list(PARAMETERS[1:5])
-
-
 def deviations(seen: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
     """Parameters less those of Eq. (mode), phases in shares of l."""
     values = seen[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
@@ -119,14 +108,9 @@ def deviations(seen: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
 
 
 def standardised_errors(seen: pd.DataFrame) -> NDArray[np.float64]:
-    """(specimens, 7) measured less best fit, in standard deviations by what is left over."""
+    """(specimens, 7) measured less best fit, in standard deviations by model error."""
     sd = seen[[f"{name}_sd_model_error" for name in PARAMETERS]].to_numpy(np.float64)
     return np.asarray((deviations(seen) - deviations(seen, "best_")).to_numpy() / sd)
-
-
-"""Of Eq. (mode); a₆ and a₇ are told in shares of l."""
-NOISE = 0.01
-"""Of the images, for which error bars are told; the images have none [fraction of full scale]."""
 
 
 def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -134,33 +118,30 @@ def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
     Parameters
     ----------
-    case
-        One of :meth:`modeharvest.validation.studies.modes.MeasuredModesStudy.prepare`.
-    folder
-        Of the study.
+    case, folder
+        One of :meth:`MeasuredModesStudy.prepare`, and the study's.
 
     Returns
     -------
     dict
-        ``ratio``, ``pitch_mm``, ...: the specimen; ``first``: "pattern", "other" or "none", what it
-        buckles into; ``critical_strain``, ``strain``; of the lattice ``lattice_...``; and where it
-        buckles, of the measurement and the best fit what :func:`_measured` returns.
+        Of the specimen :class:`SpecimenRow`; and where it buckles, of the measurement and the best
+        fit what :func:`_measured_row` returns.
     """
     own = specimen_folder(folder, case["specimen"])
     described = SpecimenSpec.read(own / "specimen.json")
     solution = _solution(described, folder)
     lattice = LatticeMode.of(described.specimen, described.material, described.divisions)
-    row = _specimen_row(described, solution) | _lattice_row(lattice)
-    if row["first"] == "none":
-        return row
-    subject = ImagePairSpec(
+    row = SpecimenRow.of(described, solution, lattice)
+    if row.first == "none":
+        return asdict(row)
+    spec = ImagePairSpec(
         described.experiment, described.imaging, described.correlation, lambda: solution
     )
-    scene = VirtualImagePair.open(own, subject.describe(own, row["strain"]))
+    pair = VirtualImagePair.open(own, spec.describe(own, row.strain))
     try:
-        return row | _measured_row(scene, lattice, own)
+        return asdict(row) | _measured_row(pair, lattice, own)
     finally:
-        scene.discard()
+        pair.discard()
 
 
 def _solution(described: SpecimenSpec, folder: Path) -> Solution:
@@ -173,90 +154,103 @@ def _solution(described: SpecimenSpec, folder: Path) -> Solution:
     return Solution.read(path)
 
 
-PATTERN_SHARE = 0.8
-"""A critical mode of which less is the pattern, whatever its amplitude in each cell, is another."""
+@dataclass(frozen=True)
+class SpecimenRow:
+    """What a specimen is, and how it and the infinite lattice of its cells buckle.
+
+    Parameters
+    ----------
+    ratio, smallest_ratio, largest_ratio
+        d/l in the middle, and of its holes [-].
+    first, pattern_share
+        What it buckles into, "pattern", "other" or "none"; the pattern's share of that mode [-].
+    critical_strain, strain
+        Where it buckles and where it is measured [-].
+    unstable_pivots
+        Negative pivots where it is measured.
+    lattice_first, lattice_pattern_strain, lattice_overlap_ideal, lattice_a1
+        ``kind``, ``pattern`` and ``overlap`` of the lattice's
+        :class:`~modeharvest.validation.studies.lattice_pattern.ModeRow`, and its a₁.
+    """
+
+    ratio: float
+    smallest_ratio: float
+    largest_ratio: float
+    pitch_mm: float
+    first: str
+    pattern_share: float
+    critical_strain: float
+    strain: float
+    unstable_pivots: int | None
+    simulation: str
+    lattice_first: str
+    lattice_pattern_strain: float
+    lattice_overlap_ideal: float
+    lattice_a1: float
+
+    @classmethod
+    def of(cls, described: SpecimenSpec, solution: Solution, lattice: LatticeMode) -> SpecimenRow:
+        """Of a simulated specimen."""
+        specimen, critical = described.specimen, solution.info.get("critical")
+        share = critical["pattern_overlap_by_cell"] if critical else np.nan
+        buckled = "pattern" if share >= PATTERN_SHARE else "other"
+        strain = max(s.nominal_strain for s in solution.snapshots)
+        return cls(
+            specimen.diameter / specimen.pitch,
+            float(specimen.diameters.min() / specimen.pitch),
+            float(specimen.diameters.max() / specimen.pitch),
+            specimen.pitch,
+            buckled if critical else "none",
+            share,
+            critical["strain"] if critical else np.nan,
+            strain,
+            solution.at(strain).negative_pivots,
+            solution.info.get("outcome", ""),
+            lattice.mode.row.kind,
+            lattice.mode.row.pattern,
+            lattice.mode.row.overlap,
+            lattice.aspect,
+        )
 
 
-def _specimen_row(described: SpecimenSpec, solution: Solution) -> dict[str, Any]:
-    """What a specimen is, and how it buckles."""
-    specimen, critical = described.specimen, solution.info.get("critical")
-    share = critical["pattern_overlap_by_cell"] if critical else np.nan
-    is_pattern = share >= PATTERN_SHARE
-    strain = max(s.nominal_strain for s in solution.snapshots)
-    smallest, largest = specimen.diameters.min(), specimen.diameters.max()
-    return {
-        "ratio": specimen.diameter / specimen.pitch,
-        "smallest_ratio": float(smallest / specimen.pitch),
-        "largest_ratio": float(largest / specimen.pitch),
-        "pitch_mm": specimen.pitch,
-        "first": ("pattern" if is_pattern else "other") if critical else "none",
-        "pattern_share": share,
-        "critical_strain": critical["strain"] if critical else np.nan,
-        "strain": strain,
-        "unstable_pivots": solution.at(strain).negative_pivots,
-        "simulation": solution.info.get("outcome", ""),
-    }
-
-
-def _lattice_row(lattice: LatticeMode) -> dict[str, Any]:
-    row = lattice.mode.row
-    return {
-        "lattice_first": row.kind,
-        "lattice_pattern_strain": row.pattern,
-        "lattice_overlap_ideal": row.overlap,
-        "lattice_a1": lattice.aspect,
-    }
-
-
-def _measured_row(scene: VirtualImagePair, lattice: LatticeMode, own: Path) -> dict[str, Any]:
-    """Correlate from the standard start; set against the truth, its best fit and the lattice.
+def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> dict[str, Any]:
+    """Correlate from the standard initial guess; compare with truth, best fit and lattice.
 
     Returns
     -------
     dict
         ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form
         nearest to the ideal one, phases in shares of l; ``a1_sd_model_error`` and ``a1_sd_noise``
-        ...: standard deviations by what the ansatz leaves over, and by noise of :data:`NOISE`.
-        ``w_px``, ``best_px``, ``lost_px``: rms per component of truth - IDIC, truth - best fit
-        and IDIC - best fit. ``overlap_lattice``: of the mode, of constant amplitude, with the
-        infinite lattice's over all cells; ``overlap_truth``: of v₁φ₁ with the truth less the best
-        fit's v₀ over the cellular material; ``best_...`` the same of the best fit.
-        ``amplitude``: rms length of v₁φ₁ over the cellular material, in shares of l.
+        ...: standard deviations by model error, and by noise of :data:`NOISE`.
+        The fields of :class:`~modeharvest.validation.truth.ErrorParts`.
+        ``overlap_lattice``: of the mode, of constant amplitude, with the infinite lattice's over
+        all cells; ``overlap_truth``: of v₁φ₁ with the truth less the best fit's v₀ over the
+        cellular material; ``best_...`` the same of the best fit. ``amplitude``: rms length of
+        v₁φ₁ over the cellular material, in shares of l.
     """
-    result = scene.correlate()
-    found = compare(scene.images, scene.strain, result, scene.start(), camera=scene.how.camera)
+    result = pair.correlate()
+    found, specimen = pair.compare(result), pair.specimen
     result.write(own / "result.json")
     found.best.write(own / "best.json")
-    pitch = scene.specimen.pitch
-    sd = {
-        "model_error": _model_error_sd(scene, result),
-        "noise": _sd(result, result.covariance(NOISE), pitch),
-    }
     row: dict[str, Any] = {"outcome": result.outcome.value, "iterations": len(result.history)}
     for prefix, fit in (("", result), ("best_", found.best)):
-        row |= dict(
-            zip((prefix + a for a in PARAMETERS), _nearest_parameters(fit, pitch), strict=True)
-        )
+        values = _nearest_parameters(fit, specimen.pitch)
+        row |= {prefix + name: value for name, value in zip(PARAMETERS, values, strict=True)}
         row[prefix + "overlap_lattice"] = lattice.overlap(
-            scene.specimen, fit.ansatz.modes[0].family, fit.mode_parameters()
+            specimen, fit.ansatz.modes[0].family, fit.mode_parameters()
         )
-    for cause, values in sd.items():
-        row |= dict(zip((f"{a}_sd_{cause}" for a in PARAMETERS), values, strict=True))
-    return row | _errors(found) | _patterns(found, scene.specimen)
-
-
-def _errors(found: Comparison) -> dict[str, float]:
-    """Rms per component of the error's parts [px]."""
-    parts = {"w_px": found.w, "best_px": found.best_error, "lost_px": found.idic_to_best}
-    px = found.grid.pixel_size
-    return {k: float(describe(v, found.mask, px)["rms_per_component"]) for k, v in parts.items()}
+    for cause, covariance in (
+        ("model_error", _model_error_covariance(pair, result)),
+        ("noise", result.covariance(NOISE)),
+    ):
+        sd = np.sqrt(np.diag(covariance)[result.ansatz.phi_slice(0)]) / _units(specimen.pitch)
+        row |= {f"{name}_sd_{cause}": value for name, value in zip(PARAMETERS, sd, strict=True)}
+    return row | asdict(found.error_parts()) | _patterns(found, specimen)
 
 
 def _patterns(found: Comparison, specimen: Specimen) -> dict[str, float]:
     """How alike v₁φ₁ and the specimen's own pattern are, and how strong the first is."""
-    a, b = specimen.cellular_half_size
-    x, y = np.abs(found.grid.x)[None, :], np.abs(found.grid.y)[:, None]
-    inside = found.mask & (x <= a) & (y <= b)
+    inside = found.cellular(specimen)
     true = (found.displacement - found.best.v0())[inside]
     measured, best = (fit.fluctuation()[inside] for fit in (found.result, found.best))
     return {
@@ -278,29 +272,49 @@ def _nearest_parameters(fit: Result, pitch: float) -> FloatArray:
     return np.asarray(nearest / _units(pitch))
 
 
-def _sd(result: Result, covariance: FloatArray, pitch: float) -> FloatArray:
-    """(7,) standard deviations of :func:`_parameters`."""
-    part = result.ansatz.phi_slice(0)
-    return np.asarray(np.sqrt(np.diag(covariance)[part]) / _units(pitch))
-
-
-def _model_error_sd(scene: VirtualImagePair, result: Result) -> FloatArray:
-    """The same by the model error, cell by cell."""
-    pitch = scene.specimen.pitch
-    pair = ImagePair(*scene.pair(), scene.images.grid, *scene.masks())
-    seen = MatchedImages.of(result, pair, scene.how.edge_px)
-    return _sd(result, seen.sandwich_covariance(pitch), pitch)
+def _model_error_covariance(pair: VirtualImagePair, result: Result) -> FloatArray:
+    matched = MatchedImages.of(result, pair.pair, pair.options.edge_px)
+    return matched.sandwich_covariance(pair.specimen.pitch)
 
 
 def _units(pitch: float) -> FloatArray:
     return np.array([1.0] * 5 + [pitch] * 2)
 
 
-BASE = "base"
+@dataclass(frozen=True, eq=False)
+class ModesAnalysis:
+    """What the table of measured modes says, each part with a row for each specimen.
+
+    Parameters
+    ----------
+    ran
+        All that succeeded.
+    measured
+        Those whose pattern was there to be measured and was: converged on a pattern.
+    sizes
+        Of these the base and those that differ from it in d/l only, by d/l.
+    """
+
+    ran: pd.DataFrame
+    measured: pd.DataFrame
+    sizes: pd.DataFrame
+
+    @classmethod
+    def of(cls, table: pd.DataFrame) -> ModesAnalysis:
+        """From the table of all specimens."""
+        ran = table[table["error"] == ""]
+        is_measured = (
+            (ran["first"] == "pattern") & (ran["outcome"] == "converged")
+            if "outcome" in ran
+            else np.zeros(len(ran), dtype=np.bool_)
+        )
+        measured = ran[is_measured]
+        sizes = measured[measured["varied"].isin([BASE, "d/l"])].sort_values("ratio")
+        return cls(ran, measured, sizes)
 
 
 @dataclass(frozen=True)
-class MeasuredModesStudy:
+class MeasuredModesStudy(Study[ModesAnalysis]):
     """Measure the mode on specimens that differ from a base in one respect each.
 
     Each is compressed until its pattern is as strong as the base's, in shares of l.
@@ -328,6 +342,16 @@ class MeasuredModesStudy:
     InputError
         If a value is out of its range, or comes twice.
     """
+
+    question: ClassVar[str] = (
+        "The paper argues that the pattern of a square stacking of holes is one mode, "
+        "whatever the size of its cells, nearly whatever that of its holes, and the material. "
+        "Here it is measured: specimens are buckled, imaged and correlated with the mode’s "
+        "parameters free, and what is found is set against the mode of the infinite lattice, "
+        "against Eq. (mode) of the paper, and against the best fit to the specimen’s own "
+        "displacement."
+    )
+    function: ClassVar[str] = f"{__name__}:one_specimen"
 
     strain: float = 0.128
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
@@ -359,23 +383,6 @@ class MeasuredModesStudy:
             require_different(name, getattr(self, name))
 
     @property
-    def question(self) -> str:
-        """What is asked, for the report."""
-        return (
-            "The paper argues that the pattern of a square stacking of holes is one mode, "
-            "whatever the size of its cells, nearly whatever that of its holes, and the material. "
-            "Here it is measured: specimens are buckled, imaged and correlated with the mode’s "
-            "parameters free, and what is found is set against the mode of the infinite lattice, "
-            "against Eq. (mode) of the paper, and against the best fit to the specimen’s own "
-            "displacement."
-        )
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-        return f"{one_specimen.__module__}:{one_specimen.__name__}"
-
-    @property
     def seeds(self) -> str:
         """The only thing that is random."""
         return "one speckle, of imaging.speckle.seed"
@@ -396,7 +403,7 @@ class MeasuredModesStudy:
         )
 
     def prepare(
-        self, subject: ImagePairSpec, folder: Path, progress: Progress = silent
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Describe the specimens; they are simulated and imaged case by case.
 
@@ -405,16 +412,20 @@ class MeasuredModesStudy:
         InputError
             If the base has no critical point below the strain, or a specimen can't be.
         """
-        base = SpecimenSpec.of(subject, self.strain, self.largest, self.divisions)
+        base = SpecimenSpec.of(spec, self.strain, self.largest, self.divisions)
         name = base.leave(folder)
-        snapshot = subject.solution.at(self.strain)
-        own = Solution(subject.solution.mesh, (snapshot,), subject.solution.info)
+        snapshot = spec.solution.at(self.strain)
+        own = Solution(spec.solution.mesh, (snapshot,), spec.solution.info)
         own.write(base.solution_path(folder))
         others = [
             {"varied": varied, "level": level, "specimen": described.leave(folder)}
             for varied, level, described in self._others(base)
         ]
         return ({"varied": BASE, "level": "", "specimen": name}, *others)
+
+    def analyse(self, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
+        """The specimens whose pattern was measured."""
+        return ModesAnalysis.of(table)
 
     def _others(self, base: SpecimenSpec) -> Iterator[tuple[str, str, SpecimenSpec]]:
         """What is varied, its level in words, and the specimen."""

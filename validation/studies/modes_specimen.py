@@ -1,4 +1,4 @@
-"""Specimens of the study of measured modes: described, buckled, and the mode of their infinite lattice.
+"""Specimens of the study of measured modes: descriptions, buckling, and their lattices' modes.
 
 A description is in ``specimens/NAME/specimen.json`` of the study's folder, NAME the digest of its
 content.
@@ -28,10 +28,12 @@ from modeharvest.imaging.imageset import image_key
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, MissingDependencyError
-from modeharvest.util.files import read_json, write_json
+from modeharvest.util.files import read_json
 from modeharvest.util.stages import digest
+from modeharvest.util.typed import made
 from modeharvest.validation.studies.lattice_pattern import PatternMode, StudiedLattice, pattern_mode
 from modeharvest.validation.studies.study import ImagePairSpec
+from modeharvest.validation.workers import leave
 
 NO_DOLFINX = (
     "simulating specimens needs dolfinx >= 0.9, which is not on PyPI; with conda-forge: 'conda "
@@ -159,9 +161,7 @@ class SpecimenSpec:
     given: str = ""
 
     @classmethod
-    def of(
-        cls, subject: ImagePairSpec, strain: float, largest: float, divisions: int
-    ) -> SpecimenSpec:
+    def of(cls, spec: ImagePairSpec, strain: float, largest: float, divisions: int) -> SpecimenSpec:
         """Of a simulated experiment, as strongly buckled as it is at a strain [-].
 
         Raises
@@ -170,7 +170,7 @@ class SpecimenSpec:
             If the experiment is not perfect, did not buckle, or has a material that can't be
             written down.
         """
-        e = subject.experiment
+        e = spec.experiment
         if not e.is_perfect or e.guided:
             raise InputError(
                 "study: expected a perfect specimen that buckles at a strain of its own, got an "
@@ -179,15 +179,15 @@ class SpecimenSpec:
         if type(e.material) not in MATERIALS.values():
             known = [kind.__name__ for kind in MATERIALS.values()]
             raise InputError(f"study: expected a material among {known}, got {e.material!r}")
-        critical = subject.solution.info.get("critical")
+        critical = spec.solution.info.get("critical")
         if not critical or critical["strain"] >= strain:
             raise InputError(
                 f"study: expected an experiment that has buckled at {100 * strain:g} %, got one "
                 + (f"with {100 * critical['strain']:.4g} % as its" if critical else "with no")
                 + " critical strain"
             )
-        there = subject.solution.at(strain).displacement
-        amplitude = PatternCells(subject.solution.mesh, e.specimen).amplitude(there)
+        there = spec.solution.at(strain).displacement
+        amplitude = PatternCells(spec.solution.mesh, e.specimen).amplitude(there)
         return cls(
             specimen=e.specimen,
             material=e.material,
@@ -197,9 +197,9 @@ class SpecimenSpec:
             amplitude=amplitude,
             largest=largest,
             divisions=divisions,
-            imaging=subject.imaging,
-            correlation=subject.correlation,
-            given=image_key(subject.solution, subject.imaging, (strain,))[:16],
+            imaging=spec.imaging,
+            correlation=spec.correlation,
+            given=image_key(spec.solution, spec.imaging, (strain,))[:16],
         )
 
     @property
@@ -255,20 +255,11 @@ class SpecimenSpec:
     def read(cls, path: Path) -> SpecimenSpec:
         """Read what :meth:`leave` wrote."""
         values = dict(read_json(path))
-        made = {
-            "specimen": Specimen(**values["specimen"]),
-            "material": material_of(values["material"]),
-            "path": PathOptions(**values["path"]),
-            "imaging": _SPEC.validate_python(values["imaging"]),
-            "correlation": SquareLatticeOptions(**values["correlation"]),
-        }
-        return cls(**{**values, **made})
+        return made(cls, values | {"material": material_of(values["material"])})
 
     def leave(self, folder: Path) -> str:
         """Write it into the study's folder; returns the specimen's name."""
-        name = digest(self.plain())[:16]
-        write_json(specimen_folder(folder, name) / "specimen.json", self.plain())
-        return name
+        return leave(self.plain(), folder, "specimens/{}/specimen.json")
 
 
 def specimen_folder(folder: Path, name: str) -> Path:

@@ -21,130 +21,65 @@ gradient of g's own noise is no longer small against the speckle's.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.idic.uncertainty.covariance import MatchedImages, field_errors
+from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.studies.noise_statistics import (
+    COVARIANCES,
+    HESSIAN_CORRECTED,
+    PARTS,
+    FieldPoints,
+    NoiseAnalysis,
+)
 from modeharvest.validation.studies.study import (
     MOST,
     ImagePairSpec,
-    Images,
+    Study,
     VirtualImagePair,
-    error_parts,
     require_different,
 )
 from modeharvest.validation.workers import Case
 
-PARTS = {"u": slice(0, 2), "v0": slice(2, 4), "v1": slice(4, 5), "v1 phi1": slice(5, 7)}
-"""The fields by their names, and which of the seven components are theirs."""
-PER_CELL = 3
-"""Points along the edge of a unit cell: the errors are as smooth as the ansatz."""
-
-
-@dataclass(frozen=True, eq=False)
-class FieldPoints:
-    """Where fields are compared.
-
-    Parameters
-    ----------
-    scene
-        Whose fields.
-    rows, cols
-        Axes of the coarse grid, in pixels of the images.
-    inside
-        (rows, cols) True on material; the points are those, row by row.
-    """
-
-    scene: VirtualImagePair
-    rows: NDArray[np.intp]
-    cols: NDArray[np.intp]
-    inside: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, scene: VirtualImagePair) -> FieldPoints:
-        """The points of a pair, the same in every worker."""
-        grid, mask = scene.images.grid, scene.mask()
-        step = max(1, round(scene.specimen.pitch / PER_CELL / grid.pixel_size))
-        rows, cols = (np.arange((n % step) // 2, n, step) for n in grid.shape)
-        return cls(scene, rows, cols, mask[np.ix_(rows, cols)])
-
-    @property
-    def x(self) -> FloatArray:
-        """(points,) [mm]."""
-        return np.asarray(self.scene.images.grid.x[self.cols[np.nonzero(self.inside)[1]]])
-
-    @property
-    def y(self) -> FloatArray:
-        """(points,) [mm]."""
-        return np.asarray(self.scene.images.grid.y[self.rows[np.nonzero(self.inside)[0]]])
-
-    @property
-    def cellular(self) -> NDArray[np.bool_]:
-        """(points,) True in the part with holes: elsewhere v1 says little or nothing."""
-        a, b = self.scene.specimen.cellular_half_size
-        return np.asarray((np.abs(self.x) <= a) & (np.abs(self.y) <= b))
-
-    def fields(self, unknowns: FloatArray) -> FloatArray:
-        """(points, 7): u, v0 (2 each), v1, v1 phi1 (2) [mm], in the order of ``PARTS``."""
-        ansatz, x, y = self.scene.ansatz, self.x[:, None], self.y[:, None]
-        parts = (
-            ansatz.displacement(unknowns, x, y),
-            ansatz.v0(unknowns, x, y),
-            ansatz.v(0, unknowns, x, y)[..., None],
-            ansatz.fluctuation(0, unknowns, x, y),
-        )
-        return np.concatenate([part[:, 0] for part in parts], axis=-1)
-
-    def map(self, values: FloatArray) -> FloatArray:
-        """(rows, cols) of values at the points; NaN where there is no material."""
-        drawn = np.full(self.inside.shape, np.nan)
-        drawn[self.inside] = values
-        return drawn
-
-
-CAUSES = ("bound", "det F", "curvature", "least")
-"""Each with all that stand before it."""
-HESSIAN_CORRECTED = "softened"
-"""2 H⁻¹MH⁻¹, the curvature only: the Hessian-corrected covariance of the error analysis."""
-COVARIANCES = (*CAUSES, HESSIAN_CORRECTED)
 EXAMPLES = 24
 """Of the noise, for V; each counts as many times as there are unit cells."""
 _WEAK_NOISE = 0.01
 """Noise of the examples [fraction of full scale]; only its linear effect is taken."""
 
 
-def matched_images(scene: VirtualImagePair, result: Result, images: Images) -> MatchedImages:
-    """What a correlation of images of this scene compared at its end."""
-    pair = ImagePair(*images, scene.images.grid, *scene.masks())
-    return MatchedImages.of(result, pair, scene.how.edge_px)
+def matched_images(
+    virtual: VirtualImagePair, result: Result, pair: ImagePair | None = None
+) -> MatchedImages:
+    """What a correlation of a pair, or of a noisy one, compared at its solution."""
+    return MatchedImages.of(result, pair or virtual.pair, virtual.options.edge_px)
 
 
-def zero_residual(seen: MatchedImages) -> MatchedImages:
+def zero_residual(images: MatchedImages) -> MatchedImages:
     """The same without a residual: f is what g says that it is."""
-    pair = ImagePair(seen.reference, seen.deformed, seen.result.grid)
-    left = seen.result.residual(pair, seen.result.order)
-    f = np.where(seen.used, seen.reference - left, seen.reference).astype(np.float32)
-    return replace(seen, reference=f)
+    pair = ImagePair(images.reference, images.deformed, images.result.grid)
+    residual = images.result.residual(pair, images.result.order)
+    f = np.where(images.used, images.reference - residual, images.reference).astype(np.float32)
+    return replace(images, reference=f)
 
 
 def covariances_by_cause(
-    scene: VirtualImagePair, result: Result, seed: int
+    pair: VirtualImagePair, result: Result, seed: int
 ) -> dict[str, FloatArray]:
     """The (n, n) covariances of the unknowns for noise of 1 in both images, by their causes.
 
     Parameters
     ----------
-    scene, result
+    pair, result
         A pair of exact images, and what was found of it.
     seed
         Of the examples of noise.
@@ -152,24 +87,24 @@ def covariances_by_cause(
     Returns
     -------
     dict
-        For each of ``CAUSES`` and ``SOFTENED``; infinite on the diagonal where the images say
-        nothing.
+        For each of ``COVARIANCES``; infinite on the diagonal where the images say nothing.
     """
-    seen, cell = matched_images(scene, result, scene.pair()), scene.specimen.pitch
+    matched, cell = matched_images(pair, result), pair.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
     at = np.ix_(~lost, ~lost)
-    inverse, corrected = result.inverse[at], seen.inverse_hessian[at]
+    inverse, hessian = result.inverse[at], matched.inverse_hessian[at]
     M = np.linalg.inv(inverse)
-    # Noise in f pushes by s²M, noise in g by what its examples do.
+    # Noise in f perturbs the gradient by s²M, noise in g by what its examples do.
     V0, V = (
-        M + M @ _by_noise_of_g(images, cell, seed)[at] @ M for images in (zero_residual(seen), seen)
+        M + M @ _by_noise_of_g(images, cell, seed)[at] @ M
+        for images in (zero_residual(matched), matched)
     )
     known = {
         "bound": 2.0 * inverse,
         "det F": inverse @ V0 @ inverse,
-        "curvature": corrected @ V0 @ corrected,
-        "least": corrected @ V @ corrected,
-        HESSIAN_CORRECTED: 2.0 * corrected @ M @ corrected,
+        "curvature": hessian @ V0 @ hessian,
+        "least": hessian @ V @ hessian,
+        HESSIAN_CORRECTED: 2.0 * hessian @ M @ hessian,
     }
     found = {}
     for name, covariance in known.items():
@@ -178,14 +113,14 @@ def covariances_by_cause(
     return found
 
 
-def _by_noise_of_g(seen: MatchedImages, cell: float, seed: int) -> FloatArray:
-    """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone, pushing every cell independently."""
-    examples = _noise_examples(seen.reference, seed)
-    found = seen.noise_covariance(examples, cell, seen.result.inverse)
+def _by_noise_of_g(images: MatchedImages, cell: float, seed: int) -> FloatArray:
+    """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone, independent from cell to cell."""
+    examples = _noise_examples(images.reference, seed)
+    found = images.noise_covariance(examples, cell, images.result.inverse)
     return np.asarray(found / _WEAK_NOISE**2, dtype=np.float64)
 
 
-def _noise_examples(like: NDArray[np.float32], seed: int) -> Iterator[Images]:
+def _noise_examples(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, FloatImage]]:
     rng = np.random.default_rng([seed, EXAMPLES])
     none = np.zeros_like(like)
     for _ in range(EXAMPLES):
@@ -194,7 +129,39 @@ def _noise_examples(like: NDArray[np.float32], seed: int) -> Iterator[Images]:
 
 
 @dataclass(frozen=True)
-class NoiseStudy:
+class Realisation:
+    """What is found under one realisation of the noise, or without it.
+
+    Parameters
+    ----------
+    outcome, iterations, residual, unknowns
+        Of the correlation.
+    predicted
+        Standard deviations of the unknowns by the result's own covariance given the noise,
+        followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
+        each of ``COVARIANCES``, for noise of 1.
+    curvature_sd_mm
+        Rms over the points of u's standard deviation by the covariance H⁻¹: without noise and in
+        the first realisation of each level, else None.
+    w_px, model_error_px, measurement_error_px, v1_percent
+        Errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
+        :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
+    """
+
+    outcome: str
+    iterations: int
+    residual: float
+    unknowns: list[float]
+    predicted: list[float] | list[list[float]]
+    curvature_sd_mm: float | None = None
+    w_px: float | None = None
+    model_error_px: float | None = None
+    measurement_error_px: float | None = None
+    v1_percent: float | None = None
+
+
+@dataclass(frozen=True)
+class NoiseStudy(Study[NoiseAnalysis]):
     """Correlate a pair of images under white noise in both, many times.
 
     Parameters
@@ -214,6 +181,14 @@ class NoiseStudy:
         If a value is out of its range, or a level comes twice.
     """
 
+    question: ClassVar[str] = (
+        "A camera adds noise. What does it do to what is measured? The same pair of virtual "
+        "images is correlated under many realisations of white noise; bias and scatter are "
+        "set against the Cramér–Rao bound, and the error bars that each result predicts "
+        "against its errors."
+    )
+    function: ClassVar[str] = f"{__name__}:one_realisation"
+
     strain: float = 0.128
     levels: tuple[float, ...] = (0.002, 0.005, 0.01, 0.02)
     pairs: int = 25
@@ -230,21 +205,6 @@ class NoiseStudy:
                 f"{self.pairs} and {self.seed}"
             )
         require_different("levels", self.levels)
-
-    @property
-    def question(self) -> str:
-        """What is asked, for the report."""
-        return (
-            "A camera adds noise. What does it do to what is measured? The same pair of virtual "
-            "images is correlated under many realisations of white noise; bias and scatter are "
-            "set against the Cramér–Rao bound, and the error bars that each result tells of "
-            "itself against its errors."
-        )
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-        return f"{__name__}:one_realisation"
 
     @property
     def seeds(self) -> str:
@@ -264,94 +224,77 @@ class NoiseStudy:
         return replace(self, pairs=max(2, -(-self.pairs // 5)))
 
     def prepare(
-        self, subject: ImagePairSpec, folder: Path, progress: Progress = silent
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Make the images; the cases are level, number and sign of the noise, the first without."""
-        name = subject.describe(folder, self.strain)
+        name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)
-        base = {"subject": name, "level": 0.0, "pair": 0, "sign": 1, "seed": self.seed}
+        base = {"images": name, "level": 0.0, "pair": 0, "sign": 1, "seed": self.seed}
         noisy = [
-            {**base, "level": level, "pair": pair, "sign": sign}
+            {**base, "level": level, "pair": number, "sign": sign}
             for level in self.levels
-            for pair in range(self.pairs)
+            for number in range(self.pairs)
             for sign in (1, -1)
         ]
         return (base, *noisy)
 
+    def analyse(self, table: pd.DataFrame, folder: Path) -> NoiseAnalysis:
+        """Errors of all realisations against their bounds.
 
-def one_realisation(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Correlate under one realisation of the noise, from the standard start.
+        Raises
+        ------
+        InputError
+            If the case without noise failed, or no level has two whole pairs.
+        """
+        return NoiseAnalysis.of(table, VirtualImagePair.open(folder, table["images"].iloc[0]))
 
-    Parameters
-    ----------
-    case
-        One of :meth:`Noise.prepare`.
-    folder
-        Of the study.
 
-    Returns
-    -------
-    dict
-        ``unknowns``; ``told``, their standard deviations by the result's own covariance given
-        the noise, followed by those of the fields at
-        :class:`~modeharvest.validation.studies.noise.FieldPoints`. Without noise a list of
-        them for each of the ``LADDER``, for noise of 1, and what the truth says. ``give_mm``, how
-        far the displacement gives way by the cost's own curvature, without noise and in the first
-        realisation of each level.
+def one_realisation(case: Mapping[str, Any], folder: Path) -> Realisation:
+    """Correlate under one realisation of the noise, from the standard initial guess.
+
+    ``case``: one of :meth:`NoiseStudy.prepare`, ``folder``: the study's.
     """
-    scene, level = VirtualImagePair.open(folder, case["subject"]), float(case["level"])
-    images = _noisy(scene, case) if level else scene.pair()
-    result = scene.correlate(pair=images)
-    found = {
-        "outcome": result.outcome.value,
-        "iterations": result.iterations,
-        "residual": result.residual_rms,
-        "unknowns": result.unknowns.tolist(),
-    }
-    if not level:
-        return found | error_parts(scene, result) | _without_noise(scene, result, case["seed"])
-    if case["pair"] == 0 and case["sign"] == 1:
-        found["give_mm"] = _curvature_sd(scene, result, images)
-    return found | {"told": _predicted(scene, result, result.covariance(level))}
+    virtual, level = VirtualImagePair.open(folder, case["images"]), float(case["level"])
+    points = FieldPoints.of(virtual)
+    pair = _noisy(virtual.pair, case) if level else virtual.pair
+    result = virtual.correlate(pair=pair)
+    curvature_sd = None
+    if not level or (case["pair"] == 0 and case["sign"] == 1):
+        hessian = matched_images(virtual, result, pair).inverse_hessian
+        sd = points.predicted(result, hessian)[:, PARTS["u"]]
+        curvature_sd = float(np.sqrt((sd**2).mean()))
+    if level:
+        errors, predicted = {}, [_predicted(points, result, result.covariance(level))]
+    else:
+        by_cause = covariances_by_cause(virtual, result, case["seed"])
+        predicted = [_predicted(points, result, by_cause[name]) for name in COVARIANCES]
+        comparison = virtual.compare(result)
+        errors = asdict(comparison.error_parts())
+        errors["v1_percent"] = comparison.v1_percent(virtual.specimen)
+    return Realisation(
+        result.outcome.value,
+        result.iterations,
+        result.residual_rms,
+        list(map(float, result.unknowns)),
+        predicted[0] if level else predicted,
+        curvature_sd,
+        **errors,
+    )
 
 
-def _without_noise(scene: VirtualImagePair, result: Result, seed: int) -> dict[str, Any]:
-    found = covariances_by_cause(scene, result, seed)
-    return {
-        "told": [_predicted(scene, result, found[name]) for name in COVARIANCES],
-        "give_mm": _curvature_sd(scene, result, scene.pair()),
-    }
-
-
-def _curvature_sd(scene: VirtualImagePair, result: Result, images: Images) -> float:
-    """Rms over the points of u's standard deviation by the covariance H⁻¹ [mm]."""
-    corrected = matched_images(scene, result, images).inverse_hessian
-    return float(np.sqrt((_predicted_fields(scene, result, corrected)[:, PARTS["u"]] ** 2).mean()))
-
-
-def _noisy(scene: VirtualImagePair, case: Mapping[str, Any]) -> Images:
-    f, g = scene.pair()
+def _noisy(pair: ImagePair, case: Mapping[str, Any]) -> ImagePair:
+    f, g = pair.reference, pair.deformed
     rng = np.random.default_rng([case["seed"], case["pair"], round(1e9 * case["level"])])
     n_f, n_g = rng.normal(scale=case["level"], size=(2, *f.shape)).astype(np.float32)
     sign = np.float32(case["sign"])
-    return f + sign * n_f, g + sign * n_g
+    return pair.with_images(f + sign * n_f, g + sign * n_g)
 
 
-def _predicted(scene: VirtualImagePair, result: Result, covariance: FloatArray) -> list[float]:
-    """Standard deviations of the unknowns and of the fields, in the order of ``Points``.
+def _predicted(points: FieldPoints, result: Result, covariance: FloatArray) -> list[float]:
+    """Standard deviations of the unknowns, and of the fields at the points.
 
     Five digits are enough, and a third of the file.
     """
-    fields = _predicted_fields(scene, result, covariance)
+    fields = points.predicted(result, covariance)
     both = np.concatenate([np.sqrt(np.diag(covariance)), fields.ravel()])
     return [float(f"{value:.5g}") for value in both]
-
-
-def _predicted_fields(
-    scene: VirtualImagePair, result: Result, covariance: FloatArray
-) -> FloatArray:
-    """(points, 7)."""
-    points = FieldPoints.of(scene)
-    errors = field_errors(result, points.x[:, None], points.y[:, None], covariance)
-    parts = (errors.displacement, errors.v0, errors.v[0][..., None], errors.fluctuation[0])
-    return np.concatenate([part[:, 0] for part in parts], axis=-1)

@@ -1,7 +1,7 @@
-"""Statistics of a noise study: paired realisations, levels of noise, bounds, coverage.
+"""Statistics of a noise study: fields at points, paired realisations, bounds, coverage.
 
-Realisations come in pairs, n and -n. What the mean of a pair's two errors leaves is of second order
-in the noise, so that a bias shows long before it would out of the scatter.
+Realisations come in pairs, n and -n. The mean of a pair's two errors is of second order in the
+noise, so that a bias shows long before it would out of the scatter.
 """
 
 from __future__ import annotations
@@ -13,10 +13,90 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from modeharvest.idic.result import Result
+from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.validation.studies.noise import COVARIANCES, PARTS, FieldPoints
+from modeharvest.validation.studies.study import VirtualImagePair
 
+PARTS = {"u": slice(0, 2), "v0": slice(2, 4), "v1": slice(4, 5), "v1 phi1": slice(5, 7)}
+"""The fields by their names, and which of the seven components are theirs."""
+PER_CELL = 3
+"""Points along the edge of a unit cell: the errors are as smooth as the ansatz."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPoints:
+    """Where fields are compared.
+
+    Parameters
+    ----------
+    pair
+        Whose fields.
+    rows, cols
+        Axes of the coarse grid, in pixels of the images.
+    inside
+        (rows, cols) True on material; the points are those, row by row.
+    """
+
+    pair: VirtualImagePair
+    rows: NDArray[np.intp]
+    cols: NDArray[np.intp]
+    inside: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, pair: VirtualImagePair) -> FieldPoints:
+        """The points of a pair, the same in every worker."""
+        grid = pair.images.grid
+        step = max(1, round(pair.specimen.pitch / PER_CELL / grid.pixel_size))
+        rows, cols = (np.arange((n % step) // 2, n, step) for n in grid.shape)
+        return cls(pair, rows, cols, pair.mask[np.ix_(rows, cols)])
+
+    @property
+    def x(self) -> FloatArray:
+        """(points,) [mm]."""
+        return np.asarray(self.pair.images.grid.x[self.cols[np.nonzero(self.inside)[1]]])
+
+    @property
+    def y(self) -> FloatArray:
+        """(points,) [mm]."""
+        return np.asarray(self.pair.images.grid.y[self.rows[np.nonzero(self.inside)[0]]])
+
+    @property
+    def cellular(self) -> NDArray[np.bool_]:
+        """(points,) True in the part with holes: elsewhere v1 says little or nothing."""
+        a, b = self.pair.specimen.cellular_half_size
+        return np.asarray((np.abs(self.x) <= a) & (np.abs(self.y) <= b))
+
+    def fields(self, unknowns: FloatArray) -> FloatArray:
+        """(points, 7): u, v0 (2 each), v1, v1 phi1 (2) [mm], in the order of ``PARTS``."""
+        ansatz, x, y = self.pair.ansatz, self.x[:, None], self.y[:, None]
+        parts = (
+            ansatz.displacement(unknowns, x, y),
+            ansatz.v0(unknowns, x, y),
+            ansatz.v(0, unknowns, x, y)[..., None],
+            ansatz.fluctuation(0, unknowns, x, y),
+        )
+        return np.concatenate([part[:, 0] for part in parts], axis=-1)
+
+    def predicted(self, result: Result, covariance: FloatArray) -> FloatArray:
+        """(points, 7) standard deviations of :meth:`fields` by a covariance of the unknowns."""
+        errors = field_errors(result, self.x[:, None], self.y[:, None], covariance)
+        parts = (errors.displacement, errors.v0, errors.v[0][..., None], errors.fluctuation[0])
+        return np.concatenate([part[:, 0] for part in parts], axis=-1)
+
+    def map(self, values: FloatArray) -> FloatArray:
+        """(rows, cols) of values at the points; NaN where there is no material."""
+        drawn = np.full(self.inside.shape, np.nan)
+        drawn[self.inside] = values
+        return drawn
+
+
+CAUSES = ("bound", "det F", "curvature", "least")
+"""Each with all that stand before it."""
+HESSIAN_CORRECTED = "hessian"
+"""2 H⁻¹MH⁻¹: :func:`~modeharvest.idic.uncertainty.covariance.hessian_corrected_covariance`."""
+COVARIANCES = (*CAUSES, HESSIAN_CORRECTED)
 _NORMAL_95 = 1.959964
 """Half the width of a 95 % interval [standard deviations]."""
 
@@ -46,15 +126,15 @@ class PairedErrors:
     ----------
     errors
         (pairs, 2, ...) of the realisations n and -n, in any unit.
-    told
-        Same shape: the standard deviations that each result tells of itself.
+    predicted
+        Same shape: the standard deviations that each result predicts.
     bound
         (...): the least standard deviations there can be; 0 for what no noise moves (a mode
         outside its support), which does not count.
     """
 
     errors: FloatArray
-    told: FloatArray
+    predicted: FloatArray
     bound: FloatArray
 
     @property
@@ -67,16 +147,16 @@ class PairedErrors:
         """What counts in units of the bound, flat: everything weighs alike."""
         kept = self.of(self.counted)
         return PairedErrors(
-            kept.errors / kept.bound, kept.told / kept.bound, np.ones_like(kept.bound)
+            kept.errors / kept.bound, kept.predicted / kept.bound, np.ones_like(kept.bound)
         )
 
     def of(self, part: NDArray[np.bool_]) -> PairedErrors:
         """Some of the quantities: those where ``part``, of the bound's shape, is True."""
-        return PairedErrors(self.errors[:, :, part], self.told[:, :, part], self.bound[part])
+        return PairedErrors(self.errors[:, :, part], self.predicted[:, :, part], self.bound[part])
 
     def against(self, factor: FloatArray) -> PairedErrors:
         """The same errors, bound and error bars ``factor`` (...) as large."""
-        return PairedErrors(self.errors, factor * self.told, factor * self.bound)
+        return PairedErrors(self.errors, factor * self.predicted, factor * self.bound)
 
     # -- each quantity by itself; NaN for what does not count ---------------------------------
 
@@ -112,7 +192,7 @@ class PairedErrors:
 
     @property
     def bias(self) -> Estimate:
-        """Rms of the mean error, freed from what is left of the scatter, over rms bound [-]."""
+        """Rms of the mean error, freed from the remaining scatter, over rms bound [-]."""
         even, count = self.of(self.counted).errors.mean(axis=1), len(self.errors)
         mean_square = float((even.mean(axis=0) ** 2).mean())
         scatter = float((even.var(axis=0, ddof=1) / count).mean())
@@ -125,12 +205,6 @@ class PairedErrors:
         shares = self._inside[:, :, self.counted].mean(axis=(1, 2))
         return Estimate(float(shares.mean()), float(shares.std(ddof=1) / np.sqrt(len(shares))))
 
-    @property
-    def told_over_error(self) -> float:
-        """Rms of the standard deviations told over the rms error [-]."""
-        kept = self.of(self.counted)
-        return float(np.sqrt((kept.told**2).mean() / (kept.errors**2).mean()))
-
     def _over_bound(self, values: FloatArray) -> FloatArray:
         return np.asarray(
             np.divide(values, self.bound, out=np.full(values.shape, np.nan), where=self.counted)
@@ -138,7 +212,7 @@ class PairedErrors:
 
     @property
     def _inside(self) -> FloatArray:
-        return np.asarray(np.abs(self.errors) < _NORMAL_95 * self.told, dtype=np.float64)
+        return np.asarray(np.abs(self.errors) < _NORMAL_95 * self.predicted, dtype=np.float64)
 
 
 Levels = Mapping[float, Mapping[str, PairedErrors]]
@@ -174,7 +248,7 @@ class NoiseErrors:
 
 @dataclass(frozen=True, eq=False)
 class NoiseFreeCase:
-    """The end without noise.
+    """The solution without noise.
 
     Parameters
     ----------
@@ -194,26 +268,28 @@ class NoiseFreeCase:
 
     @property
     def unknowns(self) -> FloatArray:
-        """(n,) what all errors are told against."""
+        """(n,) what all errors are measured from."""
         return np.array(self.row["unknowns"])
 
-    def told(self, cause: str) -> NoiseErrors:
-        """Standard deviations for noise of 1 by one of the ``LADDER``."""
-        flat = np.array(self.row["told"][COVARIANCES.index(cause)], dtype=np.float64)
+    def predicted(self, cause: str) -> NoiseErrors:
+        """Standard deviations for noise of 1 by one of ``COVARIANCES``."""
+        flat = np.array(self.row["predicted"][COVARIANCES.index(cause)], dtype=np.float64)
         return NoiseErrors.of(flat, len(self.row["unknowns"]))
 
     def factors(self, cause: str) -> dict[str, FloatArray]:
         """How much larger than the bound they are: 1 where there is none."""
         found = {}
         for (name, sd), bound in zip(
-            self.told(cause).parts().items(), self.told("bound").parts().values(), strict=True
+            self.predicted(cause).parts().items(),
+            self.predicted("bound").parts().values(),
+            strict=True,
         ):
             known = np.isfinite(bound) & (bound > 0.0)
             found[name] = np.divide(sd, bound, out=np.ones_like(bound), where=known)
         return found
 
 
-def read_levels(table: pd.DataFrame, home: NoiseFreeCase, points: FieldPoints) -> Levels:
+def read_levels(table: pd.DataFrame, noise_free: NoiseFreeCase, points: FieldPoints) -> Levels:
     """The errors of all realisations, and their bound 2 s²M⁻¹.
 
     Raises
@@ -226,15 +302,15 @@ def read_levels(table: pd.DataFrame, home: NoiseFreeCase, points: FieldPoints) -
     for level, part in noisy.groupby("level"):
         by_pair = [pair.sort_values("sign") for _, pair in part.groupby("pair") if len(pair) == 2]
         if len(by_pair) >= 2:
-            found[float(level)] = _read_level(float(level), by_pair, home, points)
+            found[float(level)] = _read_level(float(level), by_pair, noise_free, points)
     if not found:
         raise InputError("study: expected two whole pairs of realisations at a level, got fewer")
     return found
 
 
-def against_bound(levels: Levels, home: NoiseFreeCase, cause: str) -> Levels:
-    """Set the same errors against another bound, and let error bars know of what it knows."""
-    factors = home.factors(cause)
+def against_bound(levels: Levels, noise_free: NoiseFreeCase, cause: str) -> Levels:
+    """Set the same errors against another bound, and error bars by the same cause."""
+    factors = noise_free.factors(cause)
     return {
         level: {name: pairs.against(factors[name]) for name, pairs in parts.items()}
         for level, parts in levels.items()
@@ -242,21 +318,71 @@ def against_bound(levels: Levels, home: NoiseFreeCase, cause: str) -> Levels:
 
 
 def _read_level(
-    level: float, by_pair: list[pd.DataFrame], home: NoiseFreeCase, points: FieldPoints
+    level: float, by_pair: list[pd.DataFrame], noise_free: NoiseFreeCase, points: FieldPoints
 ) -> dict[str, PairedErrors]:
     def column(name: str) -> FloatArray:
         return np.array([[np.array(v, dtype=np.float64) for v in pair[name]] for pair in by_pair])
 
-    true, a = home.unknowns, column("unknowns")
+    true, a = noise_free.unknowns, column("unknowns")
     fields = np.array([[points.fields(one) for one in pair] for pair in a]) - points.fields(true)
-    errors, told = NoiseErrors(a - true, fields), NoiseErrors.of(column("told"), len(true))
-    least = home.told("bound")
+    errors, predicted = (
+        NoiseErrors(a - true, fields),
+        NoiseErrors.of(column("predicted"), len(true)),
+    )
+    least = noise_free.predicted("bound")
     least.fields[~points.cellular, PARTS["v1"]] = 0.0  # where phi1 fades out it does not count
     found = {}
     for name, off in errors.parts().items():
         bound = level * least.parts()[name]
         known = np.isfinite(bound)  # the others are not determined by the images
         found[name] = PairedErrors(
-            np.where(known, off, 0.0), told.parts()[name], np.where(known, bound, 0.0)
+            np.where(known, off, 0.0), predicted.parts()[name], np.where(known, bound, 0.0)
         )
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseAnalysis:
+    """What the table of a noise study says.
+
+    Parameters
+    ----------
+    pair, points
+        What was measured, and where fields are compared.
+    noise_free
+        The case without noise.
+    by_bound, by_least, by_hessian
+        Errors against the Cramér–Rao bound, against the least of least squares, and against the
+        Hessian-corrected covariance.
+    curvature_sd_ratio
+        By level, u's standard deviation by noisy images' own curvature over that of exact ones.
+    not_converged
+        Number of correlations.
+    """
+
+    pair: VirtualImagePair
+    points: FieldPoints
+    noise_free: NoiseFreeCase
+    by_bound: Levels
+    by_least: Levels
+    by_hessian: Levels
+    curvature_sd_ratio: Mapping[float, float]
+    not_converged: int
+
+    @classmethod
+    def of(cls, table: pd.DataFrame, pair: VirtualImagePair) -> NoiseAnalysis:
+        """From the table of all realisations of a pair."""
+        points, noise_free = FieldPoints.of(pair), NoiseFreeCase.of(table)
+        levels = read_levels(table, noise_free, points)
+        done = table[table["error"] == ""]
+        sd = done[done["curvature_sd_mm"].notna()].set_index("level")["curvature_sd_mm"]
+        return cls(
+            pair,
+            points,
+            noise_free,
+            levels,
+            against_bound(levels, noise_free, "least"),
+            against_bound(levels, noise_free, HESSIAN_CORRECTED),
+            {float(level): float(sd[level] / sd[0.0]) for level in sd.index if level},
+            int((done["outcome"] != "converged").sum()),
+        )

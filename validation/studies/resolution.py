@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ import pandas as pd
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.uncertainty.covariance import field_errors
+from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -21,75 +22,36 @@ from modeharvest.validation.campaign import grid
 from modeharvest.validation.resolution.buckled import (
     LARGEST,
     AddedWave,
-    AnalyticPair,
     BuckledMotion,
     ResolutionSpec,
+    noisy,
 )
-from modeharvest.validation.resolution.transfer import wave_share
-from modeharvest.validation.resolution.waves import AXES, QUANTITIES, WAVED, TransferCurves
-from modeharvest.validation.studies.study import MOST, require_different, require_mode
-from modeharvest.validation.studies.study import ImagePairSpec as Experiment
+from modeharvest.validation.resolution.transfer import (
+    AXES,
+    WAVED,
+    DegreeResolution,
+    Passband,
+    TransferCurves,
+    degrees_of,
+    subset_indicator,
+    wave_share,
+)
+from modeharvest.validation.studies.study import (
+    MOST,
+    ImagePairSpec,
+    Study,
+    require_different,
+    require_mode,
+)
 from modeharvest.validation.workers import Case
 
-
-def noise_floors(done: pd.DataFrame, subject: ResolutionSpec) -> pd.DataFrame:
-    """Scatter under noise against what each result's covariance tells, and the least there can be.
-
-    The rms over realisations and material [px], by motion, degree and quantity.
-    """
-    rows = []
-    for motion, what in MOTIONS.items():
-        noisy = done[(done["task"] == "noise") & (done["motion"] == motion)]
-        floors = done[(done["task"] == "floor") & (done["motion"] == motion)]
-        for degree in subject.measured:
-            least = floors[floors["degree"] == degree]
-            if len(noisy) < 2 or not len(least):
-                continue
-            for name in QUANTITIES:
-                squares = noisy[f"{name}_{degree}"].to_numpy(float) ** 2
-                told = float(np.sqrt((noisy[f"told_{name}_{degree}"] ** 2).mean()))
-                scatter = float(np.sqrt(squares.mean()))
-                error = squares.std(ddof=1) / np.sqrt(len(squares)) / (2.0 * scatter)
-                rows.append({
-                    "images": what, "degree": degree, "quantity": name,
-                    "bound [10⁻³ px]": 1e3 * float(least[name].iloc[0]),
-                    "told by covariance [10⁻³ px]": 1e3 * told,
-                    "Monte Carlo [10⁻³ px]": 1e3 * scatter,
-                    "Monte Carlo / told": scatter / told, "±": error / told,
-                })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def measured_waves(
-    done: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
-) -> pd.DataFrame:
-    """Shares of waves found in images and by best fits, over both phases."""
-    waves, rows = done[done["task"] == "wave"], []
-    pitch = subject.buckled.specimen.pitch
-    for (part, axis, period), both in waves.groupby(["part", "axis", "period"]):
-        if len(both) < 2:
-            continue
-        for degree in subject.measured:
-            fit = curves.at(part, axis, degree, period)
-            found = float(np.average(both[f"own_{degree}"], weights=both["power"]))
-            rows.append({
-                "wave of": part, "along": AXES[axis], "period [cells]": period / pitch,
-                "degree": degree, "best fit": fit, "images": found, "difference": found - fit,
-            })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
 Row = dict[str, Any]
-
-MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 held"}
-
-"""Of the points at which fields are compared [mm]."""
-
-"""Every so many of them are enough for standard deviations, which are as smooth as the ansatz."""
+"""Of the table: quantities by their names, with the degree behind an underscore."""
+MOTIONS = {"buckled": "under the base motion", "still": "without motion, φ1 fixed"}
 
 
 @lru_cache(maxsize=2)
-def _exact_pair(folder: Path, name: str, motion: str) -> AnalyticPair:
+def _exact_pair(folder: Path, name: str, motion: str) -> ImagePair:
     """The images without wave and noise."""
     buckled = ResolutionSpec.read(folder, name).buckled
     return buckled.still() if motion == "still" else buckled.images()
@@ -104,15 +66,7 @@ def _noise_free(folder: Path, name: str, motion: str, degree: int) -> Result:
 
 
 def one_case(case: Mapping[str, Any], folder: Path) -> Row:
-    """Run a case of :meth:`modeharvest.validation.studies.resolution.ResolutionStudy.prepare`.
-
-    Parameters
-    ----------
-    case
-        Its ``task`` says what: "wave", "noise" or "floor".
-    folder
-        Of the study.
-    """
+    """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor."""
     tasks: dict[str, Callable[[Mapping[str, Any], Path], Row]] = {
         "wave": _wave,
         "noise": _noise,
@@ -123,21 +77,19 @@ def one_case(case: Mapping[str, Any], folder: Path) -> Row:
 
 def _wave(case: Mapping[str, Any], folder: Path) -> Row:
     """The shares of a wave that are found in its own part and in the whole, by degree."""
-    name = case["subject"]
-    subject = ResolutionSpec.read(folder, name)
-    buckled = subject.buckled
-    amplitude = subject.amplitude_px * buckled.pixel_size
+    name = case["images"]
+    spec = ResolutionSpec.read(folder, name)
+    buckled, points = spec.buckled, spec.points
+    amplitude = spec.amplitude_px * buckled.pixel_size
     wave = AddedWave(case["part"], case["axis"], case["period"], case["phase"], amplitude)
     pair = buckled.images(wave)
-    points = subject.points
     true = buckled.wave_at(wave, points)[..., None]
     row: Row = {"power": float((true**2).sum())}
-    for degree in subject.measured:
-        found = subject.correlate(pair, degree, "buckled")
+    for degree in spec.measured:
+        found = spec.correlate(pair, degree, "buckled")
         quiet = _noise_free(folder, name, "buckled", degree)
         change = {
-            part: _part_at(found, part, points) - _part_at(quiet, part, points)
-            for part in ("v0", "v1")
+            part: _part_at(found, part, points) - _part_at(quiet, part, points) for part in WAVED
         }
         row[f"own_{degree}"] = float(wave_share(change[case["part"]][..., None], true)[0])
         row[f"whole_{degree}"] = float(
@@ -157,57 +109,57 @@ def _part_at(result: Result, part: str, points: FloatArray) -> FloatArray:
 
 def _floor(case: Mapping[str, Any], folder: Path) -> Row:
     """Standard deviations by 2 s^2 M^-1 of the exact images, rms over the material [px]."""
-    name = case["subject"]
-    subject = ResolutionSpec.read(folder, name)
-    result = _noise_free(folder, name, case["motion"], case["degree"])
-    told = _predicted(subject, result, 2.0 * subject.noise**2 * result.inverse)
-    return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **told}
-
-
-def _predicted(subject: ResolutionSpec, result: Result, covariance: FloatArray) -> Row:
-    """Rms standard deviations of the fields by a covariance of the unknowns [px]."""
-    points, cellular = subject.sparse
-    errors = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
-    px = subject.buckled.pixel_size
-    return {
-        "v0": rms(errors.v0) / px,
-        "v1": LARGEST * rms(errors.v[0][cellular]) / px,
-        "v1phi1": rms(errors.fluctuation[0][cellular]) / px,
-        "u": rms(errors.displacement) / px,
-    }
+    spec = ResolutionSpec.read(folder, case["images"])
+    result = _noise_free(folder, case["images"], case["motion"], case["degree"])
+    predicted = _predicted(spec, result, 2.0 * spec.noise**2 * result.inverse)
+    return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **predicted}
 
 
 def _noise(case: Mapping[str, Any], folder: Path) -> Row:
-    """Errors of fields from noisy images, and those their covariance tells, by degree [px]."""
-    name, motion = case["subject"], case["motion"]
-    subject = ResolutionSpec.read(folder, name)
+    """Errors of fields from noisy images, and those their covariance predicts, by degree [px]."""
+    name, motion = case["images"], case["motion"]
+    spec = ResolutionSpec.read(folder, name)
     rng = np.random.default_rng([case["seed"], case["number"], motion == "still"])
-    pair = _exact_pair(folder, name, motion).noisy(subject.noise, rng)
+    pair = noisy(_exact_pair(folder, name, motion), spec.noise, rng)
     row: Row = {}
-    for degree in subject.measured:
-        found = subject.correlate(pair, degree, motion)
-        errors = _errors(subject, found, _noise_free(folder, name, motion, degree))
-        told = _predicted(subject, found, found.covariance(subject.noise))
+    for degree in spec.measured:
+        found = spec.correlate(pair, degree, motion)
+        errors = _errors(spec, found, _noise_free(folder, name, motion, degree))
+        predicted = _predicted(spec, found, found.covariance(spec.noise))
         row |= {f"{key}_{degree}": value for key, value in errors.items()}
-        row |= {f"told_{key}_{degree}": value for key, value in told.items()}
+        row |= {f"predicted_{key}_{degree}": value for key, value in predicted.items()}
         row[f"outcome_{degree}"] = found.outcome.value
     return row
 
 
-def _errors(subject: ResolutionSpec, found: Result, quiet: Result) -> Row:
-    """Rms differences of the fields of two results [px]."""
-    points, cellular = subject.sparse
-    x, y = points[:, 0, None], points[:, 1, None]
-    v0, v1phi1 = (
-        _part_at(found, part, points) - _part_at(quiet, part, points) for part in ("v0", "v1")
+def _predicted(spec: ResolutionSpec, result: Result, covariance: FloatArray) -> Row:
+    """Rms standard deviations of the fields by a covariance of the unknowns [px]."""
+    points, cellular = spec.sparse
+    errors = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
+    return _rms_px(
+        spec, errors.v0, errors.v[0][cellular], errors.fluctuation[0][cellular], errors.displacement
     )
+
+
+def _errors(spec: ResolutionSpec, found: Result, quiet: Result) -> Row:
+    """Rms differences of the fields of two results [px]."""
+    points, cellular = spec.sparse
+    x, y = points[:, 0, None], points[:, 1, None]
+    v0, v1phi1 = (_part_at(found, part, points) - _part_at(quiet, part, points) for part in WAVED)
     v1 = found.ansatz.v(0, found.unknowns, x, y) - quiet.ansatz.v(0, quiet.unknowns, x, y)
-    px = subject.buckled.pixel_size
+    return _rms_px(spec, v0, v1[cellular], v1phi1[cellular], v0 + v1phi1)
+
+
+def _rms_px(
+    spec: ResolutionSpec, v0: FloatArray, v1: FloatArray, v1phi1: FloatArray, u: FloatArray
+) -> Row:
+    """Root mean squares of fields [mm] in px; of v1 that of v1 phi1 where phi1 is largest."""
+    px = spec.buckled.pixel_size
     return {
         "v0": rms(v0) / px,
-        "v1": LARGEST * rms(v1[cellular]) / px,
-        "v1phi1": rms(v1phi1[cellular]) / px,
-        "u": rms(v0 + v1phi1) / px,
+        "v1": LARGEST * rms(v1) / px,
+        "v1phi1": rms(v1phi1) / px,
+        "u": rms(u) / px,
     }
 
 
@@ -216,8 +168,46 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@dataclass(frozen=True, eq=False)
+class ResolutionAnalysis:
+    """What the table of a resolution study says.
+
+    Parameters
+    ----------
+    spec
+        What was measured.
+    rows
+        The table of what succeeded.
+    degrees, chosen
+        All degrees, and the one nearest to the specification's own v0 degree.
+    curves, passband
+        Best fits of waves, and of patterns of other wavelengths.
+    subset_px2
+        The indicator of an affine subset [px^2].
+    """
+
+    spec: ResolutionSpec
+    rows: pd.DataFrame
+    degrees: list[DegreeResolution]
+    chosen: DegreeResolution
+    curves: TransferCurves
+    passband: Passband
+    subset_px2: float
+
+    @classmethod
+    def of(
+        cls, table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
+    ) -> ResolutionAnalysis:
+        """From the table of all cases, and the best fits of waves at all degrees."""
+        rows = table[table["error"] == ""]
+        degrees = degrees_of(rows, spec, curves)
+        chosen = min(degrees, key=lambda d: abs(d.degree - spec.buckled.how.v0_degree))
+        passband = Passband.of(spec, chosen.degree)
+        return cls(spec, rows, degrees, chosen, curves, passband, subset_indicator(spec))
+
+
 @dataclass(frozen=True)
-class ResolutionStudy:
+class ResolutionStudy(Study[ResolutionAnalysis]):
     """Small waves of v0 and v1 on a buckled specimen, and noise, against the polynomial degree.
 
     Parameters
@@ -244,6 +234,15 @@ class ResolutionStudy:
     InputError
         If a value is out of its range.
     """
+
+    question: ClassVar[str] = (
+        "How fine a change of v0 and v1 does an ansatz of polynomials show, and what noise "
+        "does each degree cost? Small waves on a buckled specimen are measured; the period "
+        "at which 10 % of their amplitude is lost, times the noise floor, is the "
+        "metrological efficiency indicator of DIC Challenge 2.0, carried over to "
+        "parametrised fields."
+    )
+    function: ClassVar[str] = f"{__name__}:one_case"
 
     strain: float = 0.128
     pattern: float = 7.0
@@ -275,22 +274,6 @@ class ResolutionStudy:
             )
 
     @property
-    def question(self) -> str:
-        """What is asked, for the report."""
-        return (
-            "How fine a change of v0 and v1 does an ansatz of polynomials show, and what noise "
-            "does each degree cost? Small waves on a buckled specimen are measured; the period "
-            "at which 10 % of their amplitude is lost, times the noise floor, is the "
-            "metrological efficiency indicator of DIC Challenge 2.0, carried over to "
-            "parametrised fields."
-        )
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-        return f"{one_case.__module__}:{one_case.__name__}"
-
-    @property
     def seeds(self) -> str:
         """Of the noise."""
         return f"seed {self.seed} of the noise"
@@ -310,20 +293,20 @@ class ResolutionStudy:
         return replace(self, measured=(middle,), realisations=max(2, self.realisations // 2))
 
     def prepare(
-        self, subject: Experiment, folder: Path, progress: Progress = silent
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Say what is measured; the cases are waves, noise, and the floors of exact images."""
         buckled = BuckledMotion(
-            subject.experiment.specimen,
-            subject.correlation,
-            subject.imaging.speckle,
-            subject.imaging.pixel_size,
+            spec.experiment.specimen,
+            spec.correlation,
+            spec.imaging.speckle,
+            spec.imaging.pixel_size,
             self.strain,
             self.pattern,
         )
         measured = ResolutionSpec(buckled, self.measured, self.amplitude_px, self.noise)
         base: Case = {
-            "subject": measured.write(folder), "task": "floor", "motion": "buckled", "part": "",
+            "images": measured.write(folder), "task": "floor", "motion": "buckled", "part": "",
             "axis": 0, "period": 0.0, "phase": 0.0, "degree": 0, "number": 0, "seed": self.seed,
         }  # fmt: skip
         floors = grid(base, motion=tuple(MOTIONS), degree=self.degrees)
@@ -340,3 +323,8 @@ class ResolutionStudy:
             for phase in (0.0, 0.5 * np.pi)
         ]  # fmt: skip
         return (*waves, *noise, *floors)
+
+    def analyse(self, table: pd.DataFrame, folder: Path) -> ResolutionAnalysis:
+        """Transfer, noise floors and indicators by degree."""
+        spec = ResolutionSpec.read(folder, table["images"].iloc[0])
+        return ResolutionAnalysis.of(table, spec, TransferCurves.of(spec, self.degrees))

@@ -1,4 +1,4 @@
-"""Robustness study: convergence from perturbed initial guesses, and the basin around the solution."""
+"""Robustness study: convergence from perturbed initial guesses, and the basin of convergence."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -19,127 +19,159 @@ from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.study import (
     MOST,
     ImagePairSpec,
+    Study,
     VirtualImagePair,
     require_different,
     require_mode,
 )
 from modeharvest.validation.workers import Case
 
-
-def success_numbers(asked: pd.DataFrame, radius: float) -> dict[str, Any]:
-    """The paper's numbers and the honest ones, of the starts within one radius."""
-    good, n = int(asked["same"].sum()), len(asked)
-    epsilon, arrived = asked["epsilon_percent"].dropna(), asked["same"]
-    outliers = epsilon > OUTLIER_PERCENT
-    others = asked[~arrived & (asked["error"] == "")]
-    return {
-        "starts": n,
-        "radius": radius,
-        "same_minimum": good,
-        "success": good / n,
-        "success_interval_95": list(wilson(good, n)),
-        "mean_epsilon_percent": float(epsilon.mean()),
-        "largest_epsilon_percent": float(epsilon.max()),
-        "mean_epsilon_without_outliers_percent": float(epsilon[~outliers].mean()),
-        "outliers": int(outliers.sum()),
-        "largest_distance_px": float(asked["distance_px"].max()),
-        "largest_distance_of_arrived_px": float(asked.loc[arrived, "distance_px"].max()),
-        "largest_start_distance_px": float(asked["start_distance_px"].max()),
-        "elsewhere_but_called_converged": int((others["outcome"] == "converged").sum()),
-        "failed": int((asked["error"] != "").sum()),
-        "paper": PUBLISHED,
-    }
-
-
-def wilson(good: int, n: int) -> tuple[float, float]:
-    """95 % confidence interval of a share, by Wilson's score.
-
-    References
-    ----------
-    E. B. Wilson, J. Am. Stat. Assoc. 22 (1927), doi 10.1080/01621459.1927.10502953.
-    """
-    low, high = binomtest(good, n).proportion_ci(0.95, method="wilson")
-    return float(low), float(high)
-
-
-def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
-    """Success against the radius of the perturbations."""
-    rows = []
-    for radius, part in moved.groupby("radius"):
-        good, n = int(part["same"].sum()), len(part)
-        low, high = wilson(good, n)
-        others = part[~part["same"]]
-        told = int((others["outcome"] != "converged").sum())
-        rows.append({
-            "off by up to [%]": 100.0 * radius,
-            "starts": n,
-            "same minimum": good,
-            "success [%]": 100.0 * good / n,
-            "95 % from": 100.0 * low,
-            "to [%]": 100.0 * high,
-            "others recognised": f"{told} of {n - good}",
-            "largest distance among the same [px]": part.loc[part["same"], "distance_px"].max(),
-            "mean iterations": part["all_iterations"].mean(),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def other_minima(moved: pd.DataFrame) -> pd.DataFrame:
-    """Each start that does not arrive; with the seed its number makes it again."""
-    others = moved[~moved["same"]].sort_values(["radius", "start"])
-    return pd.DataFrame({
-        "off by up to [%]": 100.0 * others["radius"],
-        "number of the start": others["start"],
-        "distance of the start [px rms]": others["start_distance_px"].round(2),
-        "distance of the end [px rms]": others["distance_px"].round(3),
-        "ε [%]": others["epsilon_percent"].round(3),
-        "outcome": others["outcome"].fillna("failed"),
-        "iterations": others["all_iterations"],
-    })  # fmt: skip
-
-
-def by_strain(table: pd.DataFrame) -> pd.DataFrame:
-    """Where starts with a wrong strain end; empty if there was none."""
-    part = table[table["strain_error"] != 0.0]
-    return pd.DataFrame({
-        "strain of the start, off by [%]": 100.0 * part["strain_error"],
-        "distance of the start [px]": part["start_distance_px"],
-        "distance of the end [px]": part["distance_px"],
-        "outcome": part["outcome"],
-        "iterations": part["all_iterations"],
-    })  # fmt: skip
-
-
 SAME_PX = 0.01
-
+"""Solutions nearer than this, rms, are the same minimum [px]."""
 OUTLIER_PERCENT = 1.5
-
+"""Above this epsilon the paper calls a result erroneous."""
 PUBLISHED = {
     "success": 0.98,
     "mean_epsilon_percent": 0.86,
     "mean_epsilon_without_outliers_percent": 0.45,
 }
-
-
+"""Section "Virtual Experiments" of the paper: 100 starts, parameters up to 10 % off."""
 EVERY = 4
 """Displacements are compared at every fourth pixel: they are smooth."""
 
 
 @dataclass(frozen=True)
-class RobustnessStudy:
-    """Correlate from many starts.
+class Proportion:
+    """``good`` out of ``count``."""
+
+    good: int
+    count: int
+
+    @property
+    def value(self) -> float:
+        """Between 0 and 1."""
+        return self.good / self.count
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval by Wilson's score.
+
+        References
+        ----------
+        E. B. Wilson, J. Am. Stat. Assoc. 22 (1927), doi 10.1080/01621459.1927.10502953.
+        """
+        low, high = binomtest(self.good, self.count).proportion_ci(0.95, method="wilson")
+        return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class GuessStatistics:
+    """The paper's numbers and more, of the initial guesses within one radius.
+
+    ``distance``: rms length of the difference of two displacements, from the reference solution's.
+    """
+
+    starts: int
+    radius: float
+    same_minimum: int
+    success: float
+    success_interval_95: tuple[float, float]
+    mean_epsilon_percent: float
+    largest_epsilon_percent: float
+    mean_epsilon_without_outliers_percent: float
+    outliers: int
+    largest_distance_px: float
+    largest_distance_of_arrived_px: float
+    largest_start_distance_px: float
+    other_minimum_called_converged: int
+    failed: int
+    paper: Mapping[str, float]
+
+    @classmethod
+    def of(cls, guesses: pd.DataFrame, radius: float) -> GuessStatistics:
+        """From the rows of those guesses, with a column ``same``."""
+        same = guesses["same"]
+        success = Proportion(int(same.sum()), len(guesses))
+        epsilon = guesses["epsilon_percent"].dropna()
+        outliers = epsilon > OUTLIER_PERCENT
+        others = guesses[~same & (guesses["error"] == "")]
+        return cls(
+            success.count,
+            radius,
+            success.good,
+            success.value,
+            success.interval,
+            float(epsilon.mean()),
+            float(epsilon.max()),
+            float(epsilon[~outliers].mean()),
+            int(outliers.sum()),
+            float(guesses["distance_px"].max()),
+            float(guesses.loc[same, "distance_px"].max()),
+            float(guesses["start_distance_px"].max()),
+            int((others["outcome"] == "converged").sum()),
+            int((guesses["error"] != "").sum()),
+            PUBLISHED,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RobustnessAnalysis:
+    """What the table of a robustness study says.
+
+    Parameters
+    ----------
+    moved, at_radius, strains
+        Rows with perturbed mode parameters, all and of the paper's radius, and with a wrong
+        strain; ``same``: whether each is the reference solution's minimum.
+    statistics
+        Of the paper's radius.
+    """
+
+    moved: pd.DataFrame
+    at_radius: pd.DataFrame
+    strains: pd.DataFrame
+    statistics: GuessStatistics
+
+
+@dataclass(frozen=True)
+class GuessResult:
+    """Where an initial guess leads.
+
+    Parameters
+    ----------
+    distance_px, start_distance_px
+        Rms length of the difference of two displacements, the reference solution's and this
+        one's, or the guess' own.
+    epsilon_percent
+        The paper's: the difference of their norms.
+    outcome, iterations, all_iterations, residual
+        Of the correlation.
+    """
+
+    distance_px: float
+    start_distance_px: float
+    epsilon_percent: float
+    outcome: str
+    iterations: int
+    all_iterations: int
+    residual: float
+
+
+@dataclass(frozen=True)
+class RobustnessStudy(Study[RobustnessAnalysis]):
+    """Correlate from many initial guesses.
 
     Parameters
     ----------
     strain
         Of the deformed image [-].
     starts, radius
-        Number of starts whose mode parameters are perturbed by up to ``radius``: a share of 1 for
-        a1 ... a5, of the unit cell for the two phases. The paper: 100 and 0.1.
+        Number of guesses whose mode parameters are perturbed by up to ``radius``: a share of 1
+        for a1 ... a5, of the unit cell for the two phases. The paper: 100 and 0.1.
     radii, per_radius
-        For the basin: further radii, and starts for each.
+        For the basin: further radii, and guesses for each.
     strain_errors
-        And starts whose v0 has the applied strain times 1 plus these, with the mode as it is.
+        And guesses whose v0 has the applied strain times 1 plus these, with the mode as it is.
     seed
         Of the perturbations.
 
@@ -148,6 +180,13 @@ class RobustnessStudy:
     InputError
         If a value is out of its range, or one comes twice.
     """
+
+    question: ClassVar[str] = (
+        "A correlation searches from a start. Does it matter which? The same pair of virtual "
+        "images is correlated from starts whose mode parameters are off, and their ends are "
+        "compared with that of the standard start."
+    )
+    function: ClassVar[str] = f"{__name__}:one_start"
 
     strain: float = 0.128
     starts: int = 100
@@ -177,39 +216,25 @@ class RobustnessStudy:
         require_different("strain_errors", self.strain_errors)
 
     @property
-    def question(self) -> str:
-        """What is asked, for the report."""
-        return (
-            "A correlation searches from a start. Does it matter which? The same pair of virtual "
-            "images is correlated from starts whose mode parameters are off, and their ends are "
-            "compared with that of the standard start."
-        )
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-        return f"{__name__}:one_start"
-
-    @property
     def seeds(self) -> str:
         """Of the perturbations."""
         return f"seed {self.seed} of the perturbations"
 
     def require(self, correlation: SquareLatticeOptions) -> None:
-        """A mode that is held has no start."""
+        """A mode that is fixed has no initial guess."""
         require_mode(correlation)
 
     def quick(self) -> Self:
-        """A fifth of the starts."""
+        """A fifth of the initial guesses."""
         return replace(self, starts=-(-self.starts // 5), per_radius=-(-self.per_radius // 5))
 
     def prepare(
-        self, subject: ImagePairSpec, folder: Path, progress: Progress = silent
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
-        """Make the images; the cases are radius, number of the start and seed."""
-        name = subject.describe(folder, self.strain)
+        """Make the images; the cases are radius, number of the guess and seed."""
+        name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)
-        base = {"subject": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
+        base = {"images": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
                 "seed": self.seed}  # fmt: skip
         cases = [{**base, "start": k} for k in range(self.starts)]
         for radius in self.radii:
@@ -217,60 +242,54 @@ class RobustnessStudy:
         cases += [{**base, "radius": 0.0, "strain_error": e} for e in self.strain_errors]
         return tuple(cases)
 
+    def analyse(self, table: pd.DataFrame, folder: Path) -> RobustnessAnalysis:
+        """Success, epsilon and distances; what failed counts as not arrived."""
+        table = table.assign(same=table["distance_px"] < SAME_PX)
+        moved = table[table["strain_error"] == 0.0]
+        at_radius = moved[moved["radius"] == self.radius]
+        strains = table[table["strain_error"] != 0.0]
+        statistics = GuessStatistics.of(at_radius, self.radius)
+        return RobustnessAnalysis(moved, at_radius, strains, statistics)
 
-def one_start(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Correlate from one perturbed start, and compare with the standard one's end.
 
-    Parameters
-    ----------
-    case
-        One of :meth:`Robustness.prepare`.
-    folder
-        Of the study.
+def one_start(case: Mapping[str, Any], folder: Path) -> GuessResult:
+    """Correlate from one perturbed initial guess, and compare with the reference solution.
 
-    Returns
-    -------
-    dict
-        ``distance_px``: rms length of the difference of the two displacements, the standard
-        start's and this one's; ``start_distance_px``: the same of the start itself;
-        ``epsilon_percent``: the paper's, the difference of their norms; outcome, iterations and
-        residual.
+    ``case``: one of :meth:`RobustnessStudy.prepare`, ``folder``: the study's.
     """
-    scene = VirtualImagePair.open(folder, case["subject"])
-    home = _reference_solution(folder, case["subject"])
-    start = _perturbed_start(scene, case)
-    result = scene.correlate(start)
-    found = _field(scene, result.unknowns)
-    size = _rms(home)
-    return {
-        "distance_px": _rms(found - home),
-        "start_distance_px": _rms(_field(scene, start) - home),
-        "epsilon_percent": 100.0 * abs(size - _rms(found)) / size,
-        "outcome": result.outcome.value,
-        "iterations": result.iterations,
-        "all_iterations": len(result.history),
-        "residual": result.residual_rms,
-    }
-
-
-def _perturbed_start(scene: VirtualImagePair, case: Mapping[str, Any]) -> FloatArray:
-    """The start of a case; the same directions for every radius."""
-    ansatz = scene.ansatz
-    start = ansatz.initial_guess(
-        scene.strain * (1.0 + case["strain_error"]), scene.how.start_amplitude
+    pair = VirtualImagePair.open(folder, case["images"])
+    reference = _reference_solution(folder, case["images"])
+    guess = _perturbed_guess(pair, case)
+    result = pair.correlate(guess)
+    found, size = _field(pair, result.unknowns), _rms(reference)
+    return GuessResult(
+        _rms(found - reference),
+        _rms(_field(pair, guess) - reference),
+        100.0 * abs(size - _rms(found)) / size,
+        result.outcome.value,
+        result.iterations,
+        len(result.history),
+        result.residual_rms,
     )
+
+
+def _perturbed_guess(pair: VirtualImagePair, case: Mapping[str, Any]) -> FloatArray:
+    """(n,) of a case; the same directions for every radius."""
+    ansatz = pair.ansatz
+    strain = pair.strain * (1.0 + case["strain_error"])
+    guess = ansatz.initial_guess(strain, pair.options.start_amplitude)
     rng = np.random.default_rng([case["seed"], case["start"]])
     unit = rng.uniform(-1.0, 1.0, 7)
-    scale = np.array([1.0] * 5 + [scene.specimen.pitch] * 2)
-    start[ansatz.phi_slice(0)] += case["radius"] * unit * scale
-    return start
+    scale = np.array([1.0] * 5 + [pair.specimen.pitch] * 2)
+    guess[ansatz.phi_slice(0)] += case["radius"] * unit * scale
+    return guess
 
 
-def _field(scene: VirtualImagePair, unknowns: FloatArray) -> FloatArray:
+def _field(pair: VirtualImagePair, unknowns: FloatArray) -> FloatArray:
     """(points, 2) displacement at some pixels of the material [px]."""
-    grid = scene.images.grid
-    u = scene.ansatz.displacement(unknowns, grid.x[::EVERY], grid.y[::EVERY])
-    return np.asarray(u[scene.mask()[::EVERY, ::EVERY]] / grid.pixel_size)
+    grid, mask = pair.images.grid, pair.mask
+    u = pair.ansatz.displacement(unknowns, grid.x[::EVERY], grid.y[::EVERY])
+    return np.asarray(u[mask[::EVERY, ::EVERY]] / grid.pixel_size)
 
 
 def _rms(field: FloatArray) -> float:
@@ -280,6 +299,6 @@ def _rms(field: FloatArray) -> float:
 
 @lru_cache(maxsize=1)
 def _reference_solution(folder: Path, name: str) -> FloatArray:
-    """(points, 2) displacement that the standard start ends with [px]; once in each worker."""
-    scene = VirtualImagePair.open(folder, name)
-    return _field(scene, scene.correlate().unknowns)
+    """(points, 2) displacement from the standard initial guess [px]; once in each worker."""
+    pair = VirtualImagePair.open(folder, name)
+    return _field(pair, pair.correlate().unknowns)

@@ -1,4 +1,4 @@
-"""What all studies share: the protocol, pairs of virtual images, and their error against the truth.
+"""What all studies share: the frame of a study, and pairs of virtual images that workers open.
 
 A pair is described once, made once, and opened by workers. In a study's folder::
 
@@ -10,14 +10,14 @@ A pair is described once, made once, and opened by workers. In a study's folder:
 from __future__ import annotations
 
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 from pydantic import TypeAdapter
 
 from modeharvest.fem.experiment import Experiment
@@ -30,15 +30,12 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, write_json
+from modeharvest.util.files import read_json
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import digest
-from modeharvest.validation.truth import compare, describe
-from modeharvest.validation.workers import Case
-
-Images = tuple[NDArray[np.float32], NDArray[np.float32]]
+from modeharvest.validation.truth import Comparison, compare
+from modeharvest.validation.workers import Case, leave
 
 _SPEC = TypeAdapter(ImagingSpec)
 PAPERS_TAPER = 0.5
@@ -51,12 +48,8 @@ class ImagePairSpec:
 
     Parameters
     ----------
-    experiment
-        What was simulated.
-    imaging
-        How it is imaged.
-    correlation
-        How it is correlated.
+    experiment, imaging, correlation
+        What was simulated, how it is imaged and correlated.
     load
         Gives the exact displacements; called when they are first needed, because simulating them
         takes long and not every study asks for them.
@@ -80,7 +73,7 @@ class ImagePairSpec:
         correlation: SquareLatticeOptions | None = None,
         taper: float = PAPERS_TAPER,
     ) -> str:
-        """Leave in ``folder`` what a worker needs to open a pair; returns the pair's name.
+        """Leave in a study's folder what a worker needs to open a pair; returns the pair's name.
 
         Parameters
         ----------
@@ -89,7 +82,7 @@ class ImagePairSpec:
         strain
             Nominal strain of the deformed image [-].
         imaging, correlation
-            Instead of the subject's own.
+            Instead of the specification's own.
         taper
             Width over which the mode fades out [unit cells].
 
@@ -108,15 +101,13 @@ class ImagePairSpec:
             "images": image_key(self.solution, spec, (strain,))[:16],
             "strain": strain,
             "imaging": _SPEC.dump_python(spec, mode="json"),
-            "specimen": vars(self.experiment.specimen),
+            "specimen": self.experiment.specimen.plain(),
             "correlation": vars(correlation or self.correlation),
             "taper": taper,
         }
-        name = digest(description)[:16]
         if not (folder / "solution.h5").is_file():
             self.solution.write(folder / "solution.h5")
-        write_json(folder / "subjects" / f"{name}.json", description)
-        return name
+        return leave(description, folder, "subjects/{}.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +122,8 @@ class VirtualImagePair:
         Its nominal strain [-].
     specimen
         Of the images.
-    how
-        The correlation.
+    options
+        Of the correlation.
     taper
         Width over which the mode fades out [unit cells].
     """
@@ -140,12 +131,12 @@ class VirtualImagePair:
     images: ImageSet
     strain: float
     specimen: Specimen
-    how: SquareLatticeOptions
+    options: SquareLatticeOptions
     taper: float = PAPERS_TAPER
 
     @classmethod
     def open(cls, folder: Path, name: str, progress: Progress = silent) -> VirtualImagePair:
-        """The pair that :meth:`Subject.describe` described; its images are made if need be.
+        """The pair that :meth:`ImagePairSpec.describe` described; its images are made if need be.
 
         Where several workers open the same pair, it is to be opened once before.
 
@@ -175,33 +166,35 @@ class VirtualImagePair:
     @property
     def ansatz(self) -> Ansatz:
         """The paper's, on this specimen."""
-        usual = self.how.ansatz(self.specimen)
+        usual = self.options.ansatz(self.specimen)
         (mode,) = usual.modes
         taper = replace(mode.taper, width=self.taper * self.specimen.pitch)
         return replace(usual, modes=(replace(mode, taper=taper),))
 
-    def start(self) -> FloatArray:
-        """The standard start."""
-        return self.ansatz.initial_guess(self.strain, self.how.start_amplitude)
+    def initial_guess(self) -> FloatArray:
+        """(n,) the standard initial guess of the unknowns."""
+        return self.ansatz.initial_guess(self.strain, self.options.start_amplitude)
 
-    def pair(self) -> Images:
-        """(rows, cols) f and g, as the identification wants them: exact, or a camera's."""
-        return _read_pair(self.images.folder, self.strain, self.how.camera)
+    @property
+    def pair(self) -> ImagePair:
+        """The images as the options want them: exact, or a camera's; kept for the next case."""
+        return _read_pair(self.images.folder, self.strain, self.options.camera)
 
-    def correlate(self, start: FloatArray | None = None, pair: Images | None = None) -> Result:
-        """Correlate the pair, or a noisy one, from the standard start or another."""
-        f, g = self.pair() if pair is None else pair
-        images = ImagePair(f, g, self.images.grid, *self.masks())
-        begin = self.start() if start is None else start
-        return correlate(images, self.ansatz, guess=begin, options=self.how.options())
-
-    def masks(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(rows, cols) True on material, of the reference and of the deformed image."""
-        return _read_masks(self.images.folder, self.strain)
-
-    def mask(self) -> NDArray[np.bool_]:
+    @property
+    def mask(self) -> BoolArray:
         """(rows, cols) True on material of the reference."""
-        return self.masks()[0]
+        return self.pair.masks[0]
+
+    def correlate(self, start: FloatArray | None = None, pair: ImagePair | None = None) -> Result:
+        """Correlate the pair, or a noisy one, from the standard initial guess or another."""
+        guess = self.initial_guess() if start is None else start
+        options = self.options.options()
+        return correlate(pair or self.pair, self.ansatz, guess=guess, options=options)
+
+    def compare(self, result: Result) -> Comparison:
+        """Set a result against the truth and the best fit of its ansatz."""
+        guess, camera = self.initial_guess(), self.options.camera
+        return compare(self.images, self.strain, result, guess, camera)
 
 
 def _description(folder: Path, name: str) -> dict[str, Any]:
@@ -228,53 +221,52 @@ def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> I
 
 
 @lru_cache(maxsize=1)
-def _read_pair(folder: Path, strain: float, camera: bool) -> Images:
-    images = ImageSet.read(folder)
-    return images.reference(camera=camera), images.deformed(strain, camera=camera)
+def _read_pair(folder: Path, strain: float, camera: bool) -> ImagePair:
+    return ImageSet.read(folder).pair(strain, camera=camera)
 
 
-@lru_cache(maxsize=1)
-def _read_masks(folder: Path, strain: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    images = ImageSet.read(folder)
-    return images.mask(), images.deformed_mask(strain)
+A = TypeVar("A")
+"""What a study's table says, as a dataclass."""
 
 
-class Study(Protocol):
-    """A question, as options in a frozen dataclass.
+class Study(ABC, Generic[A]):
+    """A question, as options in a frozen dataclass; see docs/studies.md for one's own."""
 
-    One's own needs these and a module-level function for one case: see docs/studies.md.
-    """
-
+    question: ClassVar[str]
+    """What is asked, in a sentence or two, for the report."""
+    function: ClassVar[str]
+    """The "package.module:name" of what runs one case."""
     strain: float
     """Of the deformed image [-]."""
 
     @property
-    def question(self) -> str:
-        """What is asked, in a sentence or two, for the report."""
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-
-    @property
+    @abstractmethod
     def seeds(self) -> str:
         """The seeds of all that is random, in words, for the report."""
 
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Raise InputError if the correlation contradicts the study."""
 
+    @abstractmethod
     def quick(self) -> Self:
         """The same question with fewer cases: a first look."""
 
-    def prepare(self, subject: ImagePairSpec, folder: Path, progress: Progress) -> tuple[Case, ...]:
+    @abstractmethod
+    def prepare(
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
+    ) -> tuple[Case, ...]:
         """Make what the cases share (images) in ``folder``; returns the cases.
 
         The random choices of a case follow from a seed that it holds.
         """
 
+    @abstractmethod
+    def analyse(self, table: pd.DataFrame, folder: Path) -> A:
+        """What a table with a row for each case says; failed ones have an ``error``."""
+
 
 def require_mode(correlation: SquareLatticeOptions) -> None:
-    """Raise InputError where the mode is held: nothing of it would be measured."""
+    """Raise InputError where the mode is fixed: nothing of it would be measured."""
     if correlation.fixed_mode:
         raise InputError(
             "study: expected correlation.fixed_mode = false, got true: nothing of the mode would "
@@ -290,35 +282,3 @@ def require_different(name: str, values: tuple[Any, ...]) -> None:
     """Raise InputError if a value comes twice."""
     if len(set(values)) < len(values):
         raise InputError(f"study: expected {name} that differ, got {list(values)}")
-
-
-def error_parts(scene: VirtualImagePair, result: Result) -> dict[str, float]:
-    """Set a result against the truth of its images and the best fit of its ansatz.
-
-    Parameters
-    ----------
-    scene
-        What was measured.
-    result
-        The measurement.
-
-    Returns
-    -------
-    dict
-        ``w_px``, ``best_px``, ``lost_px``: rms per component of truth - IDIC, truth - best fit
-        and IDIC - best fit [px]; ``v1_percent``: rms difference of v1 from the best fit's over
-        the cellular material, of the largest of the best fit's.
-    """
-    found = compare(scene.images, scene.strain, result, scene.start(), camera=scene.how.camera)
-    parts = {"w_px": found.w, "best_px": found.best_error, "lost_px": found.idic_to_best}
-    px = found.grid.pixel_size
-    rms = {
-        name: float(describe(part, found.mask, px)["rms_per_component"])
-        for name, part in parts.items()
-    }
-    a, b = scene.specimen.cellular_half_size
-    x, y = np.abs(found.grid.x)[None, :], np.abs(found.grid.y)[:, None]
-    inside = found.mask & (x <= a) & (y <= b)
-    v, at_best = (fit.v(0)[inside] for fit in (result, found.best))
-    apart = float(np.sqrt(np.mean((v - at_best) ** 2)) / np.abs(at_best).max())
-    return {**rms, "v1_percent": 100.0 * apart}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -19,94 +19,11 @@ from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.study import (
     PAPERS_TAPER,
     ImagePairSpec,
+    Study,
     VirtualImagePair,
-    error_parts,
     require_different,
 )
 from modeharvest.validation.workers import Case
-
-ERRORS = {
-    "lost_px": "IDIC − best fit [px]",
-    "best_px": "truth − best fit [px]",
-    "w_px": "w = truth − IDIC [px]",
-    "v1_percent": "v₁ off the best fit's [%]",
-}
-
-MOVED = "moved from the base [px]"
-
-
-def by_level(table: pd.DataFrame, bases: Mapping[str, float | None], px: float) -> pd.DataFrame:
-    """A row for each factor and level, the base's among them: means over the speckles."""
-    done = table[table["error"] == ""]
-    done = _in_base_pixels(done).assign(moved=_moved(done) / px)
-    base = done[done["factor"] == "base"]
-    rows = []
-    for name, at_base in bases.items():
-        parts = dict(iter(done[done["factor"] == name].groupby("level")))
-        if at_base is not None:
-            parts[float(at_base)] = base
-        for level in sorted(parts):
-            part = parts[level]
-            if not len(part):
-                continue
-            factor = FACTORS[name]
-            row = {"factor": factor.label, "name": name, "number": level,
-                   "level": factor.told(level) if factor.names else level,
-                   "base": "yes" if level == at_base else ""}  # fmt: skip
-            for key, label in ERRORS.items():
-                row[label] = part[key].mean()
-            row[MOVED] = part["moved"].mean()
-            row["IDIC − best fit, sd over speckles [px]"] = part["lost_px"].std(ddof=0)
-            row["pixels per ligament"] = part["pixels_per_ligament"].mean()
-            row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
-            rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
-    """Errors in pixels of one size: a ligament tells how large a level's own are."""
-    at_base = done.loc[done["factor"] == "base", "pixels_per_ligament"].mean()
-    factor = at_base / done["pixels_per_ligament"]
-    return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
-
-
-def _moved(done: pd.DataFrame) -> pd.Series:
-    """Rms per component of a measurement's difference from the base's on the same speckle [mm]."""
-    base = done[done["factor"] == "base"].set_index("seed")["at_junctions_mm"]
-
-    def moved(row: pd.Series) -> float:
-        if row["seed"] not in base.index:
-            return float("nan")
-        apart = np.subtract(row["at_junctions_mm"], base[row["seed"]])
-        return float(np.sqrt(np.mean(apart**2)))
-
-    return done.apply(moved, axis=1)
-
-
-def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
-    """A row for each factor: its smallest and its largest error, the most important first.
-
-    Levels at which not all converged have no part in it.
-    """
-    lost, best, moved = ERRORS["lost_px"], ERRORS["best_px"], f"largest, {MOVED}"
-    rows = []
-    settled = levels[~levels["converged"].map(not_all_converged)]
-    for name, part in settled.groupby("name", sort=False):
-        least, most = part.loc[part[lost].idxmin()], part.loc[part[lost].idxmax()]
-        rows.append({
-            "factor": FACTORS[str(name)].label, "name": name,
-            f"smallest {lost}": least[lost], "at": least["level"],
-            f"largest {lost}": most[lost], "at ": most["level"],
-            "ratio": most[lost] / least[lost],
-            f"{best}, from": part[best].min(), "to": part[best].max(),
-            moved: part[MOVED].max(),
-        })  # fmt: skip
-    return pd.DataFrame(rows).sort_values(moved, ascending=False, ignore_index=True)
-
-
-def not_all_converged(converged: str) -> bool:
-    good, _, count = converged.split()
-    return good != count
 
 
 @dataclass(frozen=True)
@@ -199,8 +116,8 @@ class VariedFactor:
             return self.names.index(level)
         return level
 
-    def told(self, level: float) -> str:
-        """A level in words."""
+    def label_of(self, level: float) -> str:
+        """How a level is called."""
         return self.names[round(level)] if self.names else f"{level:g}"
 
     def set(self, setting: StudySetting, level: float) -> StudySetting:
@@ -307,8 +224,60 @@ BASE = "base"
 _QUICK_LEVELS = 3
 
 
+ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
+
+
 @dataclass(frozen=True)
-class SystematicStudy:
+class LevelResult:
+    """What is found at one level of a factor.
+
+    Parameters
+    ----------
+    w_px, model_error_px, measurement_error_px, v1_percent
+        :class:`~modeharvest.validation.truth.ErrorParts` and
+        :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
+    outcome, iterations, residual, pixels
+        Of the correlation.
+    pixels_per_ligament
+        Width of a ligament [px].
+    at_junctions_mm
+        Displacement (x, y) at the junctions between holes, whatever the pixels [mm].
+    """
+
+    w_px: float
+    model_error_px: float
+    measurement_error_px: float
+    v1_percent: float
+    outcome: str
+    iterations: int
+    residual: float
+    pixels: int
+    pixels_per_ligament: float
+    at_junctions_mm: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class SystematicAnalysis:
+    """What the table of a systematic study says.
+
+    Parameters
+    ----------
+    rows
+        The table of what succeeded, all errors in pixels of the base; ``moved``: rms per
+        component of a measurement's difference from the base's on the same speckle [px].
+    base
+        Mean errors of the base over the speckles, by their names.
+    bases
+        The level of each factor that the base has; None where it has none.
+    """
+
+    rows: pd.DataFrame
+    base: Mapping[str, float]
+    bases: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class SystematicStudy(Study[SystematicAnalysis]):
     """Correlate exact images with one option changed at a time.
 
     Parameters
@@ -328,6 +297,13 @@ class SystematicStudy:
         If a factor is unknown, levels are given for one that is not asked for, or a value comes
         twice.
     """
+
+    question: ClassVar[str] = (
+        "Without noise a measurement is still wrong. What makes it so? One option of the "
+        "images or of the correlation is changed at a time, and the error is split into what "
+        "the ansatz can’t describe and what the measurement adds."
+    )
+    function: ClassVar[str] = f"{__name__}:one_level"
 
     strain: float = 0.128
     factors: tuple[str, ...] = tuple(FACTORS)
@@ -359,27 +335,10 @@ class SystematicStudy:
             require_different(f"levels of {name}", self._levels(name))
 
     @property
-    def question(self) -> str:
-        """What is asked, for the report."""
-        return (
-            "Without noise a measurement is still wrong. What makes it so? One option of the "
-            "images or of the correlation is changed at a time, and the error is split into what "
-            "the ansatz can’t describe and what the measurement adds."
-        )
-
-    @property
-    def function(self) -> str:
-        """The "package.module:name" of what runs one case."""
-        return f"{__name__}:one_level"
-
-    @property
     def seeds(self) -> str:
         """Of the speckles."""
         plural = "s" if len(self.seeds_of_speckle) > 1 else ""
         return f"seed{plural} {', '.join(map(str, self.seeds_of_speckle))} of the speckle"
-
-    def require(self, correlation: SquareLatticeOptions) -> None:
-        """Accept any correlation."""
 
     def quick(self) -> Self:
         """One speckle, and three levels of each factor: the first, the middle, the last."""
@@ -391,7 +350,7 @@ class SystematicStudy:
         return replace(self, levels=levels, seeds_of_speckle=self.seeds_of_speckle[:1])
 
     def prepare(
-        self, subject: ImagePairSpec, folder: Path, progress: Progress = silent
+        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Make the base's images, which many cases share; the others are made case by case.
 
@@ -402,71 +361,95 @@ class SystematicStudy:
         """
         cases = []
         for seed in self.seeds_of_speckle:
-            base = StudySetting(subject.imaging, subject.correlation).speckled(seed=seed)
-            own = _described(subject, folder, self.strain, base)
+            base = StudySetting(spec.imaging, spec.correlation).speckled(seed=seed)
+            own = _described(spec, folder, self.strain, base)
             images = VirtualImagePair.open(folder, own, progress).images.folder
-            cases.append({"factor": BASE, "level": 0.0, "seed": seed, "subject": own, "keep": True})
+            cases.append({"factor": BASE, "level": 0.0, "seed": seed, "images": own, "keep": True})
             for name in self.factors:
                 for level in self._levels(name):
                     setting = FACTORS[name].set(base, level)
-                    described = _described(subject, folder, self.strain, setting)
+                    described = _described(spec, folder, self.strain, setting)
                     if described != own:
                         shared = VirtualImagePair.images_folder(folder, described) == images
                         cases.append({"factor": name, "level": float(level), "seed": seed,
-                                      "subject": described, "keep": shared})  # fmt: skip
+                                      "images": described, "keep": shared})  # fmt: skip
         return tuple(cases)
 
     def _levels(self, name: str) -> tuple[float, ...]:
         factor = FACTORS[name]
         return tuple(factor.number(level) for level in self.levels.get(name, factor.levels))
 
+    def analyse(self, table: pd.DataFrame, folder: Path) -> SystematicAnalysis:
+        """Errors in pixels of the base, and how far each level moves the measurement."""
+        pair = VirtualImagePair.open(folder, table["images"].iloc[0])
+        setting = StudySetting(pair.images.spec, pair.options, pair.taper)
+        done = table[table["error"] == ""]
+        base = done[done["factor"] == BASE]
+        rows = _in_base_pixels(done).assign(moved=_moved(done) / setting.imaging.pixel_size)
+        return SystematicAnalysis(
+            rows,
+            {name: float(base[name].mean()) for name in ERRORS},
+            {name: FACTORS[name].base(setting) for name in self.factors},
+        )
 
-def _described(subject: ImagePairSpec, folder: Path, strain: float, setting: StudySetting) -> str:
-    return subject.describe(folder, strain, setting.imaging, setting.correlation, setting.taper)
+
+def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
+    """Errors in pixels of one size: a ligament shows how large a level's own are."""
+    at_base = done.loc[done["factor"] == "base", "pixels_per_ligament"].mean()
+    factor = at_base / done["pixels_per_ligament"]
+    return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
 
 
-def one_level(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _moved(done: pd.DataFrame) -> pd.Series:
+    """Rms per component of a measurement's difference from the base's on the same speckle [mm]."""
+    base = done[done["factor"] == "base"].set_index("seed")["at_junctions_mm"]
+
+    def moved(row: pd.Series) -> float:
+        if row["seed"] not in base.index:
+            return float("nan")
+        apart = np.subtract(row["at_junctions_mm"], base[row["seed"]])
+        return float(np.sqrt(np.mean(apart**2)))
+
+    return done.apply(moved, axis=1)
+
+
+def _described(spec: ImagePairSpec, folder: Path, strain: float, setting: StudySetting) -> str:
+    return spec.describe(folder, strain, setting.imaging, setting.correlation, setting.taper)
+
+
+def one_level(case: Mapping[str, Any], folder: Path) -> LevelResult:
     """Image, correlate and set against the truth.
 
-    Parameters
-    ----------
-    case
-        One of :meth:`Systematic.prepare`.
-    folder
-        Of the study. Images that no other case needs are removed again.
-
-    Returns
-    -------
-    dict
-        The errors of :func:`~modeharvest.validation.studies.study.error_parts`, how
-        the correlation ended, and the displacement at the junctions between holes.
+    ``case``: one of :meth:`SystematicStudy.prepare`, ``folder``: the study's. Images that no
+    other case needs are removed again.
     """
-    scene = VirtualImagePair.open(folder, case["subject"])
+    pair = VirtualImagePair.open(folder, case["images"])
     try:
-        return _errors_of(scene)
+        return _result_of(pair)
     finally:
         if not case["keep"]:
-            scene.discard()
+            pair.discard()
 
 
-def _errors_of(scene: VirtualImagePair) -> dict[str, Any]:
-    result = scene.correlate()
-    specimen = scene.specimen
+def _result_of(pair: VirtualImagePair) -> LevelResult:
+    result, specimen = pair.correlate(), pair.specimen
+    comparison = pair.compare(result)
     ligament = specimen.largest_diameter - specimen.diameter
-    return {
-        **error_parts(scene, result),
-        "outcome": result.outcome.value,
-        "iterations": result.iterations,
-        "residual": result.residual_rms,
-        "pixels": result.pixels,
-        "pixels_per_ligament": ligament / scene.images.grid.pixel_size,
-        "at_junctions_mm": _at_junctions(scene, result).ravel().tolist(),
-    }
+    return LevelResult(
+        **asdict(comparison.error_parts()),
+        v1_percent=comparison.v1_percent(specimen),
+        outcome=result.outcome.value,
+        iterations=result.iterations,
+        residual=result.residual_rms,
+        pixels=result.pixels,
+        pixels_per_ligament=ligament / pair.images.grid.pixel_size,
+        at_junctions_mm=_at_junctions(pair, result).ravel().tolist(),
+    )
 
 
-def _at_junctions(scene: VirtualImagePair, result: Result) -> FloatArray:
-    """(junctions, 2) displacement between four holes each, whatever the pixels [mm]."""
-    specimen = scene.specimen
+def _at_junctions(pair: VirtualImagePair, result: Result) -> FloatArray:
+    """(junctions, 2) displacement between four holes each [mm]."""
+    specimen = pair.specimen
     x, y = (
         distance * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
         for distance, count in (
@@ -474,4 +457,4 @@ def _at_junctions(scene: VirtualImagePair, result: Result) -> FloatArray:
             (specimen.row_distance, specimen.holes_y),
         )
     )
-    return scene.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)
+    return pair.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)

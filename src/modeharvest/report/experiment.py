@@ -22,33 +22,11 @@ from modeharvest.report.figures.style import to_svg
 from modeharvest.report.model import Picture, material_text, render
 from modeharvest.util.files import atomic
 from modeharvest.util.progress import Progress, silent
+from modeharvest.util.typed import quantities
+from modeharvest.validation.summary import SnapshotSummary
 
 Snapshot = Mapping[str, Any]
 
-_NUMBERS = (
-    ("negative pivots of the tangent stiffness", "–", "negative_pivots"),
-    ("pattern v₁φ₁, largest length", "px", "pattern_amplitude_px"),
-    ("… without the outermost ring of cells", "px", "pattern_inner_px"),
-    ("… in the four corner cells", "px", "pattern_corners_px"),
-    ("w = truth − IDIC, rms", "px", "rms_w_px"),
-    ("truth − best fit, rms: what the model can't say", "px", "rms_best_fit_px"),
-    ("IDIC − best fit, rms: what the measurement loses", "px", "rms_idic_to_best_fit_px"),
-    ("residual, rms, as a fraction of full scale", "–", "rms_residual"),
-    ("pixels compared", "–", "pixels"),
-    ("iterations on the full image", "–", "iterations"),
-    ("iterations on all levels", "–", "iterations_all_levels"),
-    ("condition number", "–", "condition_number"),
-    ("autocorrelation of the residual, 4 to 12 px", "–", "residual_correlation"),
-    ("noise of the camera images, rms, as a fraction of full scale", "–", "noise_sd"),
-    ("χ² of the residual: 1 if it is that noise and no more", "–", "chi_square"),
-    ("gain between the images, smallest", "–", "gain_min"),
-    ("… largest", "–", "gain_max"),
-    ("offset between the images, smallest, as a fraction of full scale", "–", "offset_min"),
-    ("… largest", "–", "offset_max"),
-    ("w, estimated from the images alone, rms", "px", "model_error_estimate_px"),
-    ("overlap of the mode's part with v₀", "–", "mode_polynomial_overlap"),
-    ("outcome", "", "outcome"),
-)
 _MODE = (("a₁", "–"), ("a₂", "–"), ("a₃", "–"), ("a₄", "–"), ("a₅", "–"), ("a₆", "mm"),
          ("a₇", "mm"))  # fmt: skip
 _DETAILS = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}
@@ -92,7 +70,7 @@ def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
             "unit": unit,
             "values": [s.get(key) for s in snapshots],
         }
-        for label, unit, key in _NUMBERS
+        for label, unit, key in quantities(SnapshotSummary)
         if any(s.get(key) is not None for s in snapshots)
     ]
 

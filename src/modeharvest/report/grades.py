@@ -47,7 +47,7 @@ from modeharvest.validation.resolution.grading import (
     star_csv_lines,
     star_summary,
 )
-from modeharvest.validation.resolution.transfer import KEPT
+from modeharvest.validation.resolution.star import KEPT
 from modeharvest.validation.scoring.grading import (
     COMMON,
     EVERYWHERE,

@@ -34,10 +34,9 @@ from modeharvest.validation.studies.modes import (
     PARAMETERS,
     WAVE_VECTORS,
     MeasuredModesStudy,
+    ModesAnalysis,
     SpecimenPatterns,
     deviations,
-    hole_sizes,
-    measured_patterns,
     standardised_errors,
 )
 from modeharvest.validation.studies.modes_specimen import specimen_folder
@@ -58,7 +57,7 @@ _LIKENESS = {
     "best_overlap_lattice": "best fit with it",
     "lattice_overlap_ideal": "Eq. (mode) with it", "overlap_truth": "with the specimen: measured",
     "best_overlap_truth": "best fit with that", "w_px": "truth − IDIC [px]",
-    "best_px": "truth − best fit [px]", "lost_px": "IDIC − best fit [px]",
+    "model_error_px": "truth − best fit [px]", "measurement_error_px": "IDIC − best fit [px]",
     "iterations": "iterations", "outcome": "outcome",
 }  # fmt: skip
 
@@ -104,7 +103,7 @@ def parameters_table(seen: pd.DataFrame) -> pd.DataFrame:
     rows = [
         {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
          "Eq. (mode)": ideal, "measured": row[name],
-         "± 2 sd by what is left over": 2.0 * row[f"{name}_sd_model_error"],
+         "± 2 sd by model error": 2.0 * row[f"{name}_sd_model_error"],
          "± 2 sd by 1 % of noise": 2.0 * row[f"{name}_sd_noise"],
          "best fit": row[f"best_{name}"],
          "infinite lattice": row["lattice_a1"] if name == "a1" else ideal}
@@ -296,29 +295,26 @@ def _bar(axes: Axes, scale: ColourScale) -> None:
 
 def report_modes(study: MeasuredModesStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
-    return modes_findings(table, folder, study.seeds)
+    return modes_findings(study.analyse(table, folder), folder, study.seeds)
 
 
-def modes_findings(table: pd.DataFrame, folder: Path, seeds: str) -> Findings:
-    """Read the table of all specimens.
+def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
+    """What the analysis of a study says.
 
     Parameters
     ----------
-    table
-        A row for each case of
-        :func:`modeharvest.validation.studies.modes.one_specimen`.
+    found
+        The analysis.
     folder
         Of the study, where the specimens are.
     seeds
         In words.
     """
-    ran = table[table["error"] == ""]
-    seen = measured_patterns(ran)
-    sizes = hole_sizes(seen).sort_values("ratio")
+    ran, seen, sizes = found.ran, found.measured, found.sizes
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
-        sentences=tuple(_sentences(ran, seen)),
-        keys=_keys(seen, sizes),
+        sentences=tuple(_sentences(found)),
+        keys=_keys(sizes),
         plots=tuple(_plots(seen, sizes, folder, seeds)),
         tables={
             "How they buckle": buckling_table(ran),
@@ -340,7 +336,7 @@ def _between(values: pd.Series) -> str:
     return " to ".join(ends)
 
 
-def _keys(seen: pd.DataFrame, sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
+def _keys(sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
     if not len(sizes):
         return ()
     span = f"d/l from {sizes['ratio'].min():.3g} to {sizes['ratio'].max():.3g}"
@@ -350,15 +346,15 @@ def _keys(seen: pd.DataFrame, sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
         KeyNumber("a₁", _percent(deviations(sizes)["a1"]), "", f"furthest from 1; {span}"),
         KeyNumber("overlap", f"{sizes['overlap_lattice'].min():.4f}", "",
                   f"of the measured with the infinite lattice’s mode, the least; {span}"),
-        KeyNumber("IDIC − best fit", short(float(sizes["lost_px"].max())), "px",
+        KeyNumber("IDIC − best fit", short(float(sizes["measurement_error_px"].max())), "px",
                   f"the most: what the measurement adds; {span}"),
     )  # fmt: skip
 
 
-def _sentences(ran: pd.DataFrame, seen: pd.DataFrame) -> list[str]:
+def _sentences(found: ModesAnalysis) -> list[str]:
     """What was found, the most important first."""
+    ran, seen, sizes = found.ran, found.measured, found.sizes
     said = []
-    sizes = hole_sizes(seen)
     if len(sizes):
         said += [*_of_parameters(sizes), _of_overlaps(sizes)]
     said += [
@@ -381,8 +377,8 @@ def _of_parameters(sizes: pd.DataFrame) -> list[str]:
         f"phases within {_percent(off[['a6', 'a7']])} of l.",
         f"The best fits to the specimens’ own displacements are within {_percent(best[WAVE_VECTORS])}, "
         f"{_percent(best['a1'])} and {_percent(best[['a6', 'a7']])}: that much is the specimens’. "
-        f"The measurement adds {short(float(sizes['lost_px'].min()))} to "
-        f"{short(float(sizes['lost_px'].max()))} px rms, and {int((np.abs(apart) <= 2).sum())} of "
+        f"The measurement adds {short(float(sizes['measurement_error_px'].min()))} to "
+        f"{short(float(sizes['measurement_error_px'].max()))} px rms, and {int((np.abs(apart) <= 2).sum())} of "
         f"{apart.size} parameters are within two standard deviations of the best fit’s (rms "
         f"{np.sqrt((apart**2).mean()):.2f} of them, by what the ansatz leaves over).",
     ]
@@ -429,8 +425,8 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
         f"wave vectors within {_percent(off[WAVE_VECTORS])} and an overlap with the specimen’s own "
         f"pattern of {_between(part['overlap_truth'])}, least where {worst['varied']} by "
         f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); truth − best fit is "
-        f"up to {short(float(part['best_px'].max()))} px (base: "
-        f"{short(float(base['best_px'].iloc[0]))})."
+        f"up to {short(float(part['model_error_px'].max()))} px (base: "
+        f"{short(float(base['model_error_px'].iloc[0]))})."
     ]
 
 

@@ -29,20 +29,16 @@ from modeharvest.report.figures.style import (
 )
 from modeharvest.report.model import Findings, KeyNumber, Plot, short
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.studies.noise import (
-    CAUSES,
-    HESSIAN_CORRECTED,
-    PARTS,
-    FieldPoints,
-    NoiseStudy,
-)
+from modeharvest.validation.studies.noise import NoiseStudy
 from modeharvest.validation.studies.noise_statistics import (
+    CAUSES,
+    PARTS,
     Estimate,
+    FieldPoints,
     Levels,
+    NoiseAnalysis,
     NoiseFreeCase,
     PairedErrors,
-    against_bound,
-    read_levels,
 )
 from modeharvest.validation.studies.study import VirtualImagePair
 
@@ -56,13 +52,13 @@ CAUSE_LABELS = {
 
 
 def summary_table(
-    levels: Levels, ours: Levels, soft: Levels, scene: VirtualImagePair
+    levels: Levels, ours: Levels, soft: Levels, pair: VirtualImagePair
 ) -> pd.DataFrame:
     """A row for each level and quantity; error bars by three different covariances."""
-    px = scene.images.grid.pixel_size
-    everything = np.ones(scene.ansatz.size, dtype=np.bool_)
+    px = pair.images.grid.pixel_size
+    everything = np.ones(pair.ansatz.size, dtype=np.bool_)
     families = {"all unknowns": everything} | {
-        f"unknowns of {name}": part for name, part in _unknown_families(scene).items()
+        f"unknowns of {name}": part for name, part in _unknown_families(pair).items()
     }
     rows = []
     for level in sorted(levels):
@@ -105,16 +101,16 @@ def with_errors(summary: pd.DataFrame) -> pd.DataFrame:
     return read
 
 
-def causes_table(levels: Levels, home: NoiseFreeCase) -> pd.DataFrame:
+def causes_table(levels: Levels, noise_free: NoiseFreeCase) -> pd.DataFrame:
     """Rms standard deviation or error over the bound, by causes and as measured; by fields."""
     first = levels[min(levels)]
     rows = []
     for cause in CAUSES:
-        told = home.told(cause).parts()
+        predicted = noise_free.predicted(cause).parts()
         row: dict[str, Any] = {"what": CAUSE_LABELS[cause]}
         for name in PARTS:
             counted = first[name].counted
-            row[name] = float(np.sqrt((told[name][counted] ** 2).mean()))
+            row[name] = float(np.sqrt((predicted[name][counted] ** 2).mean()))
         rows.append(row)
     bound = dict(rows[0])
     rows = [{k: v if k == "what" else v / bound[k] for k, v in row.items()} for row in rows]
@@ -124,9 +120,9 @@ def causes_table(levels: Levels, home: NoiseFreeCase) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def unknowns_table(levels: Levels, ours: Levels, scene: VirtualImagePair) -> pd.DataFrame:
+def unknowns_table(levels: Levels, ours: Levels, pair: VirtualImagePair) -> pd.DataFrame:
     """A row for each unknown and level."""
-    ansatz = scene.ansatz
+    ansatz = pair.ansatz
     parts = []
     for level, found in sorted(levels.items()):
         bound, least = found["unknowns"], ours[level]["unknowns"]
@@ -156,9 +152,9 @@ def maps_table(levels: Levels, ours: Levels, points: FieldPoints) -> pd.DataFram
     return pd.concat(parts, ignore_index=True)
 
 
-def _unknown_families(scene: VirtualImagePair) -> dict[str, NDArray[np.bool_]]:
+def _unknown_families(pair: VirtualImagePair) -> dict[str, NDArray[np.bool_]]:
     """Which unknowns are those of v0, of v1 and of phi1."""
-    names = np.array(scene.ansatz.names)
+    names = np.array(pair.ansatz.names)
     starts = {"v0": "v0", "v1": "v1[", "phi1": "phi1."}
     families = {k: np.char.startswith(names, start) for k, start in starts.items()}
     return {name: part for name, part in families.items() if part.any()}
@@ -291,7 +287,7 @@ def draw_maps(
     parts: Mapping[str, PairedErrors], points: FieldPoints, level: float, made: str
 ) -> Plot:
     """Draw maps of the fields' scatter, of its ratio to the least and of their coverage."""
-    grid = points.scene.images.grid
+    grid = points.pair.images.grid
     x, y = grid.x[points.cols], grid.y[points.rows]
     extent = (float(x[0]), float(x[-1]), float(y[-1]), float(y[0]))
     with style():
@@ -349,49 +345,32 @@ def _name_families(axes: Axes, names: Sequence[str]) -> None:
 
 def report_noise(study: NoiseStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
-    return noise_findings(
-        table, VirtualImagePair.open(folder, table["subject"].iloc[0]), study.seeds
-    )
+    return noise_findings(study.analyse(table, folder), study.seeds)
 
 
-def noise_findings(table: pd.DataFrame, scene: VirtualImagePair, seeds: str) -> Findings:
-    """Read the table of all realisations.
-
-    Parameters
-    ----------
-    table
-        A row for each case of :func:`modeharvest.validation.studies.noise.one_realisation`.
-    scene
-        The pair of images.
-    seeds
-        In words.
-    """
-    points, home = FieldPoints.of(scene), NoiseFreeCase.of(table)
-    levels = read_levels(table, home, points)
-    ours, soft = (
-        against_bound(levels, home, "least"),
-        against_bound(levels, home, HESSIAN_CORRECTED),
-    )
+def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
+    """What the analysis of a study says; ``seeds`` in words."""
+    levels, ours, soft = found.by_bound, found.by_least, found.by_hessian
     shown = sorted(levels)[len(levels) // 2]
-    summary = summary_table(levels, ours, soft, scene)
-    causes = causes_table(levels, home)
+    summary = summary_table(levels, ours, soft, found.pair)
+    causes = causes_table(levels, found.noise_free)
     bars = {"curvature, det F, gradient": ours, "curvature": soft, "JᵀJ only": levels}
     pairs = max(len(parts["u"].errors) for parts in levels.values())
     made = f"{pairs} pairs of realisations; {seeds}"
+    row = found.noise_free.row
+    parts = ("w_px", "model_error_px", "measurement_error_px")
     return Findings(
         numbers={
             "levels": summary.to_dict("records"),
             "causes": causes.to_dict("records"),
-            "noise_free": {k: float(home.row[k]) for k in ("w_px", "best_px", "lost_px")},
-            "give_over_that_without_noise": {
-                f"{k:g}": v for k, v in _curvature_sd_ratios(table).items()
-            },
-            "not_converged": _not_converged(table),
+            "noise_free": {name: float(row[name]) for name in parts},
+            "curvature_sd_ratio": {f"{k:g}": v for k, v in found.curvature_sd_ratio.items()},
+            "not_converged": found.not_converged,
         },
         sentences=(
-            *_level_sentences(levels, ours, scene),
+            *_level_sentences(levels, ours, found.pair),
             _cause_sentence(causes),
-            *_other_sentences(table, home),
+            *_other_sentences(found),
         ),
         keys=_keys(levels, ours, shown),
         plots=(
@@ -400,8 +379,8 @@ def noise_findings(table: pd.DataFrame, scene: VirtualImagePair, seeds: str) -> 
             draw_levels(levels, "bias", made),
             draw_levels(ours, "coverage", made),
             draw_bars(bars, made),
-            draw_unknowns(ours[shown]["unknowns"], scene.ansatz.names, shown, made),
-            draw_maps(ours[shown], points, shown, made),
+            draw_unknowns(ours[shown]["unknowns"], found.pair.ansatz.names, shown, made),
+            draw_maps(ours[shown], found.points, shown, made),
         ),
         tables={
             "Noise levels": with_errors(summary),
@@ -409,21 +388,10 @@ def noise_findings(table: pd.DataFrame, scene: VirtualImagePair, seeds: str) -> 
         },
         attachments={
             "Noise levels": summary,
-            "Each unknown": unknowns_table(levels, ours, scene),
-            "Maps": maps_table(levels, ours, points),
+            "Each unknown": unknowns_table(levels, ours, found.pair),
+            "Maps": maps_table(levels, ours, found.points),
         },
     )
-
-
-def _not_converged(table: pd.DataFrame) -> int:
-    done = table[table["error"] == ""]
-    return int((done["outcome"] != "converged").sum())
-
-
-def _curvature_sd_ratios(table: pd.DataFrame) -> dict[float, float]:
-    """How far u gives way by noisy images' own curvature, over that of exact images, by level."""
-    told = table[(table["error"] == "") & table["give_mm"].notna()].set_index("level")["give_mm"]
-    return {float(level): float(told[level] / told[0.0]) for level in told.index if level}
 
 
 def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
@@ -439,8 +407,8 @@ def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
     )  # fmt: skip
 
 
-def _level_sentences(levels: Levels, ours: Levels, scene: VirtualImagePair) -> tuple[str, ...]:
-    px = scene.images.grid.pixel_size
+def _level_sentences(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tuple[str, ...]:
+    px = pair.images.grid.pixel_size
     at = "at " + _listed(f"{100 * level:g}" for level in levels) + " % of noise in both images"
     shares = [
         (
@@ -482,19 +450,19 @@ def _cause_sentence(causes: pd.DataFrame) -> str:
     )
 
 
-def _other_sentences(table: pd.DataFrame, home: NoiseFreeCase) -> tuple[str, ...]:
-    noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in _curvature_sd_ratios(table).items())
+def _other_sentences(found: NoiseAnalysis) -> tuple[str, ...]:
+    noise_free, lost = found.noise_free, found.not_converged
+    noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
     said = [
         "Each result's error bars are those of its own covariance given the noise, times what "
         "exact images say that curvature, det F and the noise's gradient add, which is computed "
         "once: how far a push moves the displacement by a noisy pair's own curvature is "
         f"{noisy} of noise, over that without.",
-        f"Without noise the measurement is {short(float(home.row['lost_px']))} px rms per "
+        f"Without noise the measurement is {short(float(noise_free.row['measurement_error_px']))} px rms per "
         f"component from the best fit of its ansatz, which is "
-        f"{short(float(home.row['best_px']))} px from the truth: of that the noise's error bars "
+        f"{short(float(noise_free.row['model_error_px']))} px from the truth: of that the noise's error bars "
         "know nothing. All errors above are against the end without noise.",
     ]
-    lost = _not_converged(table)
     if lost:
         said.append(f"{lost} correlations did not converge, and count as they ended.")
     return tuple(said)

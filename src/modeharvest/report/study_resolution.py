@@ -17,27 +17,76 @@ from matplotlib.ticker import FuncFormatter
 from modeharvest.report.figures.style import BLUE, GREEN, INK, MUTED, RED, figure, style
 from modeharvest.report.model import Findings, KeyNumber, Plot, short
 from modeharvest.validation.resolution.buckled import ResolutionSpec
-from modeharvest.validation.resolution.transfer import KEPT
-from modeharvest.validation.resolution.waves import (
+from modeharvest.validation.resolution.star import KEPT
+from modeharvest.validation.resolution.transfer import (
     AXES,
     QUANTITIES,
     WAVED,
     DegreeResolution,
     Passband,
     TransferCurves,
-    degrees_of,
-    subset_indicator,
 )
-from modeharvest.validation.studies.resolution import ResolutionStudy, measured_waves, noise_floors
+from modeharvest.validation.studies.resolution import (
+    MOTIONS,
+    ResolutionAnalysis,
+    ResolutionStudy,
+)
 
 _DEGREES: Colormap = mpl.colormaps["viridis"]
 
 
+def noise_floors(done: pd.DataFrame, spec: ResolutionSpec) -> pd.DataFrame:
+    """Scatter under noise against what each result's covariance predicts, and the least there can be.
+
+    The rms over realisations and material [px], by motion, degree and quantity.
+    """
+    rows = []
+    for motion, what in MOTIONS.items():
+        noisy = done[(done["task"] == "noise") & (done["motion"] == motion)]
+        floors = done[(done["task"] == "floor") & (done["motion"] == motion)]
+        for degree in spec.measured:
+            least = floors[floors["degree"] == degree]
+            if len(noisy) < 2 or not len(least):
+                continue
+            for name in QUANTITIES:
+                squares = noisy[f"{name}_{degree}"].to_numpy(float) ** 2
+                predicted = float(np.sqrt((noisy[f"predicted_{name}_{degree}"] ** 2).mean()))
+                scatter = float(np.sqrt(squares.mean()))
+                error = squares.std(ddof=1) / np.sqrt(len(squares)) / (2.0 * scatter)
+                rows.append({
+                    "images": what, "degree": degree, "quantity": name,
+                    "bound [10⁻³ px]": 1e3 * float(least[name].iloc[0]),
+                    "predicted by covariance [10⁻³ px]": 1e3 * predicted,
+                    "Monte Carlo [10⁻³ px]": 1e3 * scatter,
+                    "Monte Carlo / predicted": scatter / predicted, "±": error / predicted,
+                })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def measured_waves(
+    done: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
+) -> pd.DataFrame:
+    """Shares of waves found in images and by best fits, over both phases."""
+    waves, rows = done[done["task"] == "wave"], []
+    pitch = spec.buckled.specimen.pitch
+    for (part, axis, period), both in waves.groupby(["part", "axis", "period"]):
+        if len(both) < 2:
+            continue
+        for degree in spec.measured:
+            fit = curves.at(part, axis, degree, period)
+            found = float(np.average(both[f"own_{degree}"], weights=both["power"]))
+            rows.append({
+                "wave of": part, "along": AXES[axis], "period [cells]": period / pitch,
+                "degree": degree, "best fit": fit, "images": found, "difference": found - fit,
+            })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
 def draw_transfer(
-    part: str, curves: TransferCurves, waves: pd.DataFrame, subject: ResolutionSpec
+    part: str, curves: TransferCurves, waves: pd.DataFrame, spec: ResolutionSpec
 ) -> Plot:
     """Draw T over the period for waves of a part along both axes, degrees in colours."""
-    pitch = subject.buckled.specimen.pitch
+    pitch = spec.buckled.specimen.pitch
     degrees = sorted({key[2] for key in curves.own})
     with style():
         drawn = figure(9.4, 3.1)
@@ -150,30 +199,19 @@ _KEPT = 0.85
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What a resolution study has found.
+    """What a resolution study has found, in words.
 
     Parameters
     ----------
-    subject
-        What was measured.
-    degrees, chosen
-        All degrees, and the one that is told of most: that of the subject's own v0.
-    curves, passband
-        Best fits of waves, and of patterns of other wavelengths.
+    found
+        The analysis.
     waves, floors
         Tables: images against best fits, scatter against covariance.
-    local_px2
-        The indicator of an affine subset [px^2].
     """
 
-    subject: ResolutionSpec
-    degrees: list[DegreeResolution]
-    chosen: DegreeResolution
-    curves: TransferCurves
-    passband: Passband
+    found: ResolutionAnalysis
     waves: pd.DataFrame
     floors: pd.DataFrame
-    local_px2: float
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -192,15 +230,15 @@ class Answers:
 
     @property
     def _pitch_px(self) -> float:
-        return self.subject.buckled.specimen.pitch / self.subject.buckled.pixel_size
+        return self.found.spec.buckled.specimen.pitch / self.found.spec.buckled.pixel_size
 
     @property
     def _finest(self) -> str:
-        b, pitch = self.subject.buckled, self._pitch_px
+        b, pitch = self.found.spec.buckled, self._pitch_px
         width = 2.0 * b.specimen.half_size[0] / b.pixel_size
-        v0, v1 = (self.chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
+        v0, v1 = (self.found.chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
         return (
-            f"At degree {self.chosen.degree} a wave along x keeps 90 % of its amplitude from a "
+            f"At degree {self.found.chosen.degree} a wave along x keeps 90 % of its amplitude from a "
             f"period of {v0:.0f} px on if it is of v0 ({v0 / pitch:.1f} cells, "
             f"{100 * v0 / width:.0f} % of the specimen's width), and from {v1:.0f} px on "
             f"({v1 / pitch:.1f} cells) if it is of v1, which lives in the cellular part only."
@@ -208,7 +246,7 @@ class Answers:
 
     @property
     def _trade_off(self) -> str:
-        first, last, pitch = self.degrees[0], self.degrees[-1], self._pitch_px
+        first, last, pitch = self.found.degrees[0], self.found.degrees[-1], self._pitch_px
         return (
             f"From degree {first.degree} to {last.degree} that period of v0 falls from "
             f"{first.finest_px['v0 x'] / pitch:.1f} to {last.finest_px['v0 x'] / pitch:.1f} cells, "
@@ -220,26 +258,26 @@ class Answers:
 
     @property
     def _product(self) -> str:
-        first, last = self.degrees[0], self.degrees[-1]
-        v0 = [d.indicator_px2["v0"] for d in self.degrees]
+        first, last = self.found.degrees[0], self.found.degrees[-1]
+        v0 = [d.indicator_px2["v0"] for d in self.found.degrees]
         gain = first.finest_px["v0 x"] / last.finest_px["v0 x"]
         return (
             f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
             f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
-            f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 held "
-            f"and without motion from {first.held_px2:.2f} to {last.held_px2:.2f} px²: the rest is "
+            f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 fixed "
+            f"and without motion from {first.fixed_px2:.2f} to {last.fixed_px2:.2f} px²: the rest is "
             "mostly the noise of φ1's own parameters. An affine subset on the same speckle under "
-            f"the same noise has {self.local_px2:.2f} px², whatever its size (theory)."
+            f"the same noise has {self.found.subset_px2:.2f} px², whatever its size (theory)."
         )
 
     @property
     def _images(self) -> str:
         off, kept = self.waves["difference"].abs(), self.waves["best fit"] >= _KEPT
         elsewhere = "" if kept.all() else f", elsewhere by {100 * off[~kept].max():.1f} %"
-        anywhere, resolved = self.curves.cross_talk()
+        anywhere, resolved = self.found.curves.cross_talk()
         return (
             f"Correlated images give what the best fits promise: where these keep "
-            f"{100 * _KEPT:.0f} % or more of a wave of {self.subject.amplitude_px:g} px, its share "
+            f"{100 * _KEPT:.0f} % or more of a wave of {self.found.spec.amplitude_px:g} px, its share "
             f"differs by {100 * off[kept].max():.1f} % of the amplitude at most{elsewhere}. Of a "
             f"wave of one part up to {100 * resolved:.1f} % is found in the other where it is "
             f"resolved, up to {100 * anywhere:.0f} % where it isn't."
@@ -247,24 +285,24 @@ class Answers:
 
     @property
     def _noise(self) -> str:
-        ratio = self.floors["Monte Carlo / told"]
+        ratio = self.floors["Monte Carlo / predicted"]
         return (
             f"Scatter under noise is {ratio.min():.2f} to {ratio.max():.2f} times what the "
-            f"results' own covariance tells, each ± {self.floors['±'].mean():.2f}, with and "
+            f"results' own covariance predicts, each ± {self.floors['±'].mean():.2f}, with and "
             "without motion."
         )
 
     @property
     def _pattern(self) -> str:
         """Why l10 means nothing for the pattern itself."""
-        band = self.passband
+        band = self.found.passband
         kept = band.stretch[(band.stretch > 0.82) & (band.added >= 0.9)]
         return (
             "The pattern itself has a wavelength of 2 cells along x and y, "
             f"{2 * self._pitch_px:.0f} px, far below those periods, and none of it is lost: it is "
             "one of the functions that are fitted. A small pattern beside it passes as through a "
             f"filter, from {kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
-            f"{self.chosen.degree}; but if the pattern itself is up to {100 * band.retuned:.0f} % "
+            f"{self.found.chosen.degree}; but if the pattern itself is up to {100 * band.retuned:.0f} % "
             "longer or shorter, its wave numbers follow, and all of its amplitude is found: "
             "l₁₀ % is a filter's number, and φ1 isn't filtered but tuned."
         )
@@ -272,80 +310,60 @@ class Answers:
 
 def report_resolution(study: ResolutionStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Transfer, noise floors and indicators by degree."""
-    subject = ResolutionSpec.read(folder, table["subject"].iloc[0])
-    return resolution_findings(
-        table, subject, TransferCurves.of(subject, study.degrees), study.seeds
-    )
+    return resolution_findings(study.analyse(table, folder), study.seeds)
 
 
-def resolution_findings(
-    table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves, seeds: str
-) -> Findings:
-    """Read the table of all cases.
-
-    Parameters
-    ----------
-    table
-        A row for each case of :func:`modeharvest.validation.studies.resolution.one_case`.
-    subject
-        What was measured.
-    curves
-        The best fits of waves at all degrees.
-    seeds
-        In words.
-    """
-    done = table[table["error"] == ""]
-    degrees = degrees_of(done, subject, curves)
-    floors, waves = noise_floors(done, subject), measured_waves(done, subject, curves)
-    chosen = min(degrees, key=lambda d: abs(d.degree - subject.buckled.how.v0_degree))
-    passband = Passband.of(subject, chosen.degree)
-    local = subset_indicator(subject)
-    answers = Answers(subject, degrees, chosen, curves, passband, waves, floors, local)
+def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
+    """What the analysis of a study says; ``seeds`` in words."""
+    spec, curves, degrees, chosen = found.spec, found.curves, found.degrees, found.chosen
+    floors = noise_floors(found.rows, spec)
+    waves = measured_waves(found.rows, spec, curves)
+    answers = Answers(found, waves, floors)
     return Findings(
         numbers={
             "degrees": [asdict(d) for d in degrees],
-            "affine_subset_indicator_px2": local,
+            "affine_subset_indicator_px2": found.subset_px2,
             "images_against_best_fits": waves.to_dict("records"),
             "noise": floors.to_dict("records"),
             "cross_talk": dict(zip(("any_period", "resolved"), curves.cross_talk(), strict=True)),
-            "longest_retuned": passband.retuned,
+            "longest_retuned": found.passband.retuned,
         },
         sentences=answers.sentences,
-        keys=_keys(chosen, subject),
+        keys=_keys(chosen, spec),
         plots=(
-            *(draw_transfer(part, curves, waves, subject) for part in WAVED),
-            draw_indicators(degrees, local, seeds),
-            draw_passband(passband, chosen.degree),
+            *(draw_transfer(part, curves, waves, spec) for part in WAVED),
+            draw_indicators(degrees, found.subset_px2, seeds),
+            draw_passband(found.passband, chosen.degree),
         ),
         tables={
-            "By degree": _by_degree(degrees, subject),
+            "By degree": _by_degree(degrees, spec),
             "Images against best fits": waves,
             "Noise floors": floors,
         },
         attachments={
-            "Finest periods": _finest(degrees, subject),
-            "Transfer": _transfer_table(curves, subject),
+            "Finest periods": _finest(degrees, spec),
+            "Transfer": _transfer_table(curves, spec),
         },
     )
 
 
-def _by_degree(degrees: list[DegreeResolution], subject: ResolutionSpec) -> pd.DataFrame:
+def _by_degree(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
     """A row for each degree."""
-    pitch_px = subject.buckled.specimen.pitch / subject.buckled.pixel_size
+    pitch_px = spec.buckled.specimen.pitch / spec.buckled.pixel_size
     rows = []
     for d in degrees:
         row: dict[str, Any] = {"degree": d.degree, "unknowns": d.unknowns}
         row |= {f"l10 of {name} [cells]": at / pitch_px for name, at in d.finest_px.items()}
         row |= {f"n of {name} [10⁻³ px]": 1e3 * d.floor_px[name] for name in QUANTITIES}
         row |= {f"n l10 of {part} [px²]": d.indicator_px2[part] for part in WAVED}
-        row["of v1, φ1 held [px²]"] = d.held_px2
+        row["of v1, φ1 fixed [px²]"] = d.fixed_px2
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _finest(degrees: list[DegreeResolution], subject: ResolutionSpec) -> pd.DataFrame:
+def _finest(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
     """A row for each degree and wave: l10 in px, in cells, and over what the wave runs through."""
-    b, rows = subject.buckled, []
+    b, rows = spec.buckled, []
     lengths = {"v0": b.specimen.half_size, "v1": b.specimen.cellular_half_size}
     for d in degrees:
         for name, at in d.finest_px.items():
@@ -359,9 +377,9 @@ def _finest(degrees: list[DegreeResolution], subject: ResolutionSpec) -> pd.Data
     return pd.DataFrame(rows)
 
 
-def _transfer_table(curves: TransferCurves, subject: ResolutionSpec) -> pd.DataFrame:
+def _transfer_table(curves: TransferCurves, spec: ResolutionSpec) -> pd.DataFrame:
     """A row for each curve and period."""
-    px = subject.buckled.pixel_size
+    px = spec.buckled.pixel_size
     parts = [
         pd.DataFrame({
             "wave of": part, "along": AXES[axis], "degree": degree,
@@ -373,14 +391,14 @@ def _transfer_table(curves: TransferCurves, subject: ResolutionSpec) -> pd.DataF
     return pd.concat(parts, ignore_index=True)
 
 
-def _keys(chosen: DegreeResolution, subject: ResolutionSpec) -> tuple[KeyNumber, ...]:
-    pitch = subject.buckled.specimen.pitch / subject.buckled.pixel_size
+def _keys(chosen: DegreeResolution, spec: ResolutionSpec) -> tuple[KeyNumber, ...]:
+    pitch = spec.buckled.specimen.pitch / spec.buckled.pixel_size
     at = f"degree {chosen.degree}"
     keys = []
     for part in WAVED:
         x, y = (chosen.finest_px[f"{part} {axis}"] / pitch for axis in AXES)
         keys.append(KeyNumber(f"l₁₀ % of {part}", f"{x:.1f} – {y:.1f}", "cells", f"{at}; x – y"))
-    noise = f"{at}; {100 * subject.noise:g} % of noise"
+    noise = f"{at}; {100 * spec.noise:g} % of noise"
     keys += [
         KeyNumber(f"n of {name}", f"{1e3 * chosen.floor_px[floor]:.2f}", "10⁻³ px", noise)
         for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1"))

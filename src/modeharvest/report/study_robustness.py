@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,18 +15,58 @@ from modeharvest.validation.studies.robustness import (
     OUTLIER_PERCENT,
     PUBLISHED,
     SAME_PX,
+    GuessStatistics,
+    Proportion,
+    RobustnessAnalysis,
     RobustnessStudy,
-    by_radius,
-    by_strain,
-    other_minima,
-    success_numbers,
 )
 
-"""Ends nearer than this, rms, are the same minimum [px]."""
 
-"""Above this epsilon the paper calls a result erroneous."""
+def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
+    """Success against the radius of the perturbations."""
+    rows = []
+    for radius, part in moved.groupby("radius"):
+        same = Proportion(int(part["same"].sum()), len(part))
+        low, high = same.interval
+        others = part[~part["same"]]
+        detected = int((others["outcome"] != "converged").sum())
+        rows.append({
+            "off by up to [%]": 100.0 * radius,
+            "starts": same.count,
+            "same minimum": same.good,
+            "success [%]": 100.0 * same.good / same.count,
+            "95 % from": 100.0 * low,
+            "to [%]": 100.0 * high,
+            "other minima detected": f"{detected} of {len(others)}",
+            "largest distance among the same [px]": part.loc[part["same"], "distance_px"].max(),
+            "mean iterations": part["all_iterations"].mean(),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
 
-"""Section "Virtual Experiments" of the paper: 100 starts, parameters up to 10 % off."""
+
+def other_minima(moved: pd.DataFrame) -> pd.DataFrame:
+    """Each initial guess that leads elsewhere; with the seed its number makes it again."""
+    others = moved[~moved["same"]].sort_values(["radius", "start"])
+    return pd.DataFrame({
+        "off by up to [%]": 100.0 * others["radius"],
+        "number of the start": others["start"],
+        "distance of the start [px rms]": others["start_distance_px"].round(2),
+        "distance of the end [px rms]": others["distance_px"].round(3),
+        "ε [%]": others["epsilon_percent"].round(3),
+        "outcome": others["outcome"].fillna("failed"),
+        "iterations": others["all_iterations"],
+    })  # fmt: skip
+
+
+def by_strain(part: pd.DataFrame) -> pd.DataFrame:
+    """Where initial guesses with a wrong strain lead; empty if there was none."""
+    return pd.DataFrame({
+        "strain of the start, off by [%]": 100.0 * part["strain_error"],
+        "distance of the start [px]": part["start_distance_px"],
+        "distance of the end [px]": part["distance_px"],
+        "outcome": part["outcome"],
+        "iterations": part["all_iterations"],
+    })  # fmt: skip
 
 
 def draw_distances(asked: pd.DataFrame, radius: float, seeds: str) -> Plot:
@@ -110,45 +149,31 @@ def draw_starts_of_v0(strains: pd.DataFrame) -> Plot:
 
 def report_robustness(study: RobustnessStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Success, epsilon and the honest distance, and the basin's picture."""
-    return robustness_findings(table, study.radius, study.seeds)
+    return robustness_findings(study.analyse(table, folder), study.seeds)
 
 
-def robustness_findings(table: pd.DataFrame, radius: float, seeds: str) -> Findings:
-    """Read the table of all starts.
-
-    Parameters
-    ----------
-    table
-        A row for each case of
-        :func:`modeharvest.validation.studies.robustness.one_start`. One that failed counts
-        as one that did not arrive.
-    radius
-        That of the paper's question [-].
-    seeds
-        In words.
-    """
-    table = table.assign(same=table["distance_px"] < SAME_PX)
-    moved = table[table["strain_error"] == 0.0]
-    asked = moved[moved["radius"] == radius]
-    found = success_numbers(asked, radius)
-    basin, strains = by_radius(moved[moved["radius"] > 0.0]), by_strain(table)
+def robustness_findings(found: RobustnessAnalysis, seeds: str) -> Findings:
+    """What the analysis of a study says; ``seeds`` in words."""
+    numbers = asdict(found.statistics)
+    radius, strains = found.statistics.radius, by_strain(found.strains)
+    basin = by_radius(found.moved[found.moved["radius"] > 0.0])
     tables = {"Basin of convergence": basin}
-    if not moved["same"].all():
-        tables["Starts that end elsewhere"] = other_minima(moved)
+    if not found.moved["same"].all():
+        tables["Starts that end elsewhere"] = other_minima(found.moved)
     if len(strains):
         tables["Start of v0"] = strains
     return Findings(
-        numbers={**found, "basin": basin.to_dict("records")},
+        numbers={**numbers, "basin": basin.to_dict("records")},
         sentences=(
-            *_sentences(found),
+            *_sentences(found.statistics),
             *_basin_sentences(basin),
-            *_undetected_sentences(moved),
+            *_undetected_sentences(found.moved),
             *_strain_sentences(strains),
         ),
-        keys=_keys(found),
+        keys=_keys(found.statistics),
         plots=(
-            draw_distances(asked, radius, seeds),
-            draw_epsilons(asked, seeds),
+            draw_distances(found.at_radius, radius, seeds),
+            draw_epsilons(found.at_radius, seeds),
             draw_basin(basin, seeds),
             *((draw_starts_of_v0(strains),) if len(strains) else ()),
         ),
@@ -156,53 +181,53 @@ def robustness_findings(table: pd.DataFrame, radius: float, seeds: str) -> Findi
     )
 
 
-def _keys(found: Mapping[str, Any]) -> tuple[KeyNumber, ...]:
-    low, high = found["success_interval_95"]
+def _keys(found: GuessStatistics) -> tuple[KeyNumber, ...]:
+    low, high = found.success_interval_95
     return (
         KeyNumber(
-            "starts that arrive", f"{found['same_minimum']} of {found['starts']}", "",
+            "starts that arrive", f"{found.same_minimum} of {found.starts}", "",
             f"95 % interval {100 * low:.1f} to {100 * high:.1f} %; the paper: 98 of 100",
         ),
         KeyNumber(
-            "mean ε, as the paper defines it", short(found["mean_epsilon_percent"]), "%",
+            "mean ε, as the paper defines it", short(found.mean_epsilon_percent), "%",
             f"the paper: {PUBLISHED['mean_epsilon_percent']} %, without two outliers "
             f"{PUBLISHED['mean_epsilon_without_outliers_percent']} %",
         ),
         KeyNumber(
-            "largest distance between ends", short(found["largest_distance_px"]), "px",
-            f"rms; starts up to {found['largest_start_distance_px']:.3g} px away",
+            "largest distance between ends", short(found.largest_distance_px), "px",
+            f"rms; starts up to {found.largest_start_distance_px:.3g} px away",
         ),
     )  # fmt: skip
 
 
-def _sentences(found: Mapping[str, Any]) -> tuple[str, ...]:
-    low, high = found["success_interval_95"]
+def _sentences(found: GuessStatistics) -> tuple[str, ...]:
+    low, high = found.success_interval_95
     said = [
-        f"{found['same_minimum']} of {found['starts']} starts with mode parameters up to "
-        f"{100 * found['radius']:g} % off end in the standard start's minimum (within {SAME_PX} "
-        f"px rms): {100 * found['success']:.1f} %, 95 % interval {100 * low:.1f} to "
+        f"{found.same_minimum} of {found.starts} starts with mode parameters up to "
+        f"{100 * found.radius:g} % off end in the standard start's minimum (within {SAME_PX} "
+        f"px rms): {100 * found.success:.1f} %, 95 % interval {100 * low:.1f} to "
         f"{100 * high:.1f} %. The paper has {100 * PUBLISHED['success']:.0f} of 100.",
         f"The paper's ε = 100 (‖u‖ − ‖u_pert‖)/‖u‖, here without its sign, is "
-        f"{short(found['mean_epsilon_percent'])} % on average and "
-        f"{short(found['largest_epsilon_percent'])} % at most; {found['outliers'] or 'none'} lie "
+        f"{short(found.mean_epsilon_percent)} % on average and "
+        f"{short(found.largest_epsilon_percent)} % at most; {found.outliers or 'none'} lie "
         f"above {OUTLIER_PERCENT} %, the paper's outliers. The paper has "
         f"{PUBLISHED['mean_epsilon_percent']} % on average, "
         f"{PUBLISHED['mean_epsilon_without_outliers_percent']} % without two outliers.",
         "A difference of norms can vanish for fields that differ. The norm of the difference is "
-        f"{short(found['largest_distance_px'])} px rms at most, "
-        f"{short(found['largest_distance_of_arrived_px'])} px among those that arrive.",
+        f"{short(found.largest_distance_px)} px rms at most, "
+        f"{short(found.largest_distance_of_arrived_px)} px among those that arrive.",
         "The paper's perturbations are shares of the parameters' nominal values, which are 0 for "
         "the two phases; here these are off by up to the same share of the unit cell, too.",
     ]
-    elsewhere = found["starts"] - found["same_minimum"] - found["failed"]
+    elsewhere = found.starts - found.same_minimum - found.failed
     if elsewhere:
         said.append(
             f"Of the {elsewhere} that end elsewhere, "
-            f"{found['elsewhere_but_called_converged']} pass for converged; the others are "
+            f"{found.other_minimum_called_converged} pass for converged; the others are "
             "recognised."
         )
-    if found["failed"]:
-        said.append(f"{found['failed']} failed, and count as not arrived.")
+    if found.failed:
+        said.append(f"{found.failed} failed, and count as not arrived.")
     return tuple(said)
 
 

@@ -13,23 +13,83 @@ from matplotlib.ticker import NullLocator
 
 from modeharvest.report.figures.style import BLUE, GOLD, GREEN, MUTED, figure, style
 from modeharvest.report.model import Findings, KeyNumber, Plot, short
-from modeharvest.validation.studies.study import VirtualImagePair
 from modeharvest.validation.studies.systematic import (
-    ERRORS,
+    BASE,
     FACTORS,
-    MOVED,
-    StudySetting,
+    SystematicAnalysis,
     SystematicStudy,
-    by_factor,
-    by_level,
-    not_all_converged,
 )
 
-"""The errors by their names in the table; the first is what the measurement adds."""
+ERROR_LABELS = {
+    "measurement_error_px": "IDIC − best fit [px]",
+    "model_error_px": "truth − best fit [px]",
+    "w_px": "w = truth − IDIC [px]",
+    "v1_percent": "v₁ off the best fit's [%]",
+}
+
+MOVED = "moved from the base [px]"
+
+
+def by_level(found: SystematicAnalysis) -> pd.DataFrame:
+    """A row for each factor and level, the base's among them: means over the speckles."""
+    done = found.rows
+    base = done[done["factor"] == BASE]
+    rows = []
+    for name, at_base in found.bases.items():
+        parts = dict(iter(done[done["factor"] == name].groupby("level")))
+        if at_base is not None:
+            parts[float(at_base)] = base
+        for level in sorted(parts):
+            part = parts[level]
+            if not len(part):
+                continue
+            factor = FACTORS[name]
+            row = {"factor": factor.label, "name": name, "number": level,
+                   "level": factor.label_of(level) if factor.names else level,
+                   "base": "yes" if level == at_base else ""}  # fmt: skip
+            for key, label in ERROR_LABELS.items():
+                row[label] = part[key].mean()
+            row[MOVED] = part["moved"].mean()
+            row["IDIC − best fit, sd over speckles [px]"] = part["measurement_error_px"].std(ddof=0)
+            row["pixels per ligament"] = part["pixels_per_ligament"].mean()
+            row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
+    """A row for each factor: its smallest and its largest error, the most important first.
+
+    Levels at which not all converged have no part in it.
+    """
+    measurement, model, moved = (
+        ERROR_LABELS["measurement_error_px"],
+        ERROR_LABELS["model_error_px"],
+        f"largest, {MOVED}",
+    )
+    rows = []
+    settled = levels[~levels["converged"].map(_not_all_converged)]
+    for name, part in settled.groupby("name", sort=False):
+        least, most = part.loc[part[measurement].idxmin()], part.loc[part[measurement].idxmax()]
+        rows.append({
+            "factor": FACTORS[str(name)].label, "name": name,
+            f"smallest {measurement}": least[measurement], "at": least["level"],
+            f"largest {measurement}": most[measurement], "at ": most["level"],
+            "ratio": most[measurement] / least[measurement],
+            f"{model}, from": part[model].min(), "to": part[model].max(),
+            moved: part[MOVED].max(),
+        })  # fmt: skip
+    return pd.DataFrame(rows).sort_values(moved, ascending=False, ignore_index=True)
+
+
+def _not_all_converged(converged: str) -> bool:
+    good, _, count = converged.split()
+    return good != count
+
 
 _CURVES: dict[str, dict[str, Any]] = {
-    ERRORS["lost_px"]: {"color": BLUE, "marker": "o"},
-    ERRORS["best_px"]: {"color": GREEN, "marker": "s"},
+    ERROR_LABELS["measurement_error_px"]: {"color": BLUE, "marker": "o"},
+    ERROR_LABELS["model_error_px"]: {"color": GREEN, "marker": "s"},
     MOVED: {"color": GOLD, "marker": "^"},
 }
 _COLUMNS = 3
@@ -37,49 +97,24 @@ _COLUMNS = 3
 
 def report_systematic(study: SystematicStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Errors against each factor, as curves and tables."""
-    scene = VirtualImagePair.open(folder, table["subject"].iloc[0])
-    base = StudySetting(scene.images.spec, scene.how, scene.taper)
-    bases = {name: FACTORS[name].base(base) for name in study.factors}
-    return systematic_findings(table, bases, base.imaging.pixel_size, study.seeds)
-
-
-def systematic_findings(
-    table: pd.DataFrame, bases: Mapping[str, float | None], px: float, seeds: str
-) -> Findings:
-    """Read the table of all levels.
-
-    Parameters
-    ----------
-    table
-        A row for each case of :func:`modeharvest.validation.studies.systematic.one_level`.
-    bases
-        The level of each factor that the base has; None where it has none.
-    px
-        The base's pixel [mm].
-    seeds
-        In words.
-    """
-    levels = by_level(table, bases, px)
+    found = study.analyse(table, folder)
+    levels = by_level(found)
     spans = by_factor(levels)
-    base = table[(table["factor"] == "base") & (table["error"] == "")]
     return Findings(
-        numbers={
-            "base": {name: float(base[name].mean()) for name in ERRORS},
-            "factors": spans.to_dict("records"),
-        },
-        sentences=_sentences(levels, spans, base),
-        keys=_keys(spans, base),
-        plots=(_curves(levels, bases, seeds),),
+        numbers={"base": dict(found.base), "factors": spans.to_dict("records")},
+        sentences=_sentences(levels, spans, found.base),
+        keys=_keys(spans, found.base),
+        plots=(_curves(levels, found.bases, study.seeds),),
         tables={"Which factor matters": spans, "Every level": levels.drop(columns="number")},
     )
 
 
-def _keys(spans: pd.DataFrame, base: pd.DataFrame) -> tuple[KeyNumber, ...]:
+def _keys(spans: pd.DataFrame, base: Mapping[str, float]) -> tuple[KeyNumber, ...]:
     first = spans.iloc[0]
     return (
-        KeyNumber("IDIC − best fit", short(float(base["lost_px"].mean())), "px",
+        KeyNumber("IDIC − best fit", short(base["measurement_error_px"]), "px",
                   "at the base, rms per component: what the measurement adds"),
-        KeyNumber("truth − best fit", short(float(base["best_px"].mean())), "px",
+        KeyNumber("truth − best fit", short(base["model_error_px"]), "px",
                   "at the base: what the ansatz can’t describe"),
         KeyNumber("matters most", str(first["factor"]).split(" [")[0], "",
                   f"moves the measurement by up to {first[f'largest, {MOVED}']:.2g} px"),
@@ -90,12 +125,14 @@ _FAR, _NEAR = 0.1, 0.01
 """Factors that move the measurement by more, or by less, are told apart [px]."""
 
 
-def _sentences(levels: pd.DataFrame, spans: pd.DataFrame, base: pd.DataFrame) -> tuple[str, ...]:
+def _sentences(
+    levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]
+) -> tuple[str, ...]:
     said = [
-        f"At the base the measurement is {short(float(base['lost_px'].mean()))} px rms per "
+        f"At the base the measurement is {short(base['measurement_error_px'])} px rms per "
         f"component from the best fit of its ansatz, which is "
-        f"{short(float(base['best_px'].mean()))} px from the truth; v₁ is "
-        f"{short(float(base['v1_percent'].mean()))} % off the best fit's."
+        f"{short(base['model_error_px'])} px from the truth; v₁ is "
+        f"{short(base['v1_percent'])} % off the best fit's."
     ]
     far = spans[f"largest, {MOVED}"]
     for words, part in (
@@ -109,7 +146,7 @@ def _sentences(levels: pd.DataFrame, spans: pd.DataFrame, base: pd.DataFrame) ->
                 for moved, (_, row) in zip(far[part.index], part.iterrows(), strict=True)
             )
             said.append(f"{words}: {told}.")
-    lost_ones = levels[levels["converged"].map(not_all_converged)]
+    lost_ones = levels[levels["converged"].map(_not_all_converged)]
     if len(lost_ones):
         told = ", ".join(f"{r['name']} = {short(r['level'])}" for _, r in lost_ones.iterrows())
         said.append(f"Not every correlation converged at {told}: left out above.")
@@ -155,7 +192,7 @@ def _finish_axes(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:
     axes.set(xlabel=factor.label, yscale="log", xscale="log" if is_geometric else "linear")
     if at_base is not None:
         axes.axvline(at_base, color=MUTED, linestyle=":", linewidth=1)
-    ticks = [factor.told(level) for level in levels]
+    ticks = [factor.label_of(level) for level in levels]
     if name == "pixel_size":
         axes.set_xlabel("pixel [mm], below: pixels per ligament")
         ticks = [f"{t}\n{p:.3g}" for t, p in zip(ticks, part["pixels per ligament"], strict=True)]

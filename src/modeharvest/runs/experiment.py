@@ -204,7 +204,7 @@ class Run(StagedRun[Case]):
                 comparisons, spectra, measured.specimen.pitch,
             )  # fmt: skip
             drawings = draw(data, self.progress)
-            summary = experiment_summary(measured, case.plain(), list(snapshots))
+            summary = experiment_summary(measured, case.plain(), list(snapshots)).plain()
         write_experiment_report(page, case.plain(), drawings, summary)
         return summary
 

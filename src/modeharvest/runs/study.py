@@ -81,7 +81,7 @@ class StudyCase(Case):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        study: Study = self.study
+        study: Study[Any] = self.study
         study.require(self.correlation)
         strains = self.experiment.strains
         if not any(abs(study.strain - e) < 1e-9 for e in strains):
@@ -195,7 +195,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
         files["timings.json"] = "what the stages took [s]"
         summary = self._summary(campaign, table, findings)
         write_json(self.folder / "summary.json", summary)
-        study: Study = self.case.study
+        study: Study[Any] = self.case.study
         run = StudyRun(
             title=summary["title"],
             question=study.question,

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 from modeharvest.util.errors import InputError
@@ -94,6 +94,18 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [to_plain(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def quantity(label: str, unit: str = "", **options: Any) -> Any:
+    """A dataclass' field that readers call by a label, in a unit; ``options``: of a field."""
+    return field(metadata={"label": label, "unit": unit}, **options)
+
+
+def quantities(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
+    """Label, unit and name of each quantity of a dataclass."""
+    for f in fields(kind):
+        if "label" in f.metadata:
+            yield f.metadata["label"], f.metadata["unit"], f.name
 
 
 def sentence(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
