@@ -409,7 +409,9 @@ def test_a_study_from_the_command_line(
     monkeypatch.setattr("modeharvest.validation.workers.Workers.client", None)
     assert called(monkeypatch, *arguments) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()} == before
-    assert "1 stored results of modeharvest 0.0.0 were left alone" in (out / "report.html").read_text()
+    assert (
+        "1 stored results of modeharvest 0.0.0 were left alone" in (out / "report.html").read_text()
+    )
 
 
 def test_a_folder_with_something_else_is_not_taken(
