@@ -5,32 +5,18 @@ edge of the material. A deformed image is summed over the points of a Gauss rule
 the *deformed* frame, each point found in the mesh and evaluated exactly; the rule has as many
 points as keep its error below :data:`TOLERANCE`. Near an edge, both images average evenly
 scattered points, some of them material and some background.
-
-The entry of an image in the sidecar of its set, besides the names of its files:
-
-``noise_sd``
-    Root mean square over the material of the camera image's predicted noise [fraction of full
-    scale].
-``saturated_px``, ``doubly_covered_px``
-    Material pixels at the highest level, and pixels inside more than one element, where the
-    specimen overlaps.
-``light``
-    If the light flickers: the factor on the irradiance.
-``quadrature``
-    If the sensor averages: points a pixel and their error's bound.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.distortion.undistort import Positions, seen_points
+from modeharvest.imaging.distortion.undistort import Positions, ideal_points
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import (
     bezier_matrix,
@@ -41,7 +27,7 @@ from modeharvest.imaging.mapping.elements import (
 )
 from modeharvest.imaging.mapping.render_rows import render_rows_average
 from modeharvest.imaging.photographs.files import write_image
-from modeharvest.imaging.render import Rendering, render_seen
+from modeharvest.imaging.render import Rendering, render_observed
 from modeharvest.imaging.sensor import EDGE_POINTS, Aperture
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
@@ -198,6 +184,36 @@ def points_a_side(
     return side, bound
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageRecord:
+    """What the sidecar of a set says of an image.
+
+    Parameters
+    ----------
+    image, camera_image, mask
+        Names of the files: without noise, as exposed, where there is material.
+    noise_sd
+        Root mean square over the material of the camera image's predicted noise [fraction of
+        full scale].
+    saturated_px, doubly_covered_px
+        Material pixels at the highest level, and pixels inside more than one element, where the
+        specimen overlaps.
+    light
+        The factor on the irradiance; None if the light doesn't flicker.
+    quadrature
+        How the pixels were averaged; None if they show points.
+    """
+
+    image: str
+    camera_image: str
+    mask: str
+    noise_sd: float
+    saturated_px: int
+    doubly_covered_px: int
+    light: float | None = None
+    quadrature: PixelQuadrature | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A lens and a sensor that expose images into a folder.
@@ -207,7 +223,7 @@ class Camera:
     spec
         The sensor, its bits, the lens.
     points
-        What the lens sees at its pixels; None of a perfect one.
+        The ideal positions that its pixels show; None for a perfect lens.
     folder
         Where the images go.
     """
@@ -220,52 +236,51 @@ class Camera:
     def of(cls, spec: ImagingSpec, shape: tuple[int, int], folder: Path) -> Camera:
         """The camera of a specification, for images of (rows, cols) pixels."""
         lens = spec.lens(shape)
-        return cls(spec, None if lens is None else seen_points(lens, shape), folder)
+        return cls(spec, None if lens is None else ideal_points(lens, shape), folder)
 
     def expose(
         self, ideal: Rendering, scene: ImagedState, name: str, mask_name: str
-    ) -> dict[str, Any]:
-        """Write what the camera makes of an image; return its entry in the sidecar.
+    ) -> ImageRecord:
+        """Write what the camera makes of an image.
 
         Parameters
         ----------
         ideal
             What a perfect lens shows.
         scene
-            What there is to be seen.
+            The specimen before the camera.
         name, mask_name
             Of the image, and of its mask's file. The name also seeds noise and flicker.
         """
-        seen = self._through_lens(ideal, scene)
-        sensor, bits, mask, irradiance = self.spec.sensor, self.spec.bits, seen.mask, seen.image
-        entry: dict[str, Any] = {}
+        observed = self._through_lens(ideal, scene)
+        sensor, bits, mask = self.spec.sensor, self.spec.bits, observed.mask
+        irradiance, quadrature, light = observed.image, None, None
         if not sensor.aperture.is_point:
             averaged, quadrature = integrate(scene, sensor.aperture, mask)
             irradiance = averaged.astype(np.float32)
-            entry["quadrature"] = asdict(quadrature)
         if sensor.flicker > 0.0:
-            irradiance = np.float32(sensor.light(name)) * irradiance
-            entry["light"] = sensor.light(name)
+            light = sensor.illumination(name)
+            irradiance = np.float32(light) * irradiance
         mean, levels = sensor.mean(irradiance), sensor.expose(irradiance, bits, name)
-        camera_name = f"{name}_{bits}bit.tif"
-        write_image(self.folder / f"{name}.tif", mean)
-        write_image(self.folder / camera_name, levels)
-        write_image(self.folder / mask_name, mask)
-        variance = sensor.noise_variance(mean[mask], bits)
-        return entry | {
-            "image": f"{name}.tif",
-            "camera_image": camera_name,
-            "mask": mask_name,
-            "noise_sd": float(np.sqrt(variance.mean())),
-            "saturated_px": sensor.saturated(levels[mask], bits),
-            "doubly_covered_px": seen.doubly_covered,
-        }
+        image, camera_image = f"{name}.tif", f"{name}_{bits}bit.tif"
+        for file, pixels in ((image, mean), (camera_image, levels), (mask_name, mask)):
+            write_image(self.folder / file, pixels)
+        return ImageRecord(
+            image=image,
+            camera_image=camera_image,
+            mask=mask_name,
+            noise_sd=float(np.sqrt(sensor.noise_variance(mean[mask], bits).mean())),
+            saturated_px=sensor.saturated(levels[mask], bits),
+            doubly_covered_px=observed.doubly_covered,
+            light=light,
+            quadrature=quadrature,
+        )
 
     def _through_lens(self, ideal: Rendering, scene: ImagedState) -> Rendering:
         """What the lens shows."""
         if self.points is None:
             return ideal
-        shown = render_seen(
+        shown = render_observed(
             scene.mesh, scene.displacement, scene.grid, self.points, scene.speckle,
             scene.background, scene.where,
         )  # fmt: skip

@@ -17,7 +17,8 @@ with the same key need not be made), and:
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
     full scale, squared].
 ``reference``, ``snapshots``
-    Of each image the entry that :mod:`modeharvest.imaging.camera` describes.
+    Of each image its :class:`modeharvest.imaging.camera.ImageRecord`, a :class:`SnapshotRecord` of
+    each deformed one.
 ``warnings``
     Sentences about what makes the images other than what a camera would show.
 
@@ -33,14 +34,14 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from modeharvest.fem.field import Solution
-from modeharvest.imaging.camera import Camera, ImagedState
+from modeharvest.fem.field import Snapshot, Solution
+from modeharvest.imaging.camera import Camera, ImagedState, ImageRecord
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, locate
@@ -49,7 +50,7 @@ from modeharvest.imaging.photographs.files import read_image, read_mask
 from modeharvest.imaging.render import render_deformed, render_reference
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, sha256_of, write_json
 from modeharvest.util.progress import Progress, silent
@@ -77,9 +78,9 @@ def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -
         If a snapshot is missing, or a distortion's file can't be read.
     """
     digest = hashlib.sha256()
-    wanted = {"format": FORMAT, "code": source_digest("fem", "imaging"), "spec": asdict(spec),
-              "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
-    digest.update(json.dumps(wanted, sort_keys=True).encode())
+    parts = {"format": FORMAT, "code": source_digest("fem", "imaging"), "spec": asdict(spec),
+             "element": solution.mesh.element, "strains": [float(s) for s in strains]}  # fmt: skip
+    digest.update(json.dumps(parts, sort_keys=True).encode())
     if isinstance(spec.distortion, str):
         read_distortion(spec.distortion)  # says what is wrong with it
         digest.update(sha256_of(spec.distortion).encode())
@@ -94,6 +95,26 @@ SIDECAR = "images.json"
 _LIBRARIES = ("numpy", "scipy", "numba", "finufft", "h5py", "tifffile")
 """What the pixels depend on."""
 _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*.h5")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapshotRecord(ImageRecord):
+    """What the sidecar says of a deformed image.
+
+    Parameters
+    ----------
+    nominal_strain, branch
+        Of the snapshot [-].
+    truth
+        Name of the truth's file.
+    inverse_map_max_residual_px
+        Largest residual of the inverse mapping [px].
+    """
+
+    nominal_strain: float
+    branch: str
+    truth: str
+    inverse_map_max_residual_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +142,9 @@ class ImageSet:
         with reading(path, what, remedy):
             images = cls(Path(folder), read_record(path, FORMAT, what, remedy))
             _ = images.grid, images.spec, images.max_residual_px
-            states = [images._snapshot(strain)["truth"] for strain in images.strains]
-            for entry in (images.info["reference"], *map(images._snapshot, images.strains)):
-                states += [entry[name] for name in ("image", "camera_image", "mask")]
-            if not set(states) <= set(images.digests):
-                raise InputError(f"expected digests of {states}, got {list(images.digests)}")
+            names = [name for record in images._records for name in _file_names(record)]
+            if not set(names) <= set(images.digests):
+                raise InputError(f"expected digests of {names}, got {list(images.digests)}")
             return images
 
     @property
@@ -141,28 +160,40 @@ class ImageSet:
     @property
     def strains(self) -> tuple[float, ...]:
         """Nominal strains of the deformed images [-]."""
-        return tuple(float(s["nominal_strain"]) for s in self.info["snapshots"])
+        return tuple(record.nominal_strain for record in self._snapshots)
+
+    @cached_property
+    def _reference(self) -> ImageRecord:
+        return made(ImageRecord, self.info["reference"])
+
+    @cached_property
+    def _snapshots(self) -> tuple[SnapshotRecord, ...]:
+        return tuple(made(SnapshotRecord, record) for record in self.info["snapshots"])
+
+    @property
+    def _records(self) -> tuple[ImageRecord, ...]:
+        return (self._reference, *self._snapshots)
 
     @property
     def max_residual_px(self) -> float:
         """The largest residual of the inverse mapping in the whole set [px]."""
         return float(self.info["inverse_map_max_residual_px"])
 
-    def reference(self, *, camera: bool = False) -> NDArray[np.float32]:
+    def reference(self, *, camera: bool = False) -> FloatImage:
         """(rows, cols) reference image [fraction of full scale]; ``camera``: as exposed."""
-        return self._image(self.info["reference"], camera)
+        return self._image(self._reference, camera)
 
     def mask(self) -> BoolArray:
         """(rows, cols) True where the reference image shows material."""
-        return read_mask(self._whole(self.info["reference"]["mask"]))
+        return read_mask(self._whole(self._reference.mask))
 
-    def deformed(self, strain: float, *, camera: bool = False) -> NDArray[np.float32]:
+    def deformed(self, strain: float, *, camera: bool = False) -> FloatImage:
         """(rows, cols) deformed image [fraction of full scale] at a nominal strain [-]."""
         return self._image(self._snapshot(strain), camera)
 
     def deformed_mask(self, strain: float) -> BoolArray:
         """(rows, cols) True where the deformed image shows material."""
-        return read_mask(self._whole(self._snapshot(strain)["mask"]))
+        return read_mask(self._whole(self._snapshot(strain).mask))
 
     def pair(self, strain: float, *, camera: bool = False) -> ImagePair:
         """The reference and the deformed image at a nominal strain [-]; ``camera``: as exposed."""
@@ -190,7 +221,7 @@ class ImageSet:
 
     def truth(self, strain: float) -> Truth:
         """The truth behind the deformed image at a nominal strain [-]; read when asked for."""
-        name = self._snapshot(strain)["truth"]
+        name = self._snapshot(strain).truth
         return Truth(lambda part: Truth.read(self._whole(name)).part(part))
 
     @property
@@ -207,8 +238,8 @@ class ImageSet:
         """Whether every file is what was written, by its SHA-256."""
         return all(sha256_of(self.folder / name) == s for name, s in self.digests.items())
 
-    def _image(self, entry: dict[str, Any], camera: bool) -> NDArray[np.float32]:
-        image = read_image(self._whole(entry["camera_image" if camera else "image"]))
+    def _image(self, record: ImageRecord, camera: bool) -> FloatImage:
+        image = read_image(self._whole(record.camera_image if camera else record.image))
         if camera:  # a 12-bit camera's white is 4095, which the file's 16 bits don't know
             full_scale = 255.0 if self.spec.bits <= 8 else 65535.0
             image *= np.float32(full_scale / (2**self.spec.bits - 1))
@@ -224,11 +255,10 @@ class ImageSet:
             )
         return path
 
-    def _snapshot(self, strain: float) -> dict[str, Any]:
-        for entry in self.info["snapshots"]:
-            if abs(entry["nominal_strain"] - strain) < 1e-9:
-                found: dict[str, Any] = entry
-                return found
+    def _snapshot(self, strain: float) -> SnapshotRecord:
+        for record in self._snapshots:
+            if abs(record.nominal_strain - strain) < 1e-9:
+                return record
         raise InputError(
             f"expected an image at strain {strain} in {self.folder}, have: "
             f"{', '.join(f'{s:.4f}' for s in self.strains)}"
@@ -283,8 +313,7 @@ def make_images(
     if is_complete(folder, key):
         return ImageSet.read(folder)
     _discard(folder)
-    info = _write_set(solution, strains, spec, folder, progress)
-    names = [n for e in (info["reference"], *info["snapshots"]) for n in _file_names(e)]
+    info, names = _write_set(solution, strains, spec, folder, progress)
     files = {n: {"bytes": (folder / n).stat().st_size, "sha256": sha256_of(folder / n)}
              for n in names}  # fmt: skip
     write_json(folder / SIDECAR, {"format": FORMAT, "key": key, **info, "files": files})
@@ -298,8 +327,8 @@ def _write_set(
     spec: ImagingSpec,
     folder: Path,
     progress: Progress,
-) -> dict[str, Any]:
-    """Write all files but the sidecar, and return the sidecar's content."""
+) -> tuple[dict[str, Any], list[str]]:
+    """Write all files but the sidecar; its content, and the files' names."""
     steps = 1 + len(strains)
     progress(0, steps, "images: reference")
     mesh = solution.mesh
@@ -315,56 +344,56 @@ def _write_set(
         progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         where = f"snapshot at strain {strain:.4f}"
         moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
-        entry = _write_snapshot(camera, moved, strain, located)
-        snapshots.append({"branch": solution.at(strain).branch, **entry})
-    residuals = [s["inverse_map_max_residual_px"] for s in snapshots]
+        snapshots.append(_write_snapshot(camera, moved, solution.at(strain), strain, located))
+    residuals = [record.inverse_map_max_residual_px for record in snapshots]
     constant, slope = spec.sensor.noise_model(spec.bits)
-    return {
+    info = {
         "grid": asdict(grid),
         "spec": asdict(spec),
         "speckle_period_px": list(speckle.period),
         "inverse_map_max_residual_px": max(located.max_residual_px, *residuals),
         "noise": {"constant": constant, "slope": slope, "offset": spec.sensor.offset},
-        "reference": reference,
-        "snapshots": snapshots,
-        "warnings": _warnings(reference, *snapshots),
+        "reference": _plain(reference),
+        "snapshots": [_plain(record) for record in snapshots],
+        "warnings": [
+            f"{record.image}: {record.doubly_covered_px} px lie inside more than one element; the "
+            "specimen overlaps there, as a real one in contact doesn't"
+            for record in (reference, *snapshots)
+            if record.doubly_covered_px
+        ],
         "solution": dict(solution.info),
         "versions": versions(*_LIBRARIES),
     }
+    return info, [name for record in (reference, *snapshots) for name in _file_names(record)]
 
 
 def _write_snapshot(
-    camera: Camera, scene: ImagedState, strain: float, located_reference: Located
-) -> dict[str, Any]:
-    """Write one deformed image, its mask and its truth; return its entry in the sidecar."""
-    assert scene.displacement is not None
+    camera: Camera, scene: ImagedState, snapshot: Snapshot, strain: float, located: Located
+) -> SnapshotRecord:
+    """Write one deformed image, its mask and its truth; ``located`` is the reference's."""
     ideal, truth = render_deformed(
-        scene.mesh, scene.displacement, located_reference, scene.grid, scene.speckle,
-        scene.background, scene.where,
+        scene.mesh, snapshot.displacement, located, scene.grid, scene.speckle, scene.background,
+        scene.where,
     )  # fmt: skip
     name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
-    images = camera.expose(ideal, scene, name, f"{name}_mask.tif")
+    record = camera.expose(ideal, scene, name, f"{name}_mask.tif")
     truth.write(camera.folder / truth_name, strain, scene.grid)
-    return {
-        "nominal_strain": float(strain),
-        **images,
-        "truth": truth_name,
-        "inverse_map_max_residual_px": float(np.nanmax(truth.residual_px)),
-    }
+    return SnapshotRecord(
+        **vars(record),
+        nominal_strain=float(strain),
+        branch=snapshot.branch,
+        truth=truth_name,
+        inverse_map_max_residual_px=float(np.nanmax(truth.residual_px)),
+    )
 
 
-def _warnings(*entries: dict[str, Any]) -> list[str]:
-    """Tell of images in which the specimen overlaps."""
-    return [
-        f"{entry['image']}: {entry['doubly_covered_px']} px lie inside more than one element; "
-        "the specimen overlaps there, as a real one in contact doesn't"
-        for entry in entries
-        if entry["doubly_covered_px"]
-    ]
+def _plain(record: ImageRecord) -> dict[str, Any]:
+    return {name: value for name, value in asdict(record).items() if value is not None}
 
 
-def _file_names(entry: dict[str, Any]) -> list[str]:
-    return [entry[k] for k in ("image", "camera_image", "mask", "truth") if k in entry]
+def _file_names(record: ImageRecord) -> list[str]:
+    more = [record.truth] if isinstance(record, SnapshotRecord) else []
+    return [record.image, record.camera_image, record.mask, *more]
 
 
 def _discard(folder: Path) -> None:

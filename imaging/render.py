@@ -24,11 +24,11 @@ from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 
-def render_seen(
+def render_observed(
     mesh: Mesh,
     displacement: FloatArray | None,
     grid: PixelGrid,
-    seen: Positions,
+    points: Positions,
     speckle: Speckle,
     background: float,
     where: str = "mesh",
@@ -41,8 +41,8 @@ def render_seen(
         The undeformed mesh and its nodal displacements (n, 2) [mm]; None shows the reference.
     grid
         The ideal image's pixels; the speckle's whole pixels are the grid's.
-    seen
-        (row, col), each (rows, cols) [px], what the pixels see: from :func:`seen_points`.
+    points
+        (row, col), each (rows, cols) [px], what the pixels show: from :func:`ideal_points`.
     speckle, background
         Intensity of the material and around it [fraction of full scale].
     where
@@ -51,7 +51,7 @@ def render_seen(
     Returns
     -------
     Rendering
-        Image and mask as seen; pixels that lie inside more than one element are not counted.
+        Image and mask; pixels that lie inside more than one element are not counted.
 
     Raises
     ------
@@ -59,10 +59,10 @@ def render_seen(
         If the displacement turns an element inside out.
     """
     nodes = mesh.nodes if displacement is None else mesh.nodes + displacement
-    located = locate_points(nodes, mesh.cells, mesh.element, grid, *seen, where)
+    located = locate_points(nodes, mesh.cells, mesh.element, grid, *points, where)
     mask = located.mask
     if displacement is None:
-        row, col = seen[0][mask], seen[1][mask]
+        row, col = points[0][mask], points[1][mask]
     else:
         x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, mask]
         row, col = grid.to_px(x, y)

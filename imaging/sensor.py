@@ -240,7 +240,7 @@ class Sensor:
         """What a pixel averages."""
         return Aperture(self.fill_factor, self.psf_px)
 
-    def light(self, name: str) -> float:
+    def illumination(self, name: str) -> float:
         """Factor on an image's irradiance, 1 on average, by its name in its set."""
         if self.flicker == 0.0:
             return 1.0
@@ -282,8 +282,8 @@ class Sensor:
         The cut-off, which lowers it, is left out; rounding counts as white noise.
         """
         constant, slope = self.noise_model(bits)
-        lit = np.maximum(np.asarray(grey, dtype=np.float64) - self.offset, 0.0)
-        return np.asarray(constant + slope * lit)
+        above = np.maximum(np.asarray(grey, dtype=np.float64) - self.offset, 0.0)
+        return np.asarray(constant + slope * above)
 
     def noise_model(self, bits: int) -> tuple[float, float]:
         """(constant, slope) of the variance: constant + slope * (grey - offset)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
 from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
-from modeharvest.imaging.distortion.undistort import seen_points
+from modeharvest.imaging.distortion.undistort import ideal_points
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
@@ -29,7 +29,7 @@ def photographs(
     target: CalibrationTarget, lens: Any = PERFECT, sensor: Sensor | None = None, bits: int = 16
 ) -> list[FloatArray]:
     """Grey levels as fractions of full scale."""
-    shots = photograph_target(target, SPECKLE, seen_points(lens, SHAPE), sensor or Sensor(), bits)
+    shots = photograph_target(target, SPECKLE, ideal_points(lens, SHAPE), sensor or Sensor(), bits)
     return [levels / (2.0**bits - 1.0) for _, levels in shots]
 
 
@@ -47,7 +47,7 @@ def test_through_a_lens_they_are_shifts_up_to_the_distortion() -> None:
 
     The pixels' intensities against the target's own pattern, evaluated exactly there.
     """
-    seen = seen_points(LENS, SHAPE)
+    seen = ideal_points(LENS, SHAPE)
     pattern = Speckle(
         replace(SPECKLE, seed=TARGET.seed, ink=replace(SPECKLE.ink, seed=TARGET.seed)), SHAPE
     )

@@ -14,7 +14,7 @@ from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.imaging.distortion.files import write_distortion
 from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
 from modeharvest.imaging.distortion.undistort import (
-    seen_points,
+    ideal_points,
     undistorted,
     undistorted_mask,
     without_affine,
@@ -22,7 +22,7 @@ from modeharvest.imaging.distortion.undistort import (
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.mapping.isoparametric import locate
-from modeharvest.imaging.render import render_reference, render_seen
+from modeharvest.imaging.render import render_observed, render_reference
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
@@ -52,10 +52,10 @@ MESH = plate()
 
 
 def test_a_lens_without_distortion_changes_nothing() -> None:
-    seen = seen_points(PolynomialDistortion(GRID.shape, np.zeros((2, 3))), GRID.shape)
+    seen = ideal_points(PolynomialDistortion(GRID.shape, np.zeros((2, 3))), GRID.shape)
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
     plain = render_reference(located, SPECKLE, BACKGROUND)
-    shown = render_seen(MESH, None, GRID, seen, SPECKLE, BACKGROUND)
+    shown = render_observed(MESH, None, GRID, seen, SPECKLE, BACKGROUND)
     np.testing.assert_array_equal(shown.mask, plain.mask)
     np.testing.assert_allclose(shown.image, plain.image, rtol=0, atol=FLOAT32)
 
@@ -64,8 +64,8 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
     """Pixel p shows the speckle at F^-1 (phi_S^-1(p) - shift), no pixel more and none less."""
     F, shift = np.array([[0.9, 0.08], [-0.05, 1.04]]), np.array([0.21, -0.13])
     u = MESH.nodes @ (F - np.eye(2)).T + shift
-    seen = seen_points(LENS, GRID.shape)
-    shown = render_seen(MESH, u, GRID, seen, SPECKLE, BACKGROUND)
+    seen = ideal_points(LENS, GRID.shape)
+    shown = render_observed(MESH, u, GRID, seen, SPECKLE, BACKGROUND)
     x = np.stack(GRID.to_mm(*seen), axis=-1)
     X = (x - shift) @ np.linalg.inv(F).T
     inside = (np.abs(X) <= [9.0, 7.0]).all(axis=-1)
@@ -83,7 +83,7 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
 def test_a_lens_may_show_what_lies_beside_the_ideal_image() -> None:
     """S = (-3, 5) px everywhere: an image shifted by whole pixels, from a larger one."""
     shift = PolynomialDistortion(GRID.shape, np.array([[-3.0], [5.0]]))
-    shown = render_seen(MESH, None, GRID, seen_points(shift, GRID.shape), SPECKLE, BACKGROUND)
+    shown = render_observed(MESH, None, GRID, ideal_points(shift, GRID.shape), SPECKLE, BACKGROUND)
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
     plain = render_reference(located, SPECKLE, BACKGROUND)
     np.testing.assert_array_equal(shown.mask[:-3, 5:], plain.mask[3:, :-5])
@@ -94,7 +94,7 @@ def test_material_beside_the_ideal_image_is_shown_too() -> None:
     wide = plate(half_width=12.0)  # its right edge lies at column 186 of 181
     col = 150.0 + np.arange(60.0)[None]
     seen = np.full(col.shape, 75.0), col
-    shown = render_seen(wide, None, GRID, seen, SPECKLE, BACKGROUND)
+    shown = render_observed(wide, None, GRID, seen, SPECKLE, BACKGROUND)
     np.testing.assert_array_equal(shown.mask, col <= 186.0)
     exact = SPECKLE.exact(*(s[shown.mask] for s in seen))
     np.testing.assert_allclose(shown.image[shown.mask], exact, rtol=0, atol=FLOAT32)
@@ -206,7 +206,7 @@ def test_light_flickers_from_image_to_image_and_evenly_over_each(tmp_path: Path)
     assert all(0.8 < light < 1.2 for light in lights)
     np.testing.assert_allclose(made.reference(), lights[0] * steady.reference(), rtol=1e-6)
     np.testing.assert_allclose(made.deformed(0.1), lights[1] * steady.deformed(0.1), rtol=1e-6)
-    many = np.log([spec.sensor.light(f"image {k}") for k in range(400)])
+    many = np.log([spec.sensor.illumination(f"image {k}") for k in range(400)])
     assert abs(many.std() / 0.05 - 1.0) < 4 / np.sqrt(2 * 400)
     assert abs(many.mean()) < 4 * 0.05 / np.sqrt(400)
     with pytest.raises(InputError, match="flicker"):

@@ -91,7 +91,7 @@ def test_the_second_exposure_differs_by_noise_and_light(twin: Twin) -> None:
         read_image(twin.experiment.parent / f"{name}.tif") for name in ("reference", "reference_2")
     )
     sensor = CASE.imaging.sensor
-    light = sensor.light("reference_2") / sensor.light("reference")
+    light = sensor.illumination("reference_2") / sensor.illumination("reference")
     difference = second - light * first
     # Two exposures, their rounding; the background's lower end is cut off now and then.
     inner = difference[35:75, 40:80]

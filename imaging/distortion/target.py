@@ -1,6 +1,6 @@
 """Photographs of a flat speckled target that a stage shifts: what a distortion is calibrated from.
 
-The target fills the image and moves rigidly, so whatever else is seen to move is the lens. The
+The target fills the image and moves rigidly, so whatever else appears to move is the lens. The
 point of the target that the first photograph shows at the ideal position x is at x + t in one
 whose shift is t; a pixel p shows the target at phi_S^-1(p) - t, evaluated exactly.
 """
@@ -72,7 +72,7 @@ class CalibrationTarget:
 def photograph_target(
     target: CalibrationTarget,
     speckle: SpeckleSpec,
-    seen: Positions,
+    points: Positions,
     sensor: Sensor,
     bits: int,
 ) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
@@ -84,7 +84,7 @@ def photograph_target(
         Shifts and pattern.
     speckle
         The pattern if the target has none of its own, but for its seeds.
-    seen
+    points
         (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
     sensor, bits
         The camera.
@@ -94,12 +94,12 @@ def photograph_target(
     name, (rows, cols) grey levels
         "calibration_00", ... and an exposure as the camera stores it.
     """
-    rows, cols = seen[0].shape
+    rows, cols = points[0].shape
     pattern = Speckle(_reseeded(target.speckle or speckle, target.seed), (rows, cols))
     for k, (down, right) in enumerate(target.true_shifts):
         name = f"calibration_{k:02d}"
-        irradiance = pattern(seen[0] - down, seen[1] - right).astype(np.float32)
-        yield name, sensor.expose(np.float32(sensor.light(name)) * irradiance, bits, name)
+        irradiance = pattern(points[0] - down, points[1] - right).astype(np.float32)
+        yield name, sensor.expose(np.float32(sensor.illumination(name)) * irradiance, bits, name)
 
 
 def _reseeded(speckle: SpeckleSpec, seed: int) -> SpeckleSpec:

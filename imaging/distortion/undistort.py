@@ -101,7 +101,7 @@ _NEGLIGIBLE_PX = 1e-12
 _STRIP = 64  # rows that a thread takes at a time
 
 
-def seen_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
+def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
     """(row, col), each (rows, cols) [px]: the ideal positions that an image's pixels show.
 
     Raises

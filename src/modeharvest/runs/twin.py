@@ -33,7 +33,7 @@ from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
-from modeharvest.imaging.distortion.undistort import seen_points
+from modeharvest.imaging.distortion.undistort import ideal_points
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.photographs.files import write_image
@@ -129,7 +129,7 @@ def make_twin(
         lens = spec.lens(images.grid.shape)
         assert lens is not None
         write_distortion(truth / "distortion.json", lens)
-        seen = seen_points(lens, images.grid.shape)
+        seen = ideal_points(lens, images.grid.shape)
         shots = photograph_target(target, spec.speckle, seen, spec.sensor, spec.bits)
         for k, (name, levels) in enumerate(shots):
             progress(k, len(target.shifts_px), "images: calibration")
@@ -165,7 +165,7 @@ def _copy_photographs(images: ImageSet, folder: Path) -> list[Path]:
         copy_whole(images.folder / source, paths[-1])
     spec, again = images.spec, "reference_2"
     sensor = spec.sensor
-    light = sensor.light(again) / sensor.light("reference")
+    light = sensor.illumination(again) / sensor.illumination("reference")
     irradiance = light * (images.reference() - sensor.offset) / sensor.gain
     levels = sensor.expose(irradiance.astype(np.float32), spec.bits, again)
     write_image(folder / f"{again}.tif", levels)
