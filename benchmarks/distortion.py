@@ -28,6 +28,7 @@ from modeharvest.imaging.distortion.undistort import undistorted, undistorted_ma
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.sensor import quantise
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.runs.photographs.prepare import calibration_text
 
 FloatArray = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ def report_calibration(name: str, lens: Distortion) -> Calibration:
         )
     print(f"error, affine part aside: {aside.rms_px:.5f} px rms, {aside.largest_px:.4f} at most")
     print(f"noise found {found.noise_sd:.5f}, made {np.hypot(NOISE, 1 / 255 / 12**0.5):.5f}")
-    print(*found.sentences, sep="\n")
+    print(*calibration_text(found), sep="\n")
     return found
 
 

@@ -38,7 +38,7 @@ from scipy.linalg import eigh_tridiagonal
 from scipy.special import ndtr
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 
 def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -88,13 +88,8 @@ class Aperture:
     psf_px: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.fill_factor <= 1.0:
-            raise InputError(f"sensor: expected a fill factor in 0 ... 1, got {self.fill_factor}")
-        if not 0.0 <= self.psf_px <= 2.0:
-            raise InputError(
-                f"sensor: expected a point spread of 0 to 2 px, got {self.psf_px}; "
-                "a pattern that is blurred on the specimen has a larger blur_px"
-            )
+        require_within("sensor: expected a fill factor", self.fill_factor, 0.0, 1.0)
+        require_within("sensor: expected a point spread [px]", self.psf_px, 0.0, 2.0)
 
     @property
     def is_point(self) -> bool:
@@ -209,31 +204,18 @@ class Sensor:
 
     def __post_init__(self) -> None:
         _ = self.aperture  # checks fill factor and point spread
-        if not (self.gain > 0.0 and math.isfinite(self.gain)):
-            raise InputError(f"sensor: expected a gain above 0, got {self.gain}")
-        if not -1.0 < self.offset < 1.0:
-            raise InputError(f"sensor: expected an offset between -1 and 1, got {self.offset}")
+        require_within("sensor: expected a gain", self.gain, 0.0, above=True)
+        require_within("sensor: expected an offset", self.offset, -1.0, 1.0, above=True)
         if not (self.full_well == 0.0 or 1.0 <= self.full_well <= 1e12):
             raise InputError(
                 "sensor: expected a full well of 1 to 1e12 electrons, or 0 for no shot noise, got "
                 f"{self.full_well}"
             )
-        if not 0.0 <= self.read_noise < 1.0:
-            raise InputError(
-                "sensor: expected a read noise of 0 to 1 of full scale (1 of 8 bits' grey levels "
-                f"is 0.0039), got {self.read_noise}"
-            )
-        if not 0.0 < self.saturation <= 1.0:
-            raise InputError(
-                f"sensor: expected saturation above 0 and at most 1 (white), got {self.saturation}"
-            )
-        if not 0.0 <= self.flicker <= 0.2:
-            raise InputError(
-                f"sensor: expected a flicker of 0 to 0.2 (20 %) of the light, got {self.flicker}"
-            )
+        require_within("sensor: expected a read noise", self.read_noise, 0.0, 1.0)
+        require_within("sensor: expected a saturation", self.saturation, 0.0, 1.0, above=True)
+        require_within("sensor: expected a flicker", self.flicker, 0.0, 0.2)
         for seed in (self.shot_seed, self.read_seed, self.flicker_seed):
-            if seed < 0:
-                raise InputError(f"sensor: expected seeds of 0 or more, got {seed}")
+            require_within("sensor: expected seeds", seed, 0)
 
     @property
     def aperture(self) -> Aperture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,7 +14,7 @@ from modeharvest.imaging.distortion.undistort import without_affine
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.machine import require_memory
 
 _FEWEST_PX = 8
@@ -70,16 +69,12 @@ class ImagingSpec:
     affine_distortion: bool = True
 
     def __post_init__(self) -> None:
-        if not (self.pixel_size > 0.0 and math.isfinite(self.pixel_size)):
-            raise InputError(f"imaging: expected a pixel size above 0 mm, got {self.pixel_size}")
-        if self.margin_px < 0:
-            raise InputError(f"imaging: expected a margin of 0 px or more, got {self.margin_px}")
-        if self.shape is not None and min(self.shape) < 8:
+        require_within("imaging: expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
+        require_within("imaging: expected a margin [px]", self.margin_px, 0)
+        require_within("imaging: expected a background", self.background, 0.0, 1.0)
+        require_within("imaging: expected bits", self.bits, 1, 16)
+        if self.shape is not None and min(self.shape) < _FEWEST_PX:
             raise InputError(f"imaging: expected a shape of 8 x 8 px or more, got {self.shape}")
-        if not 0.0 <= self.background <= 1.0:
-            raise InputError(f"imaging: expected a background in 0 ... 1, got {self.background}")
-        if not 1 <= self.bits <= 16:
-            raise InputError(f"imaging: expected 1 to 16 bits, got {self.bits}")
         two_layers, distorted = self.speckle.ink is not None, self.distortion is not None
         if (two_layers or distorted) and not self.sensor.aperture.is_point:
             raise InputError(

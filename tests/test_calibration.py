@@ -18,6 +18,7 @@ from modeharvest.imaging.distortion.calibration.result import Calibration, sampl
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.distortion.undistort import undistorted
 from modeharvest.imaging.spline import SplineImage
+from modeharvest.runs.photographs.prepare import calibration_text
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -73,7 +74,7 @@ def test_standard_deviations_are_larger_in_corners(found: Calibration) -> None:
 
 
 def test_what_cannot_be_seen_is_said(found: Calibration) -> None:
-    assert any("affine part of S can't be observed" in s for s in found.sentences)
+    assert any("affine part of S can't be observed" in s for s in calibration_text(found))
     assert not found.distortion.coefficients[:, :3].any()
 
 
@@ -89,7 +90,7 @@ def test_known_shifts_show_the_affine_part() -> None:
     sd = np.sqrt(np.mean(np.square(found.sd(row, col))))
     difference = np.stack(found.distortion.shift(row, col)) - np.stack(lens.shift(row, col))
     assert np.sqrt(np.mean(difference**2)) < 3 * sd
-    assert any("relative to the stage" in s for s in found.sentences)
+    assert any("relative to the stage" in s for s in calibration_text(found))
 
 
 def test_brightness_and_contrast_may_change() -> None:

@@ -17,7 +17,7 @@ from modeharvest.imaging.distortion.undistort import Positions
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,8 @@ class CalibrationTarget:
                 "calibration: expected finite shifts (along columns, along rows) [px], got "
                 f"{self.shifts_px}"
             )
-        if not 0.0 <= self.stage_sd_px <= 1000.0:
-            raise InputError(
-                f"calibration: expected a stage_sd_px of 0 to 1000 px, got {self.stage_sd_px}"
-            )
-        if self.seed < 0:
-            raise InputError(f"calibration: expected a seed of 0 or more, got {self.seed}")
+        require_within("calibration: expected a stage_sd_px", self.stage_sd_px, 0.0, 1000.0)
+        require_within("calibration: expected a seed", self.seed, 0)
 
     @property
     def true_shifts(self) -> FloatArray:

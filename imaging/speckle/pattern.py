@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from modeharvest.imaging.speckle.layer import BinaryField, Layer
 from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}
@@ -63,13 +63,10 @@ class Ink:
 
     def __post_init__(self) -> None:
         _require_band_limited(self.standard_deviation, self.blur_px, "ink")
-        if not (0.0 < self.coverage < 1.0 and 0.0 < self.darkness <= 1.0):
-            raise InputError(
-                "ink: expected a coverage in 0 ... 1 and a darkness above 0 and at most 1, got "
-                f"coverage {self.coverage}, darkness {self.darkness}"
-            )
-        if self.seed < 0:
-            raise InputError(f"ink: expected a seed of 0 or more, got {self.seed}")
+        if not 0.0 < self.coverage < 1.0:
+            raise InputError(f"ink: expected a coverage between 0 and 1, got {self.coverage}")
+        require_within("ink: expected a darkness", self.darkness, 0.0, 1.0, above=True)
+        require_within("ink: expected a seed", self.seed, 0)
 
     @property
     def binary_field(self) -> BinaryField:
@@ -122,8 +119,7 @@ class SpeckleSpec:
                 "speckle: expected grey levels 0 <= dark < bright <= 1, got "
                 f"dark {self.dark}, bright {self.bright}"
             )
-        if self.seed < 0:
-            raise InputError(f"speckle: expected a seed of 0 or more, got {self.seed}")
+        require_within("speckle: expected a seed", self.seed, 0)
 
     @property
     def cycles_per_px(self) -> float:
@@ -138,17 +134,10 @@ class SpeckleSpec:
 
 
 def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> None:
-    if not _NARROWEST_BLUR_PX <= blur_px <= _WIDEST_BLUR_PX:
-        raise InputError(
-            f"{what}: expected a blur of at least {_NARROWEST_BLUR_PX:g} px and at most "
-            f"{_WIDEST_BLUR_PX:g} px, got {blur_px} px"
-        )
+    require_within(f"{what}: expected a blur [px]", blur_px, _NARROWEST_BLUR_PX, _WIDEST_BLUR_PX)
     widest = _WIDEST_FREQUENCY * BinaryField(cycles_per_px, blur_px, (0.0, 1.0), 0.5, 0).finer
-    if not _LOWEST_FREQUENCY <= cycles_per_px <= widest:
-        raise InputError(
-            f"{what}: expected a spectral standard deviation from {_LOWEST_FREQUENCY:g} to "
-            f"{widest:g} cycles/px with a blur of {blur_px} px, got {cycles_per_px} cycles/px"
-        )
+    spread = f"{what}: expected, with a blur of {blur_px} px, a spectral standard deviation"
+    require_within(f"{spread} [cycles/px]", cycles_per_px, _LOWEST_FREQUENCY, widest)
 
 
 class Speckle:

@@ -128,7 +128,7 @@ def calibrate(
     trials, stride = _trials(photographs, coarse, fit, free, options, report)
     _require_matches(min(trials, key=lambda trial: trial[1].bic)[1])
     progress(1, 1, "calibrate")
-    return calibration_of(trials, known, sampled_noise(options.blurs_px[-1], options.order, stride))
+    return calibration_of(trials, sampled_noise(options.blurs_px[-1], options.order, stride))
 
 
 def _coarse_fit(

@@ -6,8 +6,9 @@ image is sampled between its pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,6 +84,7 @@ class LensEstimate:
         (m,) correlation of each image with the mean of the others, the distortion taken out [-].
     bic
         Bayesian information criterion; of two models of one set take that with the lower one.
+        NaN if it was not kept.
     """
 
     distortion: Distortion
@@ -91,7 +93,7 @@ class LensEstimate:
     model: DistortionModel
     noise_sd: float
     matches: FloatArray
-    bic: float
+    bic: float = math.nan
 
     @classmethod
     def of(cls, model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> LensEstimate:
@@ -113,17 +115,12 @@ class LensEstimate:
 
         That of the images' noise; what the model can't follow is not in it.
         """
-        return _sd(self.model, self.coefficients, self.covariance, row, col)
-
-
-def _sd(
-    model: DistortionModel, c: FloatArray, covariance: FloatArray, row: ArrayLike, col: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
-    columns = model.sensitivities(c, row.ravel(), col.ravel())
-    variance = (np.einsum("ckn,kl->cln", columns, covariance, optimize=True) * columns).sum(axis=1)
-    along_row, along_col = np.sqrt(np.maximum(variance, 0.0)).reshape(2, *row.shape)
-    return along_row, along_col
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
+        products = np.einsum("ckn,kl->cln", columns, self.covariance, optimize=True)
+        variance = np.maximum((products * columns).sum(axis=1), 0.0)
+        along_row, along_col = np.sqrt(variance).reshape(2, *row.shape)
+        return along_row, along_col
 
 
 @dataclass(frozen=True)
@@ -153,14 +150,14 @@ class DegreeTrial:
     sd_px: float
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """A lens's distortion as found, and how well.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(LensEstimate):
+    """The lens of a set of photographs, without the part of S that can't be observed.
 
     Parameters
     ----------
-    distortion
-        S, without the part that cannot be observed (see ``sentences``).
+    distortion, model
+        S; the model's ``fixed`` terms could not be observed and are zero.
     shifts, shifts_sd
         (m, 2) motion of the target since the first photograph, along rows and columns [px], and
         its standard deviation; 0 where given.
@@ -168,73 +165,43 @@ class Calibration:
         (m,) its rotation, from the columns' to the rows' axis [rad], and its standard deviation.
     trials
         One for each degree.
-    noise_sd
-        Noise of a photograph, estimated from the residual [grey levels].
-    matches
-        (m,) correlation of each photograph with the mean of the others [-].
-    covariance
-        (n, n) of S's unknown coefficients [px^2], those of the rows' component first.
-    fixed
-        How many terms of each component could not be seen and are zero.
-    sentences
-        What was found, and what could not be.
     """
 
     distortion: PolynomialDistortion
+    model: PolynomialModel
     shifts: FloatArray
     shifts_sd: FloatArray
     angles: FloatArray
     angles_sd: FloatArray
     trials: tuple[DegreeTrial, ...]
-    noise_sd: float
-    matches: FloatArray
-    covariance: FloatArray
-    fixed: int
-    sentences: tuple[str, ...] = field(default=())
-
-    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Standard deviation of S along rows and columns [px] at ideal positions [px].
-
-        That of the photographs' noise; what a polynomial of this degree can't follow is not in it.
-        """
-        lens = self.distortion
-        model = PolynomialModel(lens.shape, lens.degree, self.fixed)
-        return _sd(model, lens.coefficients[:, self.fixed :].ravel(), self.covariance, row, col)
 
 
 def calibration_of(
-    trials: Sequence[tuple[PolynomialModel, Fit]], known: bool, noise: tuple[float, float]
+    trials: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
 ) -> Calibration:
-    """Choose the degree with the lowest BIC and say what is known of it.
+    """Choose the degree with the lowest BIC.
 
     Parameters
     ----------
     trials
         One a degree.
-    known
-        Whether shifts were given.
     noise
-        What became of white noise of variance 1 in a sample, and in the mean of many
-        (:func:`~modeharvest.imaging.distortion.calibration.result.sampled_noise`).
+        What :func:`sampled_noise` gives.
     """
     model, fit = min(trials, key=lambda trial: trial[1].bic)
-    lens, k = LensEstimate.of(model, fit, noise), len(fit.coefficients)
     one, many = noise
     own = np.zeros(fit.free.shape)
-    own[fit.free] = np.sqrt(np.diag(fit.inverse * (fit.variance * many / one))[k:])
-    found = Calibration(
-        distortion=model.distortion(fit.coefficients),
+    own[fit.free] = np.sqrt(
+        np.diag(fit.inverse * (fit.variance * many / one))[len(fit.coefficients) :]
+    )
+    return Calibration(
+        **vars(LensEstimate.of(model, fit, noise)),
         shifts=np.array([pose.shift for pose in fit.poses]),
         shifts_sd=own[:, :2],
         angles=np.array([pose.angle for pose in fit.poses]),
         angles_sd=own[:, 2],
         trials=_trials(trials, noise),
-        noise_sd=lens.noise_sd,
-        matches=fit.matches,
-        covariance=lens.covariance,
-        fixed=model.fixed,
     )
-    return replace(found, sentences=calibration_text(found, known))
 
 
 def _trials(
@@ -260,41 +227,3 @@ def _trials(
         )
         before = now
     return tuple(trials)
-
-
-def calibration_text(found: Calibration, known: bool) -> tuple[str, ...]:
-    """What was found, and what could not be."""
-    chosen = next(t for t in found.trials if t.bic == 0.0)
-    row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
-    size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
-    turned = np.abs(found.angles).max()
-    notes = [
-        f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
-        f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
-        f"{chosen.sd_px:.4f} px rms over the image.",
-    ]
-    if chosen is found.trials[-1] and len(found.trials) > 1:
-        notes.append(
-            f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
-            f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
-        )
-    if known:
-        notes.append(
-            "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
-            "constant part can't be observed and is zero at the polynomial's mean."
-        )
-    else:
-        notes.append(
-            "The shifts were not known, so the affine part of S can't be observed and is zero: "
-            "scale and skew of the image are open, as with any pixel size that isn't measured."
-        )
-    if turned > 0.0:
-        notes.append(
-            f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
-            f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
-        )
-    notes.append(
-        "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
-        "or a change of the distance to the lens would be taken for distortion."
-    )
-    return tuple(notes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 
 class InputError(ValueError):
     """What the user gave can't be used; the message is one line that says what to do.
@@ -9,6 +11,23 @@ class InputError(ValueError):
     Write it as *expected, got, where, what to do*. The command line prints it without a
     traceback and exits with code 2.
     """
+
+
+def require_within(
+    what: str, value: float, low: float, high: float = math.inf, *, above: bool = False
+) -> None:
+    """Raise InputError unless low <= value <= high, finite; ``above``: unless it is above low.
+
+    ``what`` begins the message, for example "sensor: expected a gain".
+    """
+    if math.isfinite(value) and low <= value <= high and not (above and value == low):
+        return
+    limits = f"above {low:g}" if above else f"of {low:g}"
+    if high < math.inf:
+        limits += f" and at most {high:g}" if above else f" to {high:g}"
+    elif not above:
+        limits += " or more"
+    raise InputError(f"{what} {limits}, got {value}")
 
 
 class MissingDependencyError(ImportError):

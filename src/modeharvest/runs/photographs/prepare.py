@@ -26,6 +26,7 @@ from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_
 from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
 from modeharvest.imaging.distortion.calibration.calibrate import calibrate
+from modeharvest.imaging.distortion.calibration.model import PolynomialModel
 from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
@@ -234,8 +235,47 @@ def calibrate_lens(
     write_distortion(folder / "distortion.json", found.distortion)
     content: dict[str, Any] = {name: getattr(found, name).tolist() for name in _ARRAYS}
     content["trials"] = [asdict(trial) for trial in found.trials]
-    content |= {"noise_sd": found.noise_sd, "fixed": found.fixed, "text": found.sentences}
+    content |= {"noise_sd": found.noise_sd, "fixed": found.model.fixed}
+    content["text"] = calibration_text(found)
     write_json(folder / "calibration.json", content)
+
+
+def calibration_text(found: Calibration) -> tuple[str, ...]:
+    """What was found, and what could not be."""
+    chosen = next(t for t in found.trials if t.bic == 0.0)
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
+    size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
+    turned = np.abs(found.angles).max()
+    notes = [
+        f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
+        f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
+        f"{chosen.sd_px:.4f} px rms over the image.",
+    ]
+    if chosen is found.trials[-1] and len(found.trials) > 1:
+        notes.append(
+            f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
+            f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
+        )
+    if found.model.fixed == 1:  # the shifts were known
+        notes.append(
+            "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
+            "constant part can't be observed and is zero at the polynomial's mean."
+        )
+    else:
+        notes.append(
+            "The shifts were not known, so the affine part of S can't be observed and is zero: "
+            "scale and skew of the image are open, as with any pixel size that isn't measured."
+        )
+    if turned > 0.0:
+        notes.append(
+            f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
+            f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
+        )
+    notes.append(
+        "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
+        "or a change of the distance to the lens would be taken for distortion."
+    )
+    return tuple(notes)
 
 
 def calibrated_lens(folder: Path) -> Optics:
@@ -245,12 +285,13 @@ def calibrated_lens(folder: Path) -> Optics:
         distortion, content = read_distortion(folder / "distortion.json"), read_json(path)
         if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
             raise InputError("expected a polynomial in distortion.json beside it, got another kind")
+        fixed = int(content["fixed"])
         calibration = Calibration(
             distortion=distortion,
+            coefficients=distortion.coefficients[:, fixed:].ravel(),
+            model=PolynomialModel(distortion.shape, distortion.degree, fixed),
             trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
             noise_sd=float(content["noise_sd"]),
-            fixed=int(content["fixed"]),
-            sentences=tuple(map(str, content["text"])),
             **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
         )
         return Optics(distortion, calibration)

@@ -58,6 +58,7 @@ import numpy as np
 
 from modeharvest.idic.modes import PER_WAVE
 from modeharvest.idic.uncertainty.covariance import FieldErrors
+from modeharvest.runs.photographs.prepare import calibration_text
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import to_plain
@@ -304,7 +305,7 @@ def _optics(harvest: Harvest) -> dict[str, Any] | None:
             "angles_sd_rad": found.angles_sd,
             "noise_sd": found.noise_sd,
             "matches": found.matches,
-            "text": found.sentences,
+            "text": calibration_text(found),
         }
     return summary
 
