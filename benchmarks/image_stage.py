@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh, Solution
-from modeharvest.imaging.camera import ImagedState
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate
+from modeharvest.imaging.render import ImagedState
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.case import shipped_solution

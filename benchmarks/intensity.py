@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh, Solution
-from modeharvest.imaging.camera import ImagedState, integrate, near_edges
+from modeharvest.imaging.camera import integrate, near_edges
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
-from modeharvest.imaging.render import render_deformed
+from modeharvest.imaging.render import ImagedState, render_deformed
 from modeharvest.imaging.sensor import Aperture
 from modeharvest.imaging.speckle.layer import Layer
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
@@ -84,7 +84,8 @@ def point_errors(
 ) -> dict[str, float]:
     """Largest differences at random pixels of the deformed image [fraction of full scale]."""
     home = locate(mesh.nodes, mesh.cells, mesh.element, grid)
-    rendering, truth = render_deformed(mesh, displacement, home, grid, speckle, 0.0)
+    state = ImagedState(mesh, displacement, grid, speckle, 0.0)
+    rendering, truth = render_deformed(state, home)
     some = np.random.default_rng(0).choice(np.flatnonzero(rendering.mask), points)
     X = truth.reference_point.reshape(-1, 2)[some]
     at = grid.to_px(X[:, 0], X[:, 1])

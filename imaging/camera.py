@@ -15,94 +15,16 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from modeharvest.fem.field import Mesh
 from modeharvest.imaging.distortion.undistort import Positions, ideal_points
-from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import (
-    bezier_matrix,
-    monomial_gradients,
-    polynomials,
-    reference_element,
-    require_positive_jacobian,
-)
-from modeharvest.imaging.mapping.render_rows import render_rows_average
 from modeharvest.imaging.photographs.files import write_image
-from modeharvest.imaging.render import Rendering, render_observed
+from modeharvest.imaging.render import ImagedState, Rendering, render_observed
 from modeharvest.imaging.sensor import EDGE_POINTS, Aperture
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 TOLERANCE = 1e-7  # of full scale, rms: its largest among millions of pixels stays below 1e-6
 _MOST_POINTS = 16  # a side
-
-
-@dataclass(frozen=True, eq=False)
-class ImagedState:
-    """A state of the specimen before a camera.
-
-    Parameters
-    ----------
-    mesh
-        The undeformed mesh.
-    displacement
-        (n, 2) at its nodes [mm]; None for the undeformed state.
-    grid
-        The pixels; the speckle's whole pixels are the grid's.
-    speckle, background
-        Intensity of the material and around it [fraction of full scale].
-    where
-        What to call the state in an error.
-    """
-
-    mesh: Mesh
-    displacement: FloatArray | None
-    grid: PixelGrid
-    speckle: Speckle
-    background: float
-    where: str = "mesh"
-
-    @property
-    def compression(self) -> float:
-        """How many times a length shrinks, at most, among the elements' centres [-]."""
-        if self.displacement is None:
-            return 1.0
-        mesh = self.mesh
-        middle = np.full(2, 1.0 / 3.0 if reference_element(mesh.element).triangular else 0.0)
-        slopes = monomial_gradients(middle)
-        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
-        after = polynomials(mesh.element, mesh.cells, mesh.nodes + self.displacement) @ slopes
-        stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
-        return float(1.0 / stretches.min())
-
-    def average(self, offsets: FloatArray, weights: FloatArray, selected: BoolArray) -> FloatArray:
-        """(k,) weighted sum of the intensities at the k selected pixels moved by each offset.
-
-        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
-        """
-        mesh = self.mesh
-        nodes = mesh.nodes + (0.0 if self.displacement is None else self.displacement)
-        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
-        reach = float(np.abs(offsets).max(initial=0.0))
-        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
-        total = render_rows_average(
-            near, nodes, self.grid, self.speckle.spline, self.background, selected, offsets, weights
-        )
-        return total[selected]
-
-    def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
-        """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
-        element, shape = reference_element(self.mesh.element), self.grid.shape
-        control = bezier_matrix(element.triangular) @ element.coefficients
-        position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
-        hull = np.einsum("pk,mki->mpi", control, position)
-        low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
-        past = np.clip(np.ceil(hull.max(axis=1) + reach) + 1, 0, shape).astype(np.int64)
-        count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=np.int64)
-        count[1:, 1:] = selected.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
-        (top, left), (bottom, right) = low.T, past.T
-        inside = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
-        return np.asarray(inside > 0)
 
 
 @dataclass(frozen=True)
@@ -280,8 +202,5 @@ class Camera:
         """What the lens shows."""
         if self.points is None:
             return ideal
-        shown = render_observed(
-            scene.mesh, scene.displacement, scene.grid, self.points, scene.speckle,
-            scene.background, scene.where,
-        )  # fmt: skip
+        shown = render_observed(scene, self.points)
         return replace(shown, doubly_covered=ideal.doubly_covered)

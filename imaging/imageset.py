@@ -41,13 +41,13 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.field import Snapshot, Solution
-from modeharvest.imaging.camera import Camera, ImagedState, ImageRecord
+from modeharvest.imaging.camera import Camera, ImageRecord
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import Located, locate
 from modeharvest.imaging.pair import ImagePair, Truth
 from modeharvest.imaging.photographs.files import read_image, read_mask
-from modeharvest.imaging.render import render_deformed, render_reference
+from modeharvest.imaging.render import ImagedState, render_deformed, render_reference
 from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
@@ -337,7 +337,7 @@ def _write_set(
     speckle = Speckle(spec.speckle, grid.shape)
     scene = ImagedState(mesh, None, grid, speckle, spec.background, "undeformed mesh")
     camera = Camera.of(spec, grid.shape, folder)
-    ideal = render_reference(located, speckle, spec.background)
+    ideal = render_reference(scene, located)
     reference = camera.expose(ideal, scene, "reference", "mask.tif")
     snapshots = []
     for k, strain in enumerate(strains):
@@ -371,10 +371,7 @@ def _write_snapshot(
     camera: Camera, scene: ImagedState, snapshot: Snapshot, strain: float, located: Located
 ) -> SnapshotRecord:
     """Write one deformed image, its mask and its truth; ``located`` is the reference's."""
-    ideal, truth = render_deformed(
-        scene.mesh, snapshot.displacement, located, scene.grid, scene.speckle, scene.background,
-        scene.where,
-    )  # fmt: skip
+    ideal, truth = render_deformed(scene, located)
     name, truth_name = f"deformed_{_label(strain)}", f"truth_{_label(strain)}.h5"
     record = camera.expose(ideal, scene, name, f"{name}_mask.tif")
     truth.write(camera.folder / truth_name, strain, scene.grid)

@@ -12,63 +12,95 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.distortion.undistort import Positions
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import (
+    bezier_matrix,
+    monomial_gradients,
+    polynomials,
+    reference_element,
+    require_positive_jacobian,
+)
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.imaging.mapping.render_rows import render_rows_average
 from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
 
-def render_observed(
-    mesh: Mesh,
-    displacement: FloatArray | None,
-    grid: PixelGrid,
-    points: Positions,
-    speckle: Speckle,
-    background: float,
-    where: str = "mesh",
-) -> Rendering:
-    """Show the specimen at given ideal positions instead of at the grid's pixels.
+@dataclass(frozen=True, eq=False)
+class ImagedState:
+    """A state of the specimen before a camera.
 
     Parameters
     ----------
-    mesh, displacement
-        The undeformed mesh and its nodal displacements (n, 2) [mm]; None shows the reference.
+    mesh
+        The undeformed mesh.
+    displacement
+        (n, 2) at its nodes [mm]; None for the undeformed state.
     grid
-        The ideal image's pixels; the speckle's whole pixels are the grid's.
-    points
-        (row, col), each (rows, cols) [px], what the pixels show: from :func:`ideal_points`.
+        The pixels; the speckle's whole pixels are the grid's.
     speckle, background
         Intensity of the material and around it [fraction of full scale].
     where
         What to call the state in an error.
-
-    Returns
-    -------
-    Rendering
-        Image and mask; pixels that lie inside more than one element are not counted.
-
-    Raises
-    ------
-    InputError
-        If the displacement turns an element inside out.
     """
-    nodes = mesh.nodes if displacement is None else mesh.nodes + displacement
-    located = locate_points(nodes, mesh.cells, mesh.element, grid, *points, where)
-    mask = located.mask
-    if displacement is None:
-        row, col = points[0][mask], points[1][mask]
-    else:
-        x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, mask]
-        row, col = grid.to_px(x, y)
-    image = np.full(mask.shape, background, dtype=np.float32)
-    image[mask] = speckle(row, col)
-    return Rendering(image, mask)
+
+    mesh: Mesh
+    displacement: FloatArray | None
+    grid: PixelGrid
+    speckle: Speckle
+    background: float
+    where: str = "mesh"
+
+    @property
+    def nodes(self) -> FloatArray:
+        """(n, 2) where the nodes are in this state [mm]."""
+        return self.mesh.nodes if self.displacement is None else self.mesh.nodes + self.displacement
+
+    @property
+    def compression(self) -> float:
+        """How many times a length shrinks, at most, among the elements' centres [-]."""
+        if self.displacement is None:
+            return 1.0
+        mesh = self.mesh
+        middle = np.full(2, 1.0 / 3.0 if reference_element(mesh.element).triangular else 0.0)
+        slopes = monomial_gradients(middle)
+        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
+        after = polynomials(mesh.element, mesh.cells, self.nodes) @ slopes
+        stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
+        return float(1.0 / stretches.min())
+
+    def average(self, offsets: FloatArray, weights: FloatArray, selected: BoolArray) -> FloatArray:
+        """(k,) weighted sum of the intensities at the k selected pixels moved by each offset.
+
+        ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
+        """
+        mesh, nodes = self.mesh, self.nodes
+        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
+        reach = float(np.abs(offsets).max(initial=0.0))
+        near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
+        total = render_rows_average(
+            near, nodes, self.grid, self.speckle.spline, self.background, selected, offsets, weights
+        )
+        return total[selected]
+
+    def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
+        """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
+        element, shape = reference_element(self.mesh.element), self.grid.shape
+        control = bezier_matrix(element.triangular) @ element.coefficients
+        position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
+        hull = np.einsum("pk,mki->mpi", control, position)
+        low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
+        past = np.clip(np.ceil(hull.max(axis=1) + reach) + 1, 0, shape).astype(np.int64)
+        count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=np.int64)
+        count[1:, 1:] = selected.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+        (top, left), (bottom, right) = low.T, past.T
+        inside = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
+        return np.asarray(inside > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,61 +118,30 @@ class Rendering:
         and the element of the lowest number is shown.
     """
 
-    image: NDArray[np.float32]
+    image: FloatImage
     mask: BoolArray
     doubly_covered: int = 0
 
 
-def render_reference(located: Located, speckle: Speckle, background: float) -> Rendering:
-    """Show the undeformed specimen: speckle at whole pixels, ``background`` around it.
-
-    Parameters
-    ----------
-    located
-        The undeformed mesh on the image's grid.
-    speckle
-        The pattern that the material carries.
-    background
-        Intensity beside the material [fraction of full scale].
-    """
+def render_reference(state: ImagedState, located: Located) -> Rendering:
+    """Show the undeformed specimen, ``located`` on the state's grid: speckle at whole pixels."""
     mask = located.mask
-    image = np.where(mask, speckle.image(), background).astype(np.float32)
+    image = np.where(mask, state.speckle.image(), state.background).astype(np.float32)
     return Rendering(image, mask, located.doubly_covered)
 
 
-def render_deformed(
-    mesh: Mesh,
-    displacement: FloatArray,
-    located_reference: Located,
-    grid: PixelGrid,
-    speckle: Speckle,
-    background: float,
-    where: str = "deformed mesh",
-) -> tuple[Rendering, Truth]:
-    """Show the deformed specimen, and tell the truth about it.
+def render_deformed(state: ImagedState, located_reference: Located) -> tuple[Rendering, Truth]:
+    """Show the deformed specimen, and give the truth behind the image.
 
-    Parameters
-    ----------
-    mesh, displacement
-        The undeformed mesh and its nodal displacements (n, 2) [mm].
-    located_reference
-        The undeformed mesh on the same grid.
-    grid
-        The pixels of both images; the speckle's whole pixels are the grid's.
-    speckle, background
-        Intensity of the material and around it [fraction of full scale].
-    where
-        What to call the state in an error.
-
-    Raises
-    ------
-    InputError
-        If the displacement turns an element inside out.
+    ``located_reference`` is the undeformed mesh on the same grid. InputError if the displacement
+    turns an element inside out.
     """
-    located = locate(mesh.nodes + displacement, mesh.cells, mesh.element, grid, where)
+    mesh, grid, u = state.mesh, state.grid, state.displacement
+    assert u is not None
+    located = locate(state.nodes, mesh.cells, mesh.element, grid, state.where)
     point = interpolate(located, mesh.cells, mesh.element, mesh.nodes)
-    moved = interpolate(located, mesh.cells, mesh.element, displacement)
-    at_reference = interpolate(located_reference, mesh.cells, mesh.element, displacement)
+    moved = interpolate(located, mesh.cells, mesh.element, u)
+    at_reference = interpolate(located_reference, mesh.cells, mesh.element, u)
     truth = Truth.of(
         displacement=np.moveaxis(at_reference, 0, -1),
         reference_point=np.moveaxis(point, 0, -1),
@@ -149,6 +150,25 @@ def render_deformed(
         residual_px=located.residual_px,
     )
     mask = located.mask
-    image = np.full(grid.shape, background, dtype=np.float32)
-    image[mask] = speckle(*grid.to_px(point[0][mask], point[1][mask]))
+    image = np.full(grid.shape, state.background, dtype=np.float32)
+    image[mask] = state.speckle(*grid.to_px(point[0][mask], point[1][mask]))
     return Rendering(image, mask, located.doubly_covered), truth
+
+
+def render_observed(state: ImagedState, points: Positions) -> Rendering:
+    """Show the specimen at given ideal positions instead of at the grid's pixels.
+
+    ``points`` are (row, col), each (rows, cols) [px]; pixels that lie inside more than one
+    element are not counted. InputError if the displacement turns an element inside out.
+    """
+    mesh, grid = state.mesh, state.grid
+    located = locate_points(state.nodes, mesh.cells, mesh.element, grid, *points, state.where)
+    mask = located.mask
+    if state.displacement is None:
+        row, col = points[0][mask], points[1][mask]
+    else:
+        x, y = interpolate(located, mesh.cells, mesh.element, mesh.nodes)[:, mask]
+        row, col = grid.to_px(x, y)
+    image = np.full(mask.shape, state.background, dtype=np.float32)
+    image[mask] = state.speckle(row, col)
+    return Rendering(image, mask)

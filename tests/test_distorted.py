@@ -22,7 +22,7 @@ from modeharvest.imaging.distortion.undistort import (
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.mapping.isoparametric import locate
-from modeharvest.imaging.render import render_observed, render_reference
+from modeharvest.imaging.render import ImagedState, render_observed, render_reference
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
@@ -51,11 +51,15 @@ def plate(half_width: float = 9.0, half_height: float = 7.0, n: int = 6) -> Mesh
 MESH = plate()
 
 
+def state(u: FloatArray | None = None, mesh: Mesh = MESH) -> ImagedState:
+    return ImagedState(mesh, u, GRID, SPECKLE, BACKGROUND)
+
+
 def test_a_lens_without_distortion_changes_nothing() -> None:
     seen = ideal_points(PolynomialDistortion(GRID.shape, np.zeros((2, 3))), GRID.shape)
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
-    plain = render_reference(located, SPECKLE, BACKGROUND)
-    shown = render_observed(MESH, None, GRID, seen, SPECKLE, BACKGROUND)
+    plain = render_reference(state(), located)
+    shown = render_observed(state(), seen)
     np.testing.assert_array_equal(shown.mask, plain.mask)
     np.testing.assert_allclose(shown.image, plain.image, rtol=0, atol=FLOAT32)
 
@@ -65,7 +69,7 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
     F, shift = np.array([[0.9, 0.08], [-0.05, 1.04]]), np.array([0.21, -0.13])
     u = MESH.nodes @ (F - np.eye(2)).T + shift
     seen = ideal_points(LENS, GRID.shape)
-    shown = render_observed(MESH, u, GRID, seen, SPECKLE, BACKGROUND)
+    shown = render_observed(state(u), seen)
     x = np.stack(GRID.to_mm(*seen), axis=-1)
     X = (x - shift) @ np.linalg.inv(F).T
     inside = (np.abs(X) <= [9.0, 7.0]).all(axis=-1)
@@ -83,9 +87,9 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
 def test_a_lens_may_show_what_lies_beside_the_ideal_image() -> None:
     """S = (-3, 5) px everywhere: an image shifted by whole pixels, from a larger one."""
     shift = PolynomialDistortion(GRID.shape, np.array([[-3.0], [5.0]]))
-    shown = render_observed(MESH, None, GRID, ideal_points(shift, GRID.shape), SPECKLE, BACKGROUND)
+    shown = render_observed(state(), ideal_points(shift, GRID.shape))
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
-    plain = render_reference(located, SPECKLE, BACKGROUND)
+    plain = render_reference(state(), located)
     np.testing.assert_array_equal(shown.mask[:-3, 5:], plain.mask[3:, :-5])
     np.testing.assert_allclose(shown.image[:-3, 5:], plain.image[3:, :-5], rtol=0, atol=2 * FLOAT32)
 
@@ -94,7 +98,7 @@ def test_material_beside_the_ideal_image_is_shown_too() -> None:
     wide = plate(half_width=12.0)  # its right edge lies at column 186 of 181
     col = 150.0 + np.arange(60.0)[None]
     seen = np.full(col.shape, 75.0), col
-    shown = render_observed(wide, None, GRID, seen, SPECKLE, BACKGROUND)
+    shown = render_observed(state(mesh=wide), seen)
     np.testing.assert_array_equal(shown.mask, col <= 186.0)
     exact = SPECKLE.exact(*(s[shown.mask] for s in seen))
     np.testing.assert_allclose(shown.image[shown.mask], exact, rtol=0, atol=FLOAT32)

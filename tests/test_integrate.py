@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.camera import TOLERANCE, ImagedState, integrate, near_edges, points_a_side
+from modeharvest.imaging.camera import TOLERANCE, integrate, near_edges, points_a_side
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.render import ImagedState
 from modeharvest.imaging.sensor import EDGE_POINTS, Aperture
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 

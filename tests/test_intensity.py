@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.camera import TOLERANCE, ImagedState
+from modeharvest.imaging.camera import TOLERANCE
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.render import ImagedState
 from modeharvest.imaging.sensor import Aperture
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 

@@ -9,6 +9,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.render import (
+    ImagedState,
     Rendering,
     render_deformed,
     render_reference,
@@ -41,14 +42,18 @@ GRID = PixelGrid.centred(61, 61, H)  # pixel centres at whole multiples of H
 SPECKLE = Speckle(SpeckleSpec(seed=9), GRID.shape)
 
 
+def state(displacement: FloatArray | None) -> ImagedState:
+    return ImagedState(MESH, displacement, GRID, SPECKLE, BACKGROUND, "deformed mesh")
+
+
 def reference() -> Rendering:
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
-    return render_reference(located, SPECKLE, BACKGROUND)
+    return render_reference(state(None), located)
 
 
 def deformed(displacement: FloatArray) -> tuple[Rendering, Truth]:
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
-    return render_deformed(MESH, displacement, located, GRID, SPECKLE, BACKGROUND)
+    return render_deformed(state(displacement), located)
 
 
 def test_reference_shows_speckle_on_material_and_background_elsewhere() -> None:
@@ -140,4 +145,4 @@ def test_truth_in_both_frames_is_one_motion() -> None:
 def test_folding_displacement_is_refused_by_name() -> None:
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
     with pytest.raises(InputError, match="deformed mesh: expected T6 elements with positive"):
-        render_deformed(MESH, -1.5 * MESH.nodes * [1, 0], located, GRID, SPECKLE, BACKGROUND)
+        render_deformed(state(-1.5 * MESH.nodes * [1, 0]), located)

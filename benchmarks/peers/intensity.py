@@ -15,8 +15,8 @@ from meshes import Scene, specimen
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from modeharvest.imaging.camera import ImagedState
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate
+from modeharvest.imaging.render import ImagedState
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 
 FloatArray = NDArray[np.float64]

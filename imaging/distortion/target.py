@@ -66,11 +66,7 @@ class CalibrationTarget:
 
 
 def photograph_target(
-    target: CalibrationTarget,
-    speckle: SpeckleSpec,
-    points: Positions,
-    sensor: Sensor,
-    bits: int,
+    target: CalibrationTarget, speckle: SpeckleSpec, points: Positions, sensor: Sensor, bits: int
 ) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
     """Make the photographs, one after the other, each with its name.
 

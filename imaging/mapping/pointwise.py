@@ -93,25 +93,18 @@ def locate_points(
 
     Parameters
     ----------
-    nodes
-        (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
-    cells
-        (m, k) node numbers of each element.
-    element
-        T3, T6, Q4, Q8 or Q9.
+    nodes, cells, element, where
+        As for :func:`modeharvest.imaging.mapping.isoparametric.locate`.
     grid
         What positions in px mean; they need not lie on it.
     row, col
         Positions of the points [px], of shapes that broadcast to two dimensions.
-    where
-        What to call the mesh in an error.
 
     Returns
     -------
     Located
         With arrays of the points' shape; points beside the mesh, and NaN, belong to no element.
-        A point on a shared edge belongs to the element of the lowest number. How many points lie
-        inside more than one element is not counted.
+        How many points lie inside more than one element is not counted.
 
     Raises
     ------
