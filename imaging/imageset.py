@@ -17,15 +17,13 @@ with the same key need not be made), and:
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
     full scale, squared].
 ``reference``, ``snapshots``
-    Of each image its :class:`modeharvest.imaging.camera.ImageRecord`, a :class:`SnapshotRecord` of
-    each deformed one.
+    An ``ImageRecord``, and a ``SnapshotRecord`` of each deformed image.
 ``warnings``
     Sentences about what makes the images other than what a camera would show.
 
-With a distortion of the lens, images and masks are as the lens shows them, and the truth is on the
-ideal grid: what a measurement finds in images that were undistorted.
-
-For the contents of the truth files see :mod:`modeharvest.imaging.pair`.
+With a distortion of the lens, images and masks are as the lens shows them, and the truth
+(:mod:`modeharvest.imaging.pair`) is on the ideal grid: what a measurement finds in images that
+were undistorted.
 """
 
 from __future__ import annotations
@@ -61,21 +59,9 @@ FORMAT = "modeharvest-images-1"
 
 
 def image_key(solution: Solution, spec: ImagingSpec, strains: Sequence[float]) -> str:
-    """Digest everything that the images depend on, hexadecimal.
+    """Digest everything that images of these nominal strains [-] depend on, hexadecimal.
 
-    Parameters
-    ----------
-    solution
-        Mesh and displacements.
-    spec
-        How.
-    strains
-        Nominal strains of the snapshots to image [-].
-
-    Raises
-    ------
-    InputError
-        If a snapshot is missing, or a distortion's file can't be read.
+    InputError if a snapshot is missing, or a distortion's file can't be read.
     """
     digest = hashlib.sha256()
     parts = {"format": FORMAT, "code": source_digest("fem", "imaging"), "spec": asdict(spec),
@@ -285,10 +271,8 @@ def make_images(
 
     Parameters
     ----------
-    solution
-        Mesh and displacements.
-    spec
-        How.
+    solution, spec
+        What is imaged, and how.
     folder
         Where to write; made if it doesn't exist. A whole set of the same solution, spec, strains
         and code is left as it is; any other set there is replaced.

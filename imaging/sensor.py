@@ -13,12 +13,10 @@ a grey level whose mean is y is
 Everything is off by default: points instead of areas, no noise, gain 1 and offset 0.
 
 A pixel at x averages its sensitive area behind the blur of the lens, ``integral h(t) I(x + t) dt``
-of the irradiance I on the sensor, with h the indicator of a centred square convolved with a
-Gaussian; t is in pixels of *that* image. In Fourier space h is a product,
+with h the indicator of a centred square convolved with a Gaussian. In Fourier space h is
 ``sinc(a f_row) sinc(a f_col) exp(-2 pi^2 s^2 |f|^2)``, which is exact on the reference image's
-pattern. A deformed pattern isn't a sum of plane waves any more: there the average is a Gauss rule
-whose weight function is h itself. At the edge of the material I jumps, and equally weighted points
-take the rule's place.
+pattern. A deformed pattern is no sum of plane waves: there the average is a Gauss rule whose
+weight is h itself, and equally weighted points where the edge of the material makes I jump.
 
 References
 ----------
@@ -44,19 +42,12 @@ from modeharvest.util.errors import InputError, require_within
 def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Grey levels as a camera stores them: 0 ... 1 clipped, times 2^bits - 1, rounded to nearest.
 
-    Up to 8 bits give uint8, up to 16 uint16; values fill the range of ``bits``.
-
-    Raises
-    ------
-    InputError
-        If the bits are not 1 to 16.
+    Up to 8 bits give uint8, up to 16 uint16; InputError for other bits.
     """
     if not 1 <= bits <= 16:
         raise InputError(f"expected 1 to 16 bits, got {bits}")
     levels = np.rint(np.clip(image, 0.0, 1.0) * (2**bits - 1))
-    if bits <= 8:
-        return np.asarray(levels, dtype=np.uint8)
-    return np.asarray(levels, dtype=np.uint16)
+    return levels.astype(np.uint8 if bits <= 8 else np.uint16)
 
 
 EDGE_POINTS = 233  # a Fibonacci number
@@ -107,10 +98,7 @@ class Aperture:
         return math.ceil(0.5 * self.side_px + _TAIL * self.psf_px)
 
     def transfer(self, f: ArrayLike) -> FloatArray:
-        """Fourier transform of h along one axis at frequencies f [cycles/px]; even, 1 at 0.
-
-        For a plane wave the axes' transfers multiply.
-        """
+        """Fourier transform of h along one axis at frequencies f [cycles/px]."""
         f = np.asarray(f, dtype=np.float64)
         blur = np.exp(-2.0 * (math.pi * self.psf_px * f) ** 2)
         return np.asarray(np.sinc(self.side_px * f) * blur)
@@ -118,8 +106,7 @@ class Aperture:
     def rule(self, points: int) -> tuple[FloatArray, FloatArray]:
         """Gauss rule for the weight h along one axis: (nodes [px], weights), each (points,).
 
-        Exact for polynomials up to degree 2 points - 1. With a perfect lens it is the
-        Gauss-Legendre rule, with a fill factor of 0 the Gauss-Hermite one.
+        With a perfect lens it is the Gauss-Legendre rule, with a fill factor of 0 Gauss-Hermite.
         """
         nodes, weights = self._fine_rule()
         before, polynomial = np.zeros_like(nodes), np.ones_like(nodes)
@@ -135,12 +122,10 @@ class Aperture:
         """(points, 2) offsets (row, col) [px], all of the same weight, that sample h evenly.
 
         A Fibonacci lattice put through the inverse of h's cumulative sum: no two points share
-        a row or a column, so an edge along the pixels is seen as finely as any other. The part
-        of a pixel that a straight edge cuts off is off by 0.0047 rms for 233
-        points, and by points^(-3/4) of that for other Fibonacci numbers.
+        a row or a column, so an edge along the pixels is resolved as finely as any other. The
+        part of a pixel that a straight edge cuts off is off by 0.0047 rms for 233 points.
         """
         a, s = max(self.side_px, _THIN), max(self.psf_px, _THIN)
-
         t = np.linspace(-1.0, 1.0, 20_001) * (0.5 * a + 6.0 * s)
         high, low = (t + 0.5 * a) / s, (t - 0.5 * a) / s
         # The normal distribution's cumulative one, integrated: z ndtr(z) + exp(-z^2 / 2) / ...
@@ -164,11 +149,8 @@ class Sensor:
 
     Parameters
     ----------
-    fill_factor
-        Sensitive part of a pixel's area [-], a centred square: 1 is the whole pixel; 0, the
-        default, a point.
-    psf_px
-        Standard deviation of the lens's Gaussian point spread [px], 0 to 2.
+    fill_factor, psf_px
+        As of an :class:`Aperture`.
     gain
         Factor from irradiance to grey level [-].
     offset
@@ -236,17 +218,10 @@ class Sensor:
     def expose(
         self, irradiance: NDArray[np.float32], bits: int, name: str
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """One exposure: noise, cut-off and rounding to 2^bits levels.
+        """One exposure of averages over the pixels (rows, cols): noise, cut-off and rounding.
 
-        Parameters
-        ----------
-        irradiance
-            (rows, cols) averages over the pixels [fraction of full scale].
-        bits
-            1 to 16; up to 8 give uint8, up to 16 uint16.
-        name
-            The image's name in its set: with the seeds it decides the noise, so that no two
-            images share theirs.
+        The image's ``name`` in its set decides the noise with the seeds, so that no two images
+        share theirs.
         """
         grey: NDArray[np.floating] = self.mean(irradiance)
         if self.full_well > 0.0:

@@ -43,10 +43,9 @@ class ImagingSpec:
     sensor
         What a pixel averages, and its noise; the default shows points without noise.
     distortion
-        Of the lens: a camera's, or a file that :func:`read_distortion
-        <modeharvest.imaging.distortion.files.read_distortion>` reads; None is a perfect lens.
-        Where there is one, pixels show points, in the images and in their masks as the lens
-        distorts them; the truth stays on the ideal grid, that of the images once undistorted.
+        Of the lens: a camera's, or the name of a file; None is a perfect lens. Where there is
+        one, pixels show points, in the images and in their masks as the lens distorts them; the
+        truth stays on the ideal grid, that of the images once undistorted.
     affine_distortion
         False takes the distortion's affine part away
         (:func:`modeharvest.imaging.distortion.undistort.without_affine`): it is no more than
@@ -85,13 +84,7 @@ class ImagingSpec:
             object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
 
     def lens(self, shape: tuple[int, int]) -> AnyDistortion | None:
-        """The distortion of images of that size, (rows, cols) [px]; None for a perfect lens.
-
-        Raises
-        ------
-        InputError
-            If it is in a file that can't be read.
-        """
+        """The distortion of images of (rows, cols) px; InputError if its file can't be read."""
         lens: AnyDistortion | str | None = self.distortion
         if isinstance(lens, str):
             lens = read_distortion(lens)

@@ -36,13 +36,7 @@ from modeharvest.util.errors import InputError
 
 @cache
 def poles(order: int) -> FloatArray:
-    """Roots of the z-transform of a B-spline's samples inside the unit circle, the largest first.
-
-    Parameters
-    ----------
-    order
-        Odd.
-    """
+    """Roots inside the unit circle of the z-transform of a B-spline's samples, largest first."""
     knots = np.arange(order + 2.0)
     samples = BSpline.basis_element(knots)(knots[1:-1])
     polynomial = np.polynomial.Polynomial(samples)
@@ -59,17 +53,11 @@ _NEGLIGIBLE = 1e-18
 
 
 def border_reach(order: int, share: float) -> int:
-    """How far from an image's border what lies beyond it is felt by more than a share [px].
+    """How far from an image's border its continuation matters by more than a share [px].
 
-    A spline passes through every pixel whatever continues the image, but between the pixels the
-    continuation is felt: less with every pixel by the largest pole, 0.27, 0.43 or 0.66.
-
-    Parameters
-    ----------
-    order
-        3, 5 or 11.
-    share
-        Of what is felt at the border itself [-].
+    A spline passes through every pixel whatever continues the image; between the pixels the
+    continuation matters less with every pixel by the largest pole, 0.27, 0.43 or 0.66. ``share``
+    is of what it is at the border itself [-].
     """
     return int(np.ceil(np.log(share) / np.log(abs(poles(order)).max())))
 
@@ -82,10 +70,8 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     image
         (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about
         its outermost pixels.
-    order
-        3, 5 or 11.
-    pad
-        Rows and columns of mirrored coefficients to put around it [px].
+    order, pad
+        3, 5 or 11; rows and columns of mirrored coefficients to put around it [px].
 
     Returns
     -------
@@ -336,19 +322,15 @@ class SplineImage:
 
         Parameters
         ----------
-        image
-            (rows, cols) grey levels.
-        order
-            3, 5 or 11.
+        image, order
+            (rows, cols) grey levels; 3, 5 or 11.
         dtype
-            How the coefficients are stored: float32 costs 1e-7 of full scale. The recursive
-            filter itself runs in float64, line by line.
+            How the coefficients are stored: float32 costs 1e-7 of full scale.
 
         Raises
         ------
         InputError
-            If the image isn't two-dimensional or smaller than 2 x 2 px, or the order is
-            not among the three.
+            If the image isn't of 2 x 2 px or more, or the order is not among the three.
         """
         pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
@@ -363,17 +345,10 @@ class SplineImage:
         return self.coefficients.shape[0] - 2 * PAD, self.coefficients.shape[1] - 2 * PAD
 
     def sample(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Value, derivative along the rows' index and along the columns' index.
+        """(value, d_row, d_col) [grey levels, and per px] at positions (row, col) [px].
 
-        Parameters
-        ----------
-        row, col
-            Positions [px], of any common shape; those outside the image give NaN.
-
-        Returns
-        -------
-        value, d_row, d_col
-            Grey levels, and grey levels per px; d_row is along *increasing row*, i.e. down.
+        The positions may be of any common shape; those outside the image give NaN. d_row is along
+        *increasing row*, i.e. down.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         value, d_row, d_col = (np.empty(row.size) for _ in range(3))

@@ -49,19 +49,10 @@ def write_distortion(path: Path | str, distortion: AnyDistortion) -> None:
 
 
 def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
-    """Read a distortion from any of the formats above.
+    """Read a distortion from any of the formats above: ``.json``, ``.xml``, ``.yml`` or ``.yaml``.
 
-    Parameters
-    ----------
-    path
-        The file; ``.json``, ``.xml``, ``.yml`` or ``.yaml``.
-    camera
-        Number or CAMERA_ID of the camera in a DICe file.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cut short or of another kind.
+    ``camera`` is the number or CAMERA_ID of the camera in a DICe file. InputError if the file is
+    missing, cut short or of another kind.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -45,19 +45,15 @@ class Distortion(ABC):
         """(2, 2, ...) derivatives of S [-]: [component, direction], rows' index before columns'."""
 
     def observed(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """phi_S: where ideal positions (row, col) are seen [px]."""
+        """phi_S: where ideal positions (row, col) are observed [px]."""
         d_row, d_col = self.shift(row, col)
         return np.add(row, d_row), np.add(col, d_col)
 
     def ideal(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Invert phi_S: the ideal positions of what is seen at (row, col) [px].
+        """Invert phi_S: the ideal positions of what is observed at (row, col) [px].
 
         By Newton's method, to rounding (better than 1e-10 px); NaN where a position is NaN.
-
-        Raises
-        ------
-        InputError
-            If the mapping is not one-to-one there: it folds.
+        InputError if the mapping is not one-to-one there: it folds.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         observed = np.stack([row.ravel(), col.ravel()])

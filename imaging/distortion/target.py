@@ -68,23 +68,16 @@ class CalibrationTarget:
 def photograph_target(
     target: CalibrationTarget, speckle: SpeckleSpec, points: Positions, sensor: Sensor, bits: int
 ) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
-    """Make the photographs, one after the other, each with its name.
+    """Make the photographs one after the other: "calibration_00", ... and (rows, cols) levels.
 
     Parameters
     ----------
-    target
-        Shifts and pattern.
+    target, sensor, bits
+        Shifts and pattern; the camera.
     speckle
         The pattern if the target has none of its own, but for its seeds.
     points
         (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
-    sensor, bits
-        The camera.
-
-    Yields
-    ------
-    name, (rows, cols) grey levels
-        "calibration_00", ... and an exposure as the camera stores it.
     """
     rows, cols = points[0].shape
     pattern = Speckle(_reseeded(target.speckle or speckle, target.seed), (rows, cols))

@@ -23,26 +23,11 @@ _BAND = 64
 
 
 def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDArray[np.float32]:
-    """Free an image from its distortion: f(phi_S(x)) at every pixel x of the ideal grid.
+    """Free an image (rows, cols) from its distortion: f(phi_S(x)) at pixels x of the ideal grid.
 
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels as photographed.
-    distortion
-        Of the lens.
-    order
-        Of the B-spline that interpolates the photograph: 5 or 3.
-
-    Returns
-    -------
-    (rows, cols) grey levels. Where phi_S leaves the photograph, that of its nearest pixel;
-    :func:`undistorted_mask` is False there.
-
-    Raises
-    ------
-    InputError
-        If the image isn't two-dimensional, or the order neither 3 nor 5.
+    Where phi_S leaves the photograph, the grey level is that of its nearest pixel, and
+    :func:`undistorted_mask` is False. ``order`` is of the B-spline that interpolates the
+    photograph. InputError if the image isn't two-dimensional, or there is no such order.
     """
     spline = SplineImage.of(image, order)
     rows, cols = spline.shape
@@ -56,20 +41,10 @@ def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDA
 
 
 def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool_]:
-    """Free a mask from the distortion: what the nearest pixel of the photograph's mask says.
+    """Free a mask (rows, cols) from the distortion: that of the photograph's nearest pixel.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material, as photographed. All True gives the pixels of the ideal
-        grid that were photographed at all.
-    distortion
-        Of the lens.
-
-    Raises
-    ------
-    InputError
-        If the mask is not plane.
+    All True gives the pixels of the ideal grid that were photographed at all. InputError if the
+    mask is not plane.
     """
     inside = np.asarray(mask, dtype=np.bool_)
     if inside.ndim != 2:
@@ -104,10 +79,7 @@ _STRIP = 64  # rows that a thread takes at a time
 def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
     """(row, col), each (rows, cols) [px]: the ideal positions that an image's pixels show.
 
-    Raises
-    ------
-    InputError
-        If the distortion folds in the image.
+    InputError if the distortion folds in the image.
     """
     row, col = np.ogrid[: shape[0], : shape[1]]
     strips = [slice(k, k + _STRIP) for k in range(0, shape[0], _STRIP)]
@@ -117,18 +89,11 @@ def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
 
 
 def without_affine(distortion: Distortion, shape: tuple[int, int]) -> PolynomialDistortion:
-    """The same distortion without its affine part, as a polynomial.
+    """The same distortion without its affine part over images of (rows, cols) px, as a polynomial.
 
     The terms 1, xi, eta of its Chebyshev series over the image are left out, and those of the
     highest degrees where they are negligible; exact for lenses that are polynomials of degree 9
     or less (those of k1 ... k3, p1, p2).
-
-    Parameters
-    ----------
-    distortion
-        Of any kind.
-    shape
-        (rows, cols) of the images [px].
     """
     nodes = chebyshev.chebpts1(_DEGREE + 1)
     row, col = (0.5 * (n - 1) * (1.0 + nodes) for n in shape)

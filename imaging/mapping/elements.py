@@ -185,12 +185,7 @@ def sub_elements(triangular: bool) -> FloatArray:
 def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str) -> IntArray:
     """Numbers of the cells whose Jacobian isn't positive everywhere, ascending.
 
-    Parameters
-    ----------
-    positions
-        (n, 2) node positions in a right-handed frame (x right, y up).
-    cells, element
-        As in :class:`modeharvest.fem.field.Mesh`.
+    ``positions`` (n, 2) are in a right-handed frame (x right, y up).
     """
     triangular = reference_element(element).triangular
     degree = 2 if triangular else 3

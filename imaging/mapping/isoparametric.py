@@ -80,10 +80,8 @@ def locate(
     ----------
     nodes
         (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
-    cells
-        (m, k) node numbers of each element.
-    element
-        T3, T6, Q4, Q8 or Q9.
+    cells, element
+        (m, k) node numbers of each element; T3, T6, Q4, Q8 or Q9.
     grid
         The pixels.
     where
@@ -122,23 +120,9 @@ def in_turn(bands: int) -> IntArray:
 
 
 def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArray) -> FloatArray:
-    """Values of a nodal field at located pixels by the element's own shape functions.
+    """(c, rows, cols) values of a nodal field (n, c) at located pixels, NaN off the material.
 
-    Parameters
-    ----------
-    located
-        From :func:`locate`, with the same cells.
-    nodal
-        (n, c) field at the nodes, for example the displacement [mm].
-
-    Returns
-    -------
-    (c, rows, cols) values, NaN where there is no material.
-
-    Raises
-    ------
-    InputError
-        If the field is not of shape (n, c).
+    ``located`` is from :func:`locate` with the same cells. InputError unless the field is (n, c).
     """
     if nodal.ndim != 2:
         raise InputError(f"expected a nodal field of shape (n, c), got {nodal.shape}")

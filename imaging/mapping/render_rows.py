@@ -59,14 +59,10 @@ def render_rows_average(
     mesh, nodes
         The undeformed mesh, whose Jacobians are proved positive in the state with the node
         positions ``nodes`` (n, 2) [mm].
-    grid
-        The pixels; the pattern's whole pixels are the grid's.
-    pattern, background
-        Intensity of the material and around it [fraction of full scale].
-    selected
-        (rows, cols) True where to sum.
-    offsets, weights
-        (k, 2) (row, col) [px] and (k,).
+    grid, pattern, background
+        The pixels, the pattern's among them; intensity of the material and around it.
+    selected, offsets, weights
+        (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
     """
     total = np.zeros(grid.shape)
     position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)

@@ -234,11 +234,7 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
     """Read a grey image.
 
     Whole-number images are scaled to fractions of their type's full scale (uint8: /255,
-    uint16: /65535); floating-point images are taken as they are.
-
-    Returns
-    -------
-    (rows, cols) float32, row 0 at the top.
+    uint16: /65535); floating-point images are taken as they are. Row 0 is at the top.
 
     Raises
     ------
@@ -254,12 +250,9 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
 
 
 def read_mask(path: Path | str) -> BoolArray:
-    """Read a mask: True where the file isn't zero, that is, where there is material.
+    """Read a mask (rows, cols): True where the file isn't zero, that is, where there is material.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, cut short, not one plane image, or zero everywhere.
+    InputError if the file is missing, cut short, not one plane image, or zero everywhere.
     """
     levels = read_stored(Path(path), single=True).levels
     mask = (levels if levels.ndim == 2 else levels.max(axis=2)) != 0
@@ -273,10 +266,7 @@ def read_mask(path: Path | str) -> BoolArray:
 def require_same_shape(
     image: NDArray[Any], other: NDArray[Any], what: str, other_what: str
 ) -> None:
-    """Raise InputError unless two images have the same size.
-
-    ``what`` and ``other_what`` name them, best with their file names.
-    """
+    """Raise InputError unless two images, of these names, have the same size."""
     if image.shape != other.shape:
         raise InputError(
             f"expected images of one size, got {what} with {_size(image)} and {other_what} with "
@@ -287,13 +277,8 @@ def require_same_shape(
 def write_image(path: Path | str, image: NDArray[Any]) -> None:
     """Write a float32, uint8 or uint16 image (rows, cols) as TIFF, whole or not at all.
 
-    Values are stored as they are (float64 is rounded to float32); for a camera's grey levels
-    see :func:`quantise`. Bool (a mask) is written as 0 and 255.
-
-    Raises
-    ------
-    InputError
-        If the name is not of a TIFF file, the image not plane, or of another type.
+    Values are stored as they are (float64 is rounded to float32); bool (a mask) as 0 and 255.
+    InputError if the name is not of a TIFF file, the image not plane, or of another type.
     """
     path = Path(path)
     if path.suffix.lower() not in _TIFF:

@@ -137,19 +137,10 @@ def read_photograph(path: Path | str) -> Photograph:
 
 
 def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tuple[str, ...]:
-    """Check whether a photograph shows a pattern at all.
+    """Check whether a photograph shows a pattern at all; notes about what is not that good.
 
-    Parameters
-    ----------
-    photograph
-        To be checked.
-    mask
-        (rows, cols) True on material, if that is known; a background may be as white or black
-        as it likes.
-
-    Returns
-    -------
-    Sentences about what is not as good as it should be.
+    ``mask`` (rows, cols) is True on material, if that is known: a background may be as white or
+    black as it likes.
 
     Raises
     ------
@@ -221,10 +212,7 @@ def read_frame(path: Path | str, reference: Photograph) -> Photograph:
 
 
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:
-    """Correlation of pixels with their right and lower neighbours, uneven lighting removed [-].
-
-    About 0 for noise, 0.6 for speckles of 3 px, more for larger ones.
-    """
+    """Correlation of pixels with their right and lower neighbours, uneven lighting removed [-]."""
     weight = np.ones(image.shape, np.float32) if mask is None else mask.astype(np.float32)
     total = scipy.ndimage.uniform_filter(image * weight, _SHADE_PX)
     share = scipy.ndimage.uniform_filter(weight, _SHADE_PX)

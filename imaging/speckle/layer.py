@@ -47,15 +47,9 @@ def gaussian_field(
 ) -> FloatArray:
     """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [samples].
 
-    White noise is filtered by the square root of the spectral density. The sample's mean is
-    zero; in expectation the variance is one and the median zero.
-
-    Parameters
-    ----------
-    standard_deviation
-        Of the spectral density [cycles/sample].
-    seed
-        Seed of the random numbers.
+    White noise is filtered by the square root of the spectral density, of that standard deviation
+    [cycles/sample]. The sample's mean is zero; in expectation the variance is one and the median
+    zero.
     """
     noise = np.random.default_rng(seed).standard_normal(period)
     amplitude = np.exp(-_squared_frequency(period) / (4.0 * standard_deviation**2))

@@ -145,11 +145,8 @@ class Speckle:
 
     Parameters
     ----------
-    spec
-        What it looks like.
-    shape
-        (rows, cols) of the image it has to cover [px]. The pattern is periodic with the next
-        sizes that suit an FFT; the realisation depends on them, hence on ``shape``.
+    spec, shape
+        What it looks like; (rows, cols) of the image it has to cover [px], see :class:`Layer`.
 
     Attributes
     ----------
@@ -169,14 +166,7 @@ class Speckle:
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
         """(rows, cols) exact intensities at whole pixels [fraction of full scale].
 
-        ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
-        multiplied by those of its row and its column frequency (see Aperture.transfer). Not with
-        ink, whose waves are products.
-
-        Raises
-        ------
-        InputError
-            If there is a transfer and ink.
+        For ``transfer`` see :meth:`Layer.image`; InputError with ink, whose waves are products.
         """
         if transfer is not None and self._ink is not None:
             raise InputError("speckle: expected one layer where pixels average, got two")
@@ -207,10 +197,7 @@ class Speckle:
         return self.spline.bound + ink + ink * self.spline.bound
 
     def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
-        """Exact intensities at image positions (row, col) [px], of the positions' shape.
-
-        ``eps`` is the relative precision of the non-uniform FFT.
-        """
+        """Exact intensities at positions (row, col) [px]; ``eps``: the FFT's relative precision."""
         return self._product(lambda layer: layer.exact(row, col, eps))
 
     def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:

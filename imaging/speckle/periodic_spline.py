@@ -90,10 +90,8 @@ class PeriodicSpline:
 
         Parameters
         ----------
-        spectrum
-            (rows, cols // 2 + 1) Fourier coefficients c_k in the layout of a real FFT.
-        period
-            (rows, cols) of the period [px].
+        spectrum, period
+            (rows, cols // 2 + 1) c_k in the layout of a real FFT; (rows, cols) of the period [px].
         tolerance
             What the bound has to be, if 4 x 4 samples per pixel suffice for that.
         """

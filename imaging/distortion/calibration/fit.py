@@ -186,16 +186,12 @@ def fit_views(
 
     Parameters
     ----------
-    model, c
-        The distortions to choose from, and (k,) coefficients to begin with.
-    views
-        Photographs with the poses to begin with.
+    model, c, views
+        The distortions to choose from; (k,) coefficients and poses to begin with.
     points
         (n,) rows and columns of ideal positions to look at [px].
     tolerance_px
         Largest change of S or of a shift [px] at which to stop.
-    max_iterations
-        The most steps.
     """
     poses = [view.pose for view in views]
     free = np.array([view.free for view in views])

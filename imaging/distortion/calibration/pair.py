@@ -54,10 +54,8 @@ def recover_camera(
         What the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
         ``fixed=0``. By default an OpenCV camera with unknown cx, cy, k1, k2, k3; its focal length
         is taken as the larger size of the image, because another f with other k is the same S.
-    mask
-        (rows, cols) where the undistorted image counts.
-    points
-        About how many pixels to look at.
+    mask, points
+        (rows, cols) where the undistorted image counts; about how many pixels to look at.
     order
         Of the spline that samples the images: 5 or 3.
 

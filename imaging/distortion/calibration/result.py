@@ -29,10 +29,8 @@ def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, 
 
     Parameters
     ----------
-    blur_px
-        Standard deviation of the blur before the spline [px].
-    order
-        Of the spline, 3 or 5.
+    blur_px, order
+        Standard deviation of the blur before the spline [px]; the spline's order, 3 or 5.
     stride_px
         Distance between samples along rows and columns [px].
 
@@ -179,15 +177,7 @@ class Calibration(LensEstimate):
 def calibration_of(
     trials: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
 ) -> Calibration:
-    """Choose the degree with the lowest BIC.
-
-    Parameters
-    ----------
-    trials
-        One a degree.
-    noise
-        What :func:`sampled_noise` gives.
-    """
+    """Choose the degree with the lowest BIC; ``noise`` is what :func:`sampled_noise` gives."""
     model, fit = min(trials, key=lambda trial: trial[1].bic)
     one, many = noise
     own = np.zeros(fit.free.shape)
