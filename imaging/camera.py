@@ -85,7 +85,7 @@ def points_a_side(
 ) -> tuple[int, float]:
     """How many points a side the Gauss rule needs, and the bound of its rms error.
 
-    A plane wave of the pattern is seen at up to ``compression`` times its frequency f. The rule
+    A plane wave of the pattern appears at up to ``compression`` times its frequency f. The rule
     multiplies it by one factor, the exact average by another; by Parseval's theorem the rms
     error is at most the largest of |difference of factors| times the blur's transfer function
     at f, times the standard deviation of the pattern before its blur. The least number of

@@ -105,7 +105,7 @@ class ImagedState:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An image with material and background told apart.
+    """An image, and where it shows material.
 
     Parameters
     ----------

@@ -198,7 +198,7 @@ def _powers(t: FloatArray, degree: int) -> FloatArray:
 class CameraDistortion(Distortion):
     """The lens of OpenCV's camera model (Brown-Conrady, with its rational extension).
 
-    With x = (col - cx) / fx, y = (row - cy) / fy and r^2 = x^2 + y^2 an ideal position is seen at
+    With x = (col - cx) / fx, y = (row - cy) / fy and r^2 = x^2 + y^2 an ideal position appears at
 
         x' = x q + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y q + p1 (r^2 + 2 y^2) + 2 p2 x y,
         q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),

@@ -219,7 +219,7 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
         coefficients = coefficients.reshape(-1, len(points))
         owner = np.repeat(owner[open_], 4)
     else:
-        bad[owner] = True  # zero to within what can be told
+        bad[owner] = True  # zero to rounding
     return unproved[bad]
 
 

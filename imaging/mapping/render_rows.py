@@ -6,8 +6,6 @@ nothing is kept but grey levels.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import prange
 
@@ -28,18 +26,6 @@ from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
 
 _BAND = 16  # rows
-
-
-class _Shown(NamedTuple):
-    """What the kernels show: elements, the pattern on them, and the background's grey level.
-
-    place : (m, 2, 9) where in the pattern, (row, col) [px], the elements' points are.
-    """
-
-    elements: ElementTable
-    place: FloatArray
-    pattern: SplineTable
-    background: float
 
 
 def render_rows_average(
@@ -72,14 +58,17 @@ def render_rows_average(
         elements = tabulate_elements(nodes, mesh.cells, mesh.element, moved)
         start, visits = bands(elements.row_from, elements.row_to, grid.rows, _BAND)
         order = in_turn(start.size - 1)
-        shown = _Shown(elements, place, pattern.table, float(background))
-        _add(shown, start, visits, order, float(weight), np.ascontiguousarray(selected), total)
+        _add(elements, place, pattern.table, background, start, visits, order,
+             float(weight), np.ascontiguousarray(selected), total)  # fmt: skip
     return total
 
 
 @compiled(parallel=True)
 def _add(
-    shown: _Shown,
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
     start: IntArray,
     visits: IntArray,
     order: IntArray,
@@ -87,14 +76,18 @@ def _add(
     selected: BoolArray,
     total: FloatArray,
 ) -> None:
+    """``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are."""
     for i in prange(order.size):
         visited = visits[start[order[i]] : start[order[i] + 1]]
-        _add_band(shown, visited, order[i], weight, selected, total)
+        _add_band(elements, place, pattern, background, visited, order[i], weight, selected, total)
 
 
 @compiled()
 def _add_band(
-    shown: _Shown,
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
     visited: IntArray,
     band: int,
     weight: float,
@@ -106,31 +99,41 @@ def _add_band(
     sums = total[top:bottom].ravel()
     if not selected[top:bottom].any():
         return
-    grey = _render_pixels(shown, selected.ravel(), visited, top, bottom, cols)
+    grey = _render_pixels(
+        elements, place, pattern, background, selected.ravel(), visited, top, bottom, cols
+    )
     for k in range(grey.size):  # of others, too: what they get is not looked at
         sums[k] += weight * grey[k]
 
 
 @compiled()
 def _render_pixels(
-    shown: _Shown, selected: BoolArray, visited: IntArray, top: int, bottom: int, cols: int
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
+    selected: BoolArray,
+    visited: IntArray,
+    top: int,
+    bottom: int,
+    cols: int,
 ) -> FloatArray:
     """Grey levels of the pixels of some rows."""
     size = (bottom - top) * cols
     element, at, grey = np.empty(size, dtype=np.int32), np.empty((2, size)), np.empty(size)
     pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
-    fill(shown.elements, shown.place, pixels, selected, visited, top, bottom)
+    fill(elements, place, pixels, selected, visited, top, bottom)
     where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
-    values, work = np.empty(BLOCK), workspace()
-    grey[:] = shown.background
+    shown, work = np.empty(BLOCK), workspace()
+    grey[:] = background
     count = 0
     for k in range(size):
         if element[k] >= 0:
             where[count], row[count], col[count] = k, at[0, k], at[1, k]
             count += 1
         if count == BLOCK or (k == size - 1 and count > 0):
-            sample(shown.pattern, row[:count], col[:count], values[:count], work)
+            sample(pattern, row[:count], col[:count], shown[:count], work)
             for n in range(count):
-                grey[where[n]] = values[n]
+                grey[where[n]] = shown[n]
             count = 0
     return grey

@@ -57,7 +57,7 @@ class CalibrationOptions:
     Parameters
     ----------
     degrees
-        Total degrees of S to compare, ascending, from 2 on, until the criterion has risen twice.
+        Total degrees of S to compare, ascending, from 2 on, until the criterion rises two times.
     rotations
         Whether the target may turn a little between photographs; only where shifts are not
         known.
@@ -102,7 +102,7 @@ def calibrate(
         directions.
     shifts
         (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
-        goes into S. Not needed: without them the affine part of S can't be seen and is zero.
+        goes into S. Not needed: without them the affine part of S isn't observable and is zero.
     options
         How.
     progress
@@ -281,7 +281,7 @@ def _require_matches(fit: Fit) -> None:
 
 
 def _require_shifts(poses: Sequence[Pose]) -> None:
-    """Raise InputError unless the shifts span the plane: S can't be told from them otherwise."""
+    """Raise InputError unless the shifts span the plane: they don't determine S otherwise."""
     shifts = np.array([pose.shift for pose in poses])
     along, across = np.linalg.svd(shifts, compute_uv=False)
     longest = float(np.hypot(*shifts.T).max())

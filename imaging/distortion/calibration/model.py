@@ -45,7 +45,7 @@ class PolynomialModel:
         Total degree, at least 1.
     fixed
         How many terms of each component are zero: 3, the affine ones, where shifts are not
-        known; 1, the constant, where they are; 0 if all can be seen.
+        known; 1, the constant, where they are; 0 if all are observable.
     """
 
     shape: tuple[int, int]

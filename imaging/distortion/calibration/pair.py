@@ -1,7 +1,7 @@
 """A lens from two images of one scene, without and with its distortion.
 
 Such pairs are made in a computer, or by two lenses one of which is ideal. The target doesn't move,
-so all of S can be seen, its affine part included.
+so all of S is observable, its affine part included.
 """
 
 from __future__ import annotations
