@@ -47,7 +47,8 @@ def quantise(image: NDArray[Any], bits: int) -> NDArray[np.uint8] | NDArray[np.u
     if not 1 <= bits <= 16:
         raise InputError(f"expected 1 to 16 bits, got {bits}")
     levels = np.rint(np.clip(image, 0.0, 1.0) * (2**bits - 1))
-    return levels.astype(np.uint8 if bits <= 8 else np.uint16)
+    dtype: Any = np.uint8 if bits <= 8 else np.uint16
+    return np.asarray(levels, dtype)
 
 
 EDGE_POINTS = 233  # a Fibonacci number

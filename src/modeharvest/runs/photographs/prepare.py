@@ -286,13 +286,14 @@ def calibrated_lens(folder: Path) -> Optics:
         if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
             raise InputError("expected a polynomial in distortion.json beside it, got another kind")
         fixed = int(content["fixed"])
+        arrays: dict[str, Any] = {name: np.array(content[name], np.float64) for name in _ARRAYS}
         calibration = Calibration(
             distortion=distortion,
             coefficients=distortion.coefficients[:, fixed:].ravel(),
             model=PolynomialModel(distortion.shape, distortion.degree, fixed),
             trials=tuple(DegreeTrial(**trial) for trial in content["trials"]),
             noise_sd=float(content["noise_sd"]),
-            **{name: np.array(content[name], dtype=np.float64) for name in _ARRAYS},
+            **arrays,
         )
         return Optics(distortion, calibration)
 
