@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,22 +91,21 @@ def correlate(
         If both strain and guess are given, or the guess isn't one for the ansatz.
     """
     options = options or CorrelationOptions()
-    clock, levels = _Clock(), options.levels
+    course, levels = _Course(options, progress), options.levels
     a = _with_gain_and_offset(ansatz, _initial_guess(pair, ansatz, strain, guess), pair)
     smoothing: FinalSmoothing | None = None
     history: tuple[Iteration, ...] = ()
     if options.final_smoothing_px is None and len(levels) > 1:
         coarse = _useful(levels[:-1], ansatz, pair.grid)
-        steps = _Steps(progress, len(coarse) + 1, options.gauss_newton)
-        rough = _coarse_to_fine(pair, ansatz, a, coarse, options.order or 5, options, steps, clock)
-        binned = rough.search.pair.grid.pixel_size / pair.grid.pixel_size
+        course.count = len(coarse) + 1
+        rough = course.through(coarse, pair, ansatz, a, options.order or 5)
         found = make_result(rough.search.ansatz, rough.search.pair.grid, rough.found)
+        binned = found.grid.pixel_size / pair.grid.pixel_size
         smoothing = FinalSmoothing.of(pair, binned * found.model_error_px)
         a, history, levels = rough.unknowns, rough.found.history, levels[-1:]
-        steps = replace(steps, first=len(coarse))
     else:
         levels = _useful(levels, ansatz, pair.grid)
-        steps = _Steps(progress, len(levels), options.gauss_newton)
+        course.count = len(levels)
         if options.final_smoothing_px:
             smoothing = FinalSmoothing.given(pair, options.final_smoothing_px)
     if smoothing is not None and smoothing.blur_px > 0.0:
@@ -114,12 +113,12 @@ def correlate(
         ansatz = replace(ansatz, brightness=Brightness())  # which local normalisation takes away
     size_px = speckle_size(pair.reference, pair.mask)
     order = options.order or (5 if size_px >= _FINE_PX else 11)
-    clock.lap("check")
-    reached = _coarse_to_fine(pair, ansatz, a[: ansatz.size], levels, order, options, steps, clock)
-    result, reweighted = _assessed(reached, pair, size_px, options, clock)
-    progress(steps.count, steps.count, "correlate")
+    course.lap("check")
+    reached = course.through(levels, pair, ansatz, a[: ansatz.size], order)
+    result, reweighted = _assessed(reached, pair, size_px, course)
+    progress(course.count, course.count, "correlate")
     history = (*history, *reached.found.history, *reweighted)
-    return replace(result, final_smoothing=smoothing, history=history, timings_s=clock.laps)
+    return replace(result, final_smoothing=smoothing, history=history, timings_s=course.laps)
 
 
 def best_fit(
@@ -211,7 +210,7 @@ def fit_displacement(
         If sizes differ, the mask is empty or the displacement is NaN inside it.
     """
     options = options or GaussNewtonOptions()
-    clock = _Clock()
+    course = _Course(CorrelationOptions(gauss_newton=options), progress)
     guess = ansatz.checked(guess)
     ansatz = replace(ansatz, brightness=Brightness())  # of which a displacement says nothing
     target = np.asarray(displacement, dtype=np.float64)
@@ -231,10 +230,10 @@ def fit_displacement(
         guess[: ansatz.size],
         options,
         options.tolerance_px,
-        on_iteration=_Steps(progress, 1, options).on(0),
+        on_iteration=course.report,
     )
-    clock.lap("iterate")
-    return replace(make_result(ansatz, grid, found), history=found.history, timings_s=clock.laps)
+    course.lap("iterate")
+    return replace(make_result(ansatz, grid, found), history=found.history, timings_s=course.laps)
 
 
 def _initial_guess(
@@ -251,97 +250,80 @@ def _initial_guess(
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
-    """Where some levels have led.
-
-    Parameters
-    ----------
-    search, found, used
-        The last level, the minimum there with all levels' history, and its pixels.
-    unknowns
-        (size,) of the whole ansatz.
-    """
+    """The minimum on a level with all steps to it, its pixels, and the whole ansatz' unknowns."""
 
     search: LevelSearch
-    level: Level
     found: Minimum
     used: Assembly
     unknowns: FloatArray
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """Reports progress; ``first`` of ``count`` levels are done."""
+class _Course:
+    """A correlation on its way: its options, its progress, wall-clock seconds of each step."""
 
-    progress: Progress
-    count: int
-    options: GaussNewtonOptions
-    first: int = 0
+    def __init__(self, options: CorrelationOptions, progress: Progress) -> None:
+        self.options, self.progress = options, progress
+        self.count, self.done = 1, 0
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
 
-    def on(self, level: int) -> Callable[[int], None]:
-        """What is called with the number of each iteration on a level."""
-        most = self.options.max_iterations + 1
-        done = self.first + level
-        return lambda number: self.progress(done + number / most, self.count, "correlate")
+    def lap(self, step: str) -> None:
+        """Note that a step is done."""
+        now = time.perf_counter()
+        self.laps[step], self._last = now - self._last, now
 
+    def report(self, number: int) -> None:
+        """Tell the listener of an iteration."""
+        most = self.options.gauss_newton.max_iterations + 1
+        self.progress(self.done + number / most, self.count, "correlate")
 
-def _coarse_to_fine(
-    pair: ImagePair,
-    ansatz: Ansatz,
-    a: FloatArray,
-    levels: tuple[Level, ...],
-    order: int,
-    options: CorrelationOptions,
-    steps: _Steps,
-    clock: _Clock,
-) -> _Reached:
-    """Go through levels; on the last one all unknowns are sought, and found as closely as asked."""
-    before = a
-    history: tuple[Iteration, ...] = ()
-    for k, level in enumerate(levels):
-        search = _level_search(
-            pair, ansatz, level, level is levels[-1], order, options, steps.on(k)
+    def through(
+        self,
+        levels: tuple[Level, ...],
+        pair: ImagePair,
+        ansatz: Ansatz,
+        a: FloatArray,
+        order: int,
+    ) -> _Reached:
+        """Go through levels; on the last one all unknowns are sought, to the full tolerance."""
+        before = a
+        history: tuple[Iteration, ...] = ()
+        for level in levels:
+            search = self._search(level, pair, ansatz, level is levels[-1], order)
+            self.lap(f"prepare level {level.factor}")
+            n = search.ansatz.size
+            before = np.append(search.lower_cost(a[:n], before[:n]), a[n:])
+            found, used = search.minimum(before[:n])
+            self.lap(f"iterate level {level.factor}")
+            history += found.history
+            a = np.append(found.unknowns, a[n:])
+            self.done += 1
+            if found.outcome in WITHOUT_RESULT:
+                break
+        return _Reached(search, replace(found, history=history), used, a)
+
+    def _search(
+        self, level: Level, pair: ImagePair, ansatz: Ansatz, finest: bool, order: int
+    ) -> LevelSearch:
+        """Prepare a level of the images, and what to look for there.
+
+        Where gain or offset are unknowns, coarse levels see locally normalised images: what the
+        brightness could absorb there is much of the blurred speckle itself.
+        """
+        limits = self.options.gauss_newton
+        normalised = ansatz.brightness.size > 0 and not finest
+        order = order if level == FULL else min(order, 5)
+        coarse_px = limits.coarse_tolerance_px * level.factor
+        return LevelSearch(
+            level_pair(pair, level, self.options.edge_px, order, normalised=normalised),
+            ansatz if finest else replace(ansatz, brightness=Brightness()),
+            level,
+            0.0 if finest else _EIGENVALUE_CUTOFF,
+            limits.tolerance_px if finest else coarse_px,
+            coarse_px,
+            limits,
+            self.report,
         )
-        clock.lap(f"prepare level {level.factor}")
-        n = search.ansatz.size
-        before = np.append(search.lower_cost(a[:n], before[:n]), a[n:])
-        found, used = search.minimum(before[:n])
-        clock.lap(f"iterate level {level.factor}")
-        history += found.history
-        a = np.append(found.unknowns, a[n:])
-        if found.outcome in WITHOUT_RESULT:
-            break
-    return _Reached(search, level, replace(found, history=history), used, a)
-
-
-def _level_search(
-    pair: ImagePair,
-    ansatz: Ansatz,
-    level: Level,
-    finest: bool,
-    order: int,
-    options: CorrelationOptions,
-    report: Callable[[int], None],
-) -> LevelSearch:
-    """Prepare a level of the images, and what to look for there.
-
-    Where gain or offset are unknowns, coarse levels see locally normalised images: what the
-    brightness could absorb there is much of the blurred speckle itself.
-    """
-    normalised = ansatz.brightness.size > 0 and not finest
-    coarse_px = options.gauss_newton.coarse_tolerance_px * level.factor
-    return LevelSearch(
-        level_pair(
-            pair, level, options.edge_px, order if level == FULL else min(order, 5),
-            normalised=normalised,
-        ),
-        ansatz if finest else replace(ansatz, brightness=Brightness()),
-        level.factor,
-        0.0 if finest else _EIGENVALUE_CUTOFF,
-        options.gauss_newton.tolerance_px if finest else coarse_px,
-        coarse_px,
-        options.gauss_newton,
-        report,
-    )  # fmt: skip
 
 
 def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple[Level, ...]:
@@ -376,19 +358,6 @@ def _with_gain_and_offset(ansatz: Ansatz, guess: FloatArray, pair: ImagePair) ->
     return guess
 
 
-class _Clock:
-    """Wall-clock seconds of one stage after another."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.laps[stage] = now - self._last
-        self._last = now
-
-
 def make_result(
     ansatz: Ansatz, grid: PixelGrid, found: Minimum, how: Propagation | None = None
 ) -> Result:
@@ -418,38 +387,24 @@ def make_result(
 
 
 def _assessed(
-    reached: _Reached, pair: ImagePair, size_px: float, options: CorrelationOptions, clock: _Clock
+    reached: _Reached, pair: ImagePair, size_px: float, course: _Course
 ) -> tuple[Result, tuple[Iteration, ...]]:
     """Test the residual, and move on to where another gradient weighs it, if it is to.
 
-    Parameters
-    ----------
-    reached, pair
-        The least-squares minimum on the last level, and the whole images.
-    size_px
-        Of the speckle [px].
-    options
-        How to correlate.
-    clock
-        Of the laps.
-
-    Returns
-    -------
-    result, history
-        The further steps alone.
+    Returns the result, and the further steps alone.
     """
     result = _result(reached, reached.found, size_px)
-    clock.lap("assess the residual")
-    weighting = _weighting(result, size_px, options)
-    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
-    if reached.level != FULL or result.outcome in without or weighting.is_least_squares:
-        return result, ()
+    course.lap("assess the residual")
+    weighting = _weighting(result, size_px, course.options)
     search, used, found = reached.search, reached.used, reached.found
+    without = (*WITHOUT_RESULT, Outcome.LOCAL_MINIMUM)
+    if search.level != FULL or result.outcome in without or weighting.is_least_squares:
+        return result, ()
     weights = instrument(weighting, pair, search.pair, used, found.unknowns)
     found, how = search.reweighed(found, used, weights)
     weighted = (weighting, how) if found.outcome is Outcome.CONVERGED else ()
     result = _result(reached, found, size_px, *weighted)
-    clock.lap("reweight")
+    course.lap("reweight")
     return result, found.history
 
 

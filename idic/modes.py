@@ -98,10 +98,9 @@ class ModeFamily:
                 f"mode family {self.name!r}: expected offset ({rows},) and start ({m},), got "
                 f"{self.offset.shape} and {self.start.shape}"
             )
-        if not self.names:
-            object.__setattr__(self, "names", tuple(f"a{k + 1}" for k in range(m)))
-        if not self.units:
-            object.__setattr__(self, "units", ("-",) * m)
+        names = tuple(self.names) or tuple(f"a{k + 1}" for k in range(m))
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "units", tuple(self.units) or ("-",) * m)
         if len(self.names) != m or len(self.units) != m:
             raise InputError(
                 f"mode family {self.name!r}: expected {m} names and units, got "

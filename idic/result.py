@@ -6,13 +6,13 @@ Null is infinity, or NaN.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict, ansatz_to_dict
+from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict
 from modeharvest.idic.solver.final_smoothing import FinalSmoothing
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
@@ -24,6 +24,7 @@ from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, write_json
+from modeharvest.util.typed import to_plain
 
 FORMAT = "modeharvest-result-5"
 
@@ -301,71 +302,45 @@ def _axes(grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
 
 
 def result_to_dict(result: Result) -> dict[str, Any]:
-    """Everything a result holds, and what it means in words."""
-    weighting, smoothing = result.weighting, result.final_smoothing
-    return {
+    """Everything a result holds but its timings, and what it means in words."""
+    content: dict[str, Any] = {name: to_plain(getattr(result, name)) for name in _STORED}
+    weighting = result.weighting
+    content["weighting"] |= {
+        "gradient": weighting.gradient.value,
+        "explanation": weighting.sentence,
+    }
+    return content | {
         "outcome": result.outcome.value,
         "explanation": result.outcome.explanation,
         "unknowns": dict(zip(result.names, map(float, result.unknowns), strict=True)),
         "units": list(result.ansatz.units),
-        "residual_rms": _finite(result.residual_rms),
-        "pixels": result.pixels,
-        "outside_image": result.outside_image,
-        "condition_number": _finite(result.condition_number),
-        "history": [{k: _finite(v) for k, v in vars(s).items()} for s in result.history],
-        "residual_correlation": _finite(result.residual_correlation),
-        "residual_lags_px": list(result.residual_lags_px),
-        "decorrelated_fraction": _finite(result.decorrelated_fraction),
-        "weighting": {
-            "gradient": weighting.gradient.value,
-            "blur_px": weighting.blur_px,
-            "speckle_size_px": _finite(weighting.speckle_size_px),
-            "explanation": weighting.sentence,
-        },
-        "slope_square": _finite(result.slope_square),
-        "weight_square": _finite(result.weight_square),
-        "noise_transfer": vars(result.noise_transfer),
-        "order": result.order,
-        "final_smoothing": smoothing and {k: _finite(v) for k, v in vars(smoothing).items()},
-        "grid": vars(result.grid),
-        "ansatz": ansatz_to_dict(result.ansatz),
-        "inverse": [[_finite(float(v)) for v in row] for row in result.inverse],
     }
 
 
 def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
     """Make the arguments of the result that :func:`result_to_dict` described."""
+    numbers = {name: _or(np.nan if name in _UNKNOWN else np.inf, content[name]) for name in _STORED}
     weighting, smoothing = content["weighting"], content["final_smoothing"]
-    plain = ("pixels", "outside_image", "order")
+    size_px = _or(np.inf, weighting["speckle_size_px"])
     steps = ({k: _or(np.inf, v) for k, v in step.items()} for step in content["history"])
-    return {
-        **{name: content[name] for name in plain},
+    return numbers | {
         "ansatz": ansatz_from_dict(content["ansatz"]),
         "grid": PixelGrid(**content["grid"]),
         "unknowns": np.array(list(content["unknowns"].values())),
         "inverse": np.array([[_or(np.inf, v) for v in row] for row in content["inverse"]]),
-        "residual_rms": _or(np.inf, content["residual_rms"]),
         "outcome": Outcome(content["outcome"]),
-        "condition_number": _or(np.inf, content["condition_number"]),
         "history": tuple(Iteration(**step) for step in steps),
-        "residual_correlation": _or(np.nan, content["residual_correlation"]),
         "residual_lags_px": tuple(content["residual_lags_px"]),
-        "decorrelated_fraction": _or(np.nan, content["decorrelated_fraction"]),
-        "slope_square": _or(np.inf, content["slope_square"]),
-        "weight_square": _or(np.inf, content["weight_square"]),
         "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
-        "weighting": Weighting(
-            Gradient(weighting["gradient"]),
-            weighting["blur_px"],
-            _or(np.inf, weighting["speckle_size_px"]),
-        ),
+        "weighting": Weighting(Gradient(weighting["gradient"]), weighting["blur_px"], size_px),
         "final_smoothing": smoothing
         and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),
     }
 
 
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+_STORED = tuple(f.name for f in fields(Result) if f.name != "timings_s")
+_UNKNOWN = ("residual_correlation", "decorrelated_fraction")
+"""Null is NaN there, and infinity elsewhere."""
 
 
 def _or(missing: float, value: Any) -> Any:

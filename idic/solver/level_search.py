@@ -27,7 +27,7 @@ from modeharvest.idic.solver.gauss_newton import (
     StepLength,
     minimise,
 )
-from modeharvest.idic.solver.pyramid import LevelPair
+from modeharvest.idic.solver.pyramid import Level, LevelPair
 from modeharvest.idic.solver.weighting import Propagation, root
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray
@@ -51,8 +51,8 @@ class LevelSearch:
         Its images.
     ansatz
         The kinematics.
-    factor
-        Its binning.
+    level
+        Its binning and blur.
     eigenvalue_cutoff
         Directions less determined than this share of the best one stay as they are [-].
     tolerance_px, rough_px
@@ -65,7 +65,7 @@ class LevelSearch:
 
     pair: LevelPair
     ansatz: Ansatz
-    factor: int
+    level: Level
     eigenvalue_cutoff: float
     tolerance_px: float
     rough_px: float
@@ -130,7 +130,7 @@ class LevelSearch:
             return used.images(a, *images, False, instrument)
 
         how = Propagation.of(matrix, found.equations.matrix)
-        length = step_length(self.ansatz, used.grid, used.mask, self.factor)
+        length = step_length(self.ansatz, used.grid, used.mask, self.level.factor)
         there = root(evaluate, how.slope, length, found, self.options, self.on_iteration)
         return there, how
 
@@ -169,11 +169,11 @@ class LevelSearch:
     ) -> Minimum:
         return minimise(
             partial(self._equations, assembly),
-            step_length(self.ansatz, assembly.grid, assembly.mask, self.factor),
+            step_length(self.ansatz, assembly.grid, assembly.mask, self.level.factor),
             start,
             self._limits(assembly),
             tolerance,
-            self.factor,
+            self.level.factor,
             self.on_iteration,
             curvature,
             self.eigenvalue_cutoff,
