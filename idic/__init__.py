@@ -2,7 +2,7 @@
 
 Data flow one way:
 
-    pair, ansatz --> solver --> correlate --> result --> uncertainty
+    image pair, ansatz --> solver --> correlate --> result --> uncertainty
     local, spectra --> modes and an initial guess
     photograph: what photographs show, and all of the above on them
 """

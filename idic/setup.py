@@ -129,8 +129,8 @@ class PhotographOptions(AnsatzOptions):
 class SquareLatticeOptions(AnsatzOptions):
     """Table ``[correlation]`` of a virtual experiment.
 
-    The defaults are the paper's (section "Virtual Experiments"): in square stacking 42 + 28 unknowns
-    of v0 and v1, and the mode's 7 make 77.
+    The defaults are the paper's (section "Virtual Experiments"): in square stacking 42 + 28
+    unknowns of v0 and v1, and the mode's 7 make 77.
 
     Parameters
     ----------
