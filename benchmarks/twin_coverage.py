@@ -151,7 +151,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/twin"))
     parser.add_argument("--name", default="deformed_1270")
     options = parser.parse_args()
-    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # where workers find FUNCTION
+    here = str(Path(__file__).parent)  # where workers find FUNCTION
+    os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
     TwinRun(
         Case.read("paper-real-twin"), options.folder, solution=shipped_solution("paper-real-twin")
     ).all()
