@@ -2,9 +2,8 @@
 
 Where pixels average over an aperture, the reference image is exact in Fourier space away from the
 edge of the material. A deformed image is summed over the points of a Gauss rule in each pixel of
-the *deformed* frame, each point found in the mesh and evaluated exactly; the rule has as many
-points as keep its error below :data:`TOLERANCE`. Near an edge, both images average evenly
-scattered points, some of them material and some background.
+the *deformed* frame, as many as keep the error below :data:`TOLERANCE`, each found in the mesh and
+evaluated exactly. Near an edge, both images average evenly scattered points.
 """
 
 from __future__ import annotations
@@ -140,14 +139,7 @@ class ImageRecord:
 class Camera:
     """A lens and a sensor that expose images into a folder.
 
-    Parameters
-    ----------
-    spec
-        The sensor, its bits, the lens.
-    points
-        The ideal positions that its pixels show; None for a perfect lens.
-    folder
-        Where the images go.
+    ``points`` are the ideal positions that the pixels show; None for a perfect lens.
     """
 
     spec: ImagingSpec
@@ -163,16 +155,9 @@ class Camera:
     def expose(
         self, ideal: Rendering, scene: ImagedState, name: str, mask_name: str
     ) -> ImageRecord:
-        """Write what the camera makes of an image.
+        """Write what the camera makes of a scene, of which a perfect lens shows ``ideal``.
 
-        Parameters
-        ----------
-        ideal
-            What a perfect lens shows.
-        scene
-            The specimen before the camera.
-        name, mask_name
-            Of the image, and of its mask's file. The name also seeds noise and flicker.
+        The image's ``name`` also seeds noise and flicker.
         """
         observed = self._through_lens(ideal, scene)
         sensor, bits, mask = self.spec.sensor, self.spec.bits, observed.mask

@@ -107,14 +107,8 @@ class SnapshotRecord(ImageRecord):
 class ImageSet:
     """A finished set on disk; images and truth are read, and checked, when asked for.
 
-    A file that is missing, or not what was written, raises InputError.
-
-    Parameters
-    ----------
-    folder
-        Where the files are.
-    info
-        The content of ``images.json``.
+    A file that is missing, or not what was written, raises InputError. ``info`` is the content of
+    ``images.json``.
     """
 
     folder: Path

@@ -236,11 +236,8 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
     Whole-number images are scaled to fractions of their type's full scale (uint8: /255,
     uint16: /65535); floating-point images are taken as they are. Row 0 is at the top.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, cut short, not one plane image of 8 or 16 bits or floats, holds
-        NaN or infinity, or all its pixels are equal.
+    InputError if the file is missing, cut short, not one plane image of 8 or 16 bits or floats,
+    holds NaN or infinity, or all its pixels are equal.
     """
     stored = read_stored(Path(path), single=True)
     require_grey_levels(stored.levels, path)

@@ -173,13 +173,7 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
 
 
 def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
-    """The frame, its grey levels on the reference's scale.
-
-    Raises
-    ------
-    InputError
-        If its size or its bit depth is another one.
-    """
+    """The frame, its grey levels on the reference's scale; InputError for another size or depth."""
     require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
     other = _other_depth(reference, frame)
     if other:
@@ -201,11 +195,8 @@ def read_reference(path: Path | str, mask: BoolArray | None = None) -> Photograp
 def read_frame(path: Path | str, reference: Photograph) -> Photograph:
     """Read one frame and compare it with the reference.
 
-    Raises
-    ------
-    InputError
-        One line that names the file, if it is damaged, blank, or of another size or bit depth.
-        A sequence catches it, skips the frame, reports the line and goes on.
+    InputError, in a line that names the file, if it is damaged, blank, or of another size or bit
+    depth: a sequence skips the frame, reports the line and goes on.
     """
     frame = require_alike(reference, read_photograph(path))
     return _with_notes(frame, require_usable(frame))
