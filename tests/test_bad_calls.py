@@ -71,12 +71,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("[imaging]\npixel_size = inf", "a finite number, got inf"),
         ("[imaging]\naffine_distortion = 1", "affine_distortion: expected true or false, got 1"),
         ("[imaging]\nshape = [0, 0]", "a shape of 8 x 8 px"),
-        ("[imaging.speckle]\nblur_px = 1e9", "at most 100 px"),
-        ("[imaging.speckle]\nstandard_deviation = 1e-300", "from 0.0001"),
+        ("[imaging.speckle]\nblur_px = 1e9", "a blur [px] of 0.75 to 100"),
+        ("[imaging.speckle]\nstandard_deviation = 1e-300", "[cycles/px] of 0.0001"),
         ("[correlation]\nv0_degree = 1000", "v0_degree from 1 and v_degree from 0 to 20"),
         ("[correlation]\nedge_px = 1_000_000_000", "edge_px from 0 to 100"),
         ("[correlation]\ngradient_blur_px = 1e9", "of 0 to 100 px"),
-        ("[calibration]\nstage_sd_px = 1e9", "stage_sd_px of 0 to 1000 px"),
+        ("[calibration]\nstage_sd_px = 1e9", "stage_sd_px of 0 to 1000"),
     ],
 )
 def test_a_value_that_means_nothing_is_refused(
