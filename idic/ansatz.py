@@ -250,8 +250,8 @@ class Ansatz:
             part; v0x = -strain (x - centre), so that the ends of the cellular part move by half
             the shortening. Positive in compression.
         amplitude
-            The constant that every v_i starts with [mm]; not zero, because the modes could
-            not be seen then. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
+            The constant that every v_i starts with [mm]; not zero, because the modes would
+            not be observable. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
         """
         a = np.zeros(self.size)
         a[self.v0_slice(0)][1] = -strain * self.domain.half[0]
@@ -262,7 +262,7 @@ class Ansatz:
 
     def v0(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2): the slow field [mm]; positions as in :meth:`displacement`."""
-        a, (x, y) = self.checked(a), _positions(x, y)
+        a, (x, y) = self.checked(a), open_grid(x, y)
         space = self.v0_space
         # Each component in one piece: faster to work on.
         components = np.empty((2, *np.broadcast_shapes(x.shape, y.shape)))
@@ -272,12 +272,12 @@ class Ansatz:
 
     def v(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(...): the amplitude of the mode number i (from 0) [mm]."""
-        a, (x, y) = self.checked(a), _positions(x, y)
+        a, (x, y) = self.checked(a), open_grid(x, y)
         return self.v_space.evaluate(a[self.v_slice(i)], x, y)
 
     def phi(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2): the mode number i (from 0) [-]."""
-        a, (x, y) = self.checked(a), _positions(x, y)
+        a, (x, y) = self.checked(a), open_grid(x, y)
         return self.modes[i].evaluate(a[self.phi_slice(i)], x, y)
 
     def fluctuation(self, i: int, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
@@ -312,7 +312,7 @@ class Ansatz:
         self, a: ArrayLike, x: ArrayLike, y: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
         """1 + b [-] and c [grey levels]: f = (1 + b) g(x + u) + c; 1 and 0 if not unknown."""
-        a, (x, y) = self.checked(a), _positions(x, y)
+        a, (x, y) = self.checked(a), open_grid(x, y)
         return self.brightness.evaluate(self.domain, a[self.phi_offset(len(self.modes)) :], x, y)
 
     def sensitivities(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
@@ -322,7 +322,7 @@ class Ansatz:
 
         Meant for tests and for few points; the correlation itself never forms it.
         """
-        a, (x, y) = self.checked(a), _positions(x, y)
+        a, (x, y) = self.checked(a), open_grid(x, y)
         x, y = np.broadcast_arrays(x, y)
         result = np.zeros((*x.shape, 2, self.size))
         for c in (0, 1):
@@ -335,8 +335,8 @@ class Ansatz:
         return result
 
 
-def _positions(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two one-dimensional axes as an open grid; anything else as it is."""
+def open_grid(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two one-dimensional axes as an open grid; anything else unchanged."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if x.ndim == 1 and y.ndim == 1:
         return x[None, :], y[:, None]

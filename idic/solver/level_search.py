@@ -27,6 +27,7 @@ from modeharvest.idic.solver.gauss_newton import (
     StepLength,
     minimise,
 )
+from modeharvest.idic.solver.noise import subsampled
 from modeharvest.idic.solver.pyramid import Level, LevelPair
 from modeharvest.idic.solver.weighting import Propagation, root
 from modeharvest.imaging.grid import PixelGrid
@@ -36,9 +37,6 @@ _ROUNDS, _SETTLED = 5, 1e-2
 """The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 _PLENTY, _STRIDE = 1000, 4
 """Pixels an unknown that suffice to lead the way, and of how many rows one is taken then."""
-
-_ACROSS = 128
-"""Rows and columns, at most, over which the length of a step is taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,9 +203,8 @@ def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -
     factor
         Binning: a binned px is so many px.
     """
-    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
-    some, x, y = mask[np.ix_(rows, cols)], grid.x[cols], grid.y[rows]
+    rows, cols, some = subsampled(mask)
+    x, y = grid.x[cols], grid.y[rows]
     per_px = factor / grid.pixel_size
 
     @lru_cache(maxsize=2)

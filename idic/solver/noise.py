@@ -194,9 +194,7 @@ class NoiseTransfer:
         order
             Of the spline.
         """
-        rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-        rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
-        some = mask[np.ix_(rows, cols)]
+        rows, cols, some = subsampled(mask)
         if not some.any():
             return cls()
         x, y = grid.x[cols], grid.y[rows]
@@ -216,6 +214,13 @@ class NoiseTransfer:
             float(0.5 * np.mean(s_x * w_y + w_x * s_y)),
             float(np.mean(1.0 / np.maximum(det, _LEAST_DET))),
         )
+
+
+def subsampled(mask: BoolArray) -> tuple[NDArray[np.intp], NDArray[np.intp], BoolArray]:
+    """At most 128 rows and columns of a mask's bounding box, and the mask there."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows, cols = rows[:: len(rows) // _ACROSS + 1], cols[:: len(cols) // _ACROSS + 1]
+    return rows, cols, mask[np.ix_(rows, cols)]
 
 
 def slope_noise(order: int, blur_px: float) -> float:

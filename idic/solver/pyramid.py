@@ -1,4 +1,4 @@
-"""Image pyramid: a pair of images binned, blurred and locally normalised over its material.
+"""FloatImage pyramid: a pair of images binned, blurred and locally normalised over its material.
 
 A level bins the images and blurs them. Where masks are given, binning and blur are normalised
 by them, so that no grey level of a hole or of the surroundings leaks into the material.
@@ -18,19 +18,17 @@ from numpy.typing import NDArray
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, border_reach
-from modeharvest.util.arrays import BoolArray
+from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.compiled import compiled, readable
 from modeharvest.util.errors import InputError
-
-Float32Image = NDArray[np.float32]
 
 _ENDS = 4.0
 """Standard deviations after which the Gaussian is cut off."""
 
 
 def binned(
-    image: Float32Image, weight: BoolArray | None, factor: int
-) -> tuple[Float32Image, Float32Image]:
+    image: FloatImage, weight: BoolArray | None, factor: int
+) -> tuple[FloatImage, FloatImage]:
     """Means over blocks; incomplete blocks at the right and at the bottom are dropped.
 
     Parameters
@@ -54,7 +52,7 @@ def binned(
     return mean, share
 
 
-def blurred(image: Float32Image, sigma: float) -> Float32Image:
+def blurred(image: FloatImage, sigma: float) -> FloatImage:
     """Blur with a Gaussian; the outermost pixels are repeated beyond the border.
 
     Parameters
@@ -116,9 +114,6 @@ def _blur(image: Any, weights: Any, out: Any) -> None:
                 to[j] += w * (before[j] + after[j])
 
 
-Image = NDArray[Any]
-
-
 @dataclass(frozen=True)
 class Level:
     """One step from coarse to fine.
@@ -143,13 +138,13 @@ class Level:
 
 
 FULL = Level(1, 0.0)
-"""The images as they are."""
+"""The unfiltered images."""
 COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
 """Blurs of 24, 12, 6 and 0 px."""
 
 _FELT, _MOST = 2e-3, 1 / 16
-"""On the finest level no pixel counts that lands where the spline of g feels the mirror image
-beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic. What
+"""On the finest level no pixel counts that is mapped to where the spline of g feels the mirror
+image beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic. What
 is left of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in the
 strip left out, polynomials are extrapolated, and on small images that costs more than it mends."""
 _CONTINUED = 1.5
@@ -178,7 +173,7 @@ class LevelPair:
     """
 
     grid: PixelGrid
-    reference: Image
+    reference: FloatImage
     deformed: SplineImage
     mask: BoolArray
     valid: BoolArray | None
@@ -245,7 +240,7 @@ def eroded(mask: BoolArray, distance_px: int) -> BoolArray:
     return np.ascontiguousarray(mask)
 
 
-def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
+def _smooth(image: FloatImage, weight: BoolArray | None, level: Level) -> FloatImage:
     """Binned and blurred; where there is no material, a smooth continuation of the material."""
     if weight is None or weight.all():
         return blurred(binned(image, None, level.factor)[0], level.blur)
@@ -256,7 +251,7 @@ def _smooth(image: Image, weight: BoolArray | None, level: Level) -> Image:
     return filled
 
 
-def _continued(mean: Image, share: Image, blur: float) -> Image:
+def _continued(mean: FloatImage, share: FloatImage, blur: float) -> FloatImage:
     """Blur both, and divide; far from any material, its mean grey level.
 
     Parameters
@@ -275,7 +270,7 @@ def _continued(mean: Image, share: Image, blur: float) -> Image:
     return mean
 
 
-def _locally_normalised(image: Image, blur: float, around: float = _AROUND) -> Image:
+def _locally_normalised(image: FloatImage, blur: float, around: float = _AROUND) -> FloatImage:
     """The image less its local mean, over its local standard deviation."""
     around *= blur
     image = image - blurred(image, around)
@@ -283,7 +278,7 @@ def _locally_normalised(image: Image, blur: float, around: float = _AROUND) -> I
     return np.asarray(image / (contrast + 1e-3 * contrast.max()))
 
 
-def smoothed(image: Image, mask: BoolArray | None, blur: float) -> Image:
+def smoothed(image: FloatImage, mask: BoolArray | None, blur: float) -> FloatImage:
     """Blur an image over its material, and continue it beyond.
 
     Parameters
@@ -299,7 +294,7 @@ def smoothed(image: Image, mask: BoolArray | None, blur: float) -> Image:
 
 
 def locally_normalised(
-    image: Image, mask: BoolArray | None, blur: float, around: float = _AROUND
+    image: FloatImage, mask: BoolArray | None, blur: float, around: float = _AROUND
 ) -> NDArray[np.float32]:
     """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
 

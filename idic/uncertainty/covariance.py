@@ -23,6 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from modeharvest.idic.ansatz import open_grid
 from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.solver.assembly import Assembly, valid_pixels
 from modeharvest.idic.solver.final_smoothing import smoothed_pair
@@ -113,8 +114,8 @@ class MatchedImages:
     result
         Of the correlation.
     reference, deformed
-        (rows, cols) f, and g continued into its holes [grey levels]: as it is, g has edges at
-        its holes. A curvature that sees them is none of the cost's.
+        (rows, cols) f, and g continued into its holes [grey levels]: without that
+        g has edges at its holes, whose curvature is none of the cost's.
     used
         (rows, cols) True on the pixels that count.
     """
@@ -331,7 +332,7 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
     S = ansatz.sensitivities(a, x, y)
     slow = slice(0, 2 * ansatz.v0_space.size)
     modes = range(len(ansatz.modes))
-    x_open, y_open = _open(x, y)
+    x_open, y_open = open_grid(x, y)
     basis = ansatz.v_space.basis(*np.broadcast_arrays(x_open, y_open))
     amplitude, pattern = [], []
     for i in modes:
@@ -354,9 +355,3 @@ def _sd(sensitivity: FloatArray, covariance: FloatArray) -> FloatArray:
     variance = np.einsum("...n,nm,...m->...", sensitivity, known, sensitivity, optimize=True)
     touched = np.any(sensitivity[..., lost] != 0.0, axis=-1)
     return np.asarray(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
-
-
-def _open(x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two axes as an open grid; anything else as it is, like the ansatz does."""
-    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    return (x[None, :], y[:, None]) if x.ndim == y.ndim == 1 else (x, y)

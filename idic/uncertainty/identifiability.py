@@ -23,7 +23,7 @@ OBSERVABLE = 2.0
 
 @dataclass(frozen=True)
 class Combination:
-    """Unknowns that the images can hardly tell apart.
+    """Unknowns that the images hardly distinguish.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Identifiability:
         The worst-determined combinations of the others, the worst first.
     overlap
         For each mode the largest cosine between a displacement that its v_i and phi_i can make
-        and one that v0 can make [-]: 1 would mean that they can't be told apart.
+        and one that v0 can make [-]: 1 would mean that they are one.
     model_error_px
         Estimate, rms per component: residual over grey-level gradient [px].
     amplitude_px
