@@ -125,7 +125,7 @@ class ModeFamily:
     def fixed(self) -> ModeFamily:
         """The family whose only mode is this one's start: no parameters are left.
 
-        For images without a pattern, in which the mode's parameters can't be seen.
+        For images without a pattern, in which the mode's parameters aren't observable.
         """
         waves = self.waves(self.start).ravel()
         return ModeFamily(f"{self.name}, fixed", np.zeros((waves.size, 0)), waves, np.zeros(0))

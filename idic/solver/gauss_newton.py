@@ -2,7 +2,7 @@
 
 A full Gauss-Newton step is tried first. One that raises the cost is solved again from the
 stored matrix with more damping, until the cost falls. The matrix is scaled to a unit diagonal
-and decomposed into eigenvectors; directions the images can't tell anything about (the mode's
+and decomposed into eigenvectors; directions the images say nothing about (the mode's
 parameters where v is zero) get no step instead of an enormous one.
 
 Once steps are short, J'J hardly changes, and what it lacks of the Hessian makes convergence
@@ -314,15 +314,15 @@ def _ending(step: _TrialStep, number: int, limits: _Limits) -> Outcome | None:
 
 
 def corrected(matrix: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
-    """The matrix with the curvature seen along a step: matrix . step = change of the gradient.
+    """The matrix with the curvature observed along a step: matrix . step = change of the gradient.
 
-    As it was where the gradient tells of no positive curvature.
+    As it was where the gradient shows no positive curvature.
     """
-    pushed = matrix @ step
-    curvature, seen = float(step @ pushed), float(step @ change)
-    if not seen > _LEAST_CURVATURE * curvature > 0:
+    product = matrix @ step
+    curvature, observed = float(step @ product), float(step @ change)
+    if not observed > _LEAST_CURVATURE * curvature > 0:
         return matrix
-    lost, gained = np.outer(pushed, pushed) / curvature, np.outer(change, change) / seen
+    lost, gained = np.outer(product, product) / curvature, np.outer(change, change) / observed
     return np.asarray(matrix - lost + gained)
 
 

@@ -78,11 +78,11 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> C
                 f"doesn't explain (a noise of {np.sqrt(0.5 * left):.3g} grey levels); leave it out"
             )
         halves.append(0.5 * left)
-    sd, seen = float(np.sqrt(np.mean(halves))), estimated_noise(images[0], mask).sd
+    sd, estimate = float(np.sqrt(np.mean(halves))), estimated_noise(images[0], mask).sd
     source = f"measured from {len(images)} exposures of the reference"
-    if sd > _MOTION * seen:
+    if sd > _MOTION * estimate:
         source += (
-            f"; the reference's finest details show {seen:.2g} grey levels only: if anything "
+            f"; the reference's finest details show {estimate:.2g} grey levels only: if anything "
             "moved between the exposures, leave the repeats out"
         )
     return CameraNoise(sd, source)

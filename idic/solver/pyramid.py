@@ -144,9 +144,9 @@ COARSE_TO_FINE = (Level(8, 3.0), Level(4, 3.0), Level(2, 3.0), FULL)
 
 _FELT, _MOST = 2e-3, 1 / 16
 """On the finest level no pixel counts that is mapped to where the spline of g feels the mirror
-image beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic. What
-is left of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in the
-strip left out, polynomials are extrapolated, and on small images that costs more than it mends."""
+image beyond the border by more than 0.2 % of its pull: 8 px for a quintic spline, 5 for a cubic.
+The rest of it moves float images by 5e-6 px. At most a sixteenth of the image's shorter side: in
+the strip left out, polynomials are extrapolated, which costs more on small images than it mends."""
 _CONTINUED = 1.5
 """Blur that continues the material into holes on a level without blur of its own [binned px]."""
 

@@ -233,10 +233,10 @@ def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) 
     kernel(np.ascontiguousarray(residual), lags, sums, counts)
     products, pairs = sums.sum(axis=0), counts.sum(axis=0)
     variance = products[0, 0] / max(1.0, pairs[0, 0])
-    seen = pairs[:, 1:] > 0
-    if variance == 0.0 or not seen.any():
+    counted = pairs[:, 1:] > 0
+    if variance == 0.0 or not counted.any():
         return 0.0
-    found = products[:, 1:][seen] / pairs[:, 1:][seen] / variance
+    found = products[:, 1:][counted] / pairs[:, 1:][counted] / variance
     return float(np.sqrt(np.mean(found**2)))
 
 

@@ -23,7 +23,7 @@ Models, Wiley 1987, doi 10.1002/9780470316665 (instruments); H. Schreier, M. Sut
 
 Their slopes are taken once, at the least-squares minimum, and from there Newton steps lead to the
 root, which is a few hundredths of a pixel off. There is no cost that has to fall. The derivative
-of h'r is A = h'J, J being that of the residual; noise that pushes h'r with the covariance s^2 h'h
+of h'r is A = h'J, J being that of the residual; noise that perturbs h'r with the covariance s^2 h'h
 moves the root with s^2 A^-1 h'h A^-1.
 """
 
@@ -216,7 +216,7 @@ def _neighbours(
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """How what pushes h'r moves its root.
+    """How a perturbation of h'r moves its root.
 
     Parameters
     ----------
