@@ -1,1 +1,1 @@
-"""The minimiser: compiled passes over pixels, normal equations, Gauss-Newton, coarse to fine."""
+"""The minimiser: passes over pixels, normal equations, Gauss-Newton, coarse to fine; noise, residual test."""

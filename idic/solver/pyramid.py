@@ -1,4 +1,4 @@
-"""FloatImage pyramid: a pair of images binned, blurred and locally normalised over its material.
+"""Image pyramid: a pair of images binned, blurred and locally normalised over its material.
 
 A level bins the images and blurs them. Where masks are given, binning and blur are normalised
 by them, so that no grey level of a hole or of the surroundings leaks into the material.
