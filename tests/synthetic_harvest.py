@@ -31,7 +31,7 @@ from modeharvest.runs.photographs.results import (
     HarvestTruth,
     TruthCheck,
 )
-from modeharvest.validation.onset import Moment, find_buckling
+from modeharvest.validation.onset import ImageAmplitude, find_buckling
 
 FloatArray = NDArray[np.float64]
 
@@ -187,7 +187,7 @@ def harvest(
     )
 
 
-def moment(one: HarvestedFrame) -> Moment:
+def moment(one: HarvestedFrame) -> ImageAmplitude:
     """Its place in the time line."""
     seen = one.identifiability
-    return Moment(one.name, one.strain_x, seen.amplitude_px[0], seen.model_error_px, 0.01)
+    return ImageAmplitude(one.name, one.strain_x, seen.amplitude_px[0], seen.model_error_px, 0.01)

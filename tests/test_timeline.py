@@ -12,15 +12,15 @@ from manufactured import GRID
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.validation.onset import Moment, find_buckling, mean_strain
+from modeharvest.validation.onset import ImageAmplitude, find_buckling, mean_strain
 
 CRITICAL = 0.091
 
 
-def moment(strain: float) -> Moment:
+def moment(strain: float) -> ImageAmplitude:
     """A pitchfork of amplitude 100 px times the square root of the strain beyond."""
     size = 100.0 * np.sqrt(max(0.0, strain - CRITICAL))
-    return Moment(f"at {strain}", strain, 0.3 + size, 0.5, 0.01)
+    return ImageAmplitude(f"at {strain}", strain, 0.3 + size, 0.5, 0.01)
 
 
 def test_the_strain_is_bracketed_and_estimated() -> None:
@@ -28,7 +28,7 @@ def test_the_strain_is_bracketed_and_estimated() -> None:
     assert (found.before, found.after) == (0.08, 0.1)
     # The constant 0.3 px that isn't of the pitchfork moves the estimate a little.
     assert found.estimate == pytest.approx(CRITICAL, abs=2e-3)
-    assert "between strains of 8.00 % (at 0.08) and 10.00 %" in found.sentence
+    assert "between strains of 8.00 % (at 0.08) and 10.00 %" in found.text
 
 
 def test_an_unloading_is_not_taken_for_a_loading() -> None:
@@ -40,13 +40,13 @@ def test_an_unloading_is_not_taken_for_a_loading() -> None:
 def test_no_pattern_is_said(strains: tuple[float, ...]) -> None:
     found = find_buckling([moment(e) for e in strains])
     assert np.isnan(found.after)
-    assert "No image" in found.sentence
+    assert "No image" in found.text
 
 
 def test_a_pattern_from_the_beginning_is_said() -> None:
     found = find_buckling([moment(e) for e in (0.1, 0.12)])
     assert np.isnan(found.before)
-    assert "Every image" in found.sentence
+    assert "Every image" in found.text
 
 
 def test_mean_strain_is_that_of_the_slow_field() -> None:

@@ -136,7 +136,7 @@ class Campaign:
         """The cases as they get done, or fail for certain.
 
         A connection that breaks is made anew. Only where that fails is the scheduler gone:
-        whatever dask says of a case, no other conclusion is drawn from it
+        whatever dask reports of a case, no other conclusion is drawn from it
         (docs/decisions/0011-campaigns-on-busy-machines.md).
         """
         left, in_vain = list(cases), 0
@@ -160,7 +160,7 @@ class Campaign:
             left = cut_off
 
     def _gone(self, how: object) -> str:
-        """What is said when a scheduler doesn't come back."""
+        """The message where a scheduler doesn't come back."""
         done = len(self.cases) - len(self.missing())
         return (
             f"expected the dask scheduler to stay until all cases are done, but it went away; "
@@ -242,8 +242,8 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
     for name, values in axes.items():
         if name not in base:
             raise InputError(f"expected axes among {sorted(base)}, got {name!r}")
-        seen = [repr(value) for value in values]
-        if not seen or len(set(seen)) < len(seen):
+        found = [repr(value) for value in values]
+        if not found or len(set(found)) < len(found):
             raise InputError(f"expected different values of {name!r}, got {list(values)}")
     combinations = itertools.product(*axes.values())
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)

@@ -16,7 +16,7 @@ _FIT = 3
 
 
 @dataclass(frozen=True)
-class Moment:
+class ImageAmplitude:
     """One image of a test.
 
     Parameters
@@ -28,7 +28,7 @@ class Moment:
     amplitude_px
         Rms of v1 phi1 per component [px]; of several modes the root of their squares' sum.
     model_error_px
-        What the ansatz leaves over, rms per component [px].
+        Model error, rms per component [px].
     noise_px
         Standard deviation of v1 phi1 by the images' noise, rms per component [px]; of several
         modes as above.
@@ -42,7 +42,7 @@ class Moment:
 
     @property
     def has_pattern(self) -> bool:
-        """Whether the pattern stands out of noise and of what the ansatz leaves over."""
+        """Whether the pattern stands out of noise and model error."""
         return self.amplitude_px > OBSERVABLE * max(self.model_error_px, self.noise_px)
 
 
@@ -59,14 +59,14 @@ class Buckling:
         Strain at which the pattern begins if its amplitude grows with the square root of the
         strain beyond, as after a pitchfork bifurcation [-]; NaN with fewer than three images
         that have a pattern.
-    sentence
-        That in words.
+    text
+        That as text.
     """
 
     before: float
     after: float
     estimate: float
-    sentence: str
+    text: str
 
 
 def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
@@ -94,8 +94,8 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     )
 
 
-def find_buckling(moments: Sequence[Moment]) -> Buckling:
-    """Tell from a sequence of images when the pattern appeared.
+def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
+    """When the pattern appeared in a sequence of images.
 
     Parameters
     ----------
@@ -111,20 +111,20 @@ def find_buckling(moments: Sequence[Moment]) -> Buckling:
     first = shown[0]
     plain = [m for m in loading if not m.has_pattern and m.strain < first.strain]
     if not plain:
-        words = f"Every image shows the pattern, from a strain of {100 * first.strain:.2f} % on."
-        return Buckling(nan, first.strain, _pitchfork(shown), words)
+        text = f"Every image shows the pattern, from a strain of {100 * first.strain:.2f} % on."
+        return Buckling(nan, first.strain, _pitchfork(shown), text)
     before = plain[-1].strain
     estimate = _pitchfork(shown)
-    words = (
+    text = (
         f"The pattern appears between strains of {100 * before:.2f} % ({plain[-1].name}) and "
         f"{100 * first.strain:.2f} % ({first.name})."
     )
     if np.isfinite(estimate):
-        words += f" Its growth points back to {100 * estimate:.2f} %."
-    return Buckling(before, first.strain, estimate, words)
+        text += f" Its growth points back to {100 * estimate:.2f} %."
+    return Buckling(before, first.strain, estimate, text)
 
 
-def _pitchfork(shown: Sequence[Moment]) -> float:
+def _pitchfork(shown: Sequence[ImageAmplitude]) -> float:
     """Where the squared amplitude, taken for linear in the strain, begins."""
     if len(shown) < _FIT:
         return float("nan")

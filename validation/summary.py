@@ -35,7 +35,7 @@ _BRIGHTNESS = ("gain_min", "gain_max", "offset_min", "offset_max")
 
 @dataclass(frozen=True)
 class Expectation:
-    """An expected value, in words with its range, against the one obtained, and its source."""
+    """An expected value, as text with its range, against the one obtained, and its source."""
 
     quantity: str
     unit: str

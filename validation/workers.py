@@ -133,7 +133,7 @@ _PATIENCE_S = 30.0
 """How long to wait for a scheduler that does not answer: it may be on a busy machine."""
 _LIBRARIES = ("OMP", "MKL", "OPENBLAS")
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
-"""A worker has one thread: cores are shared out by cases. numba is told in each case, because
+"""A worker has one thread: cores are shared out by cases. numba has it set in each case, because
 this stands in the parent's own environment for a while, where numba must not change its mind."""
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
@@ -309,7 +309,7 @@ def _client_of(scheduler: str) -> Iterator[Any]:
     """A client of a scheduler that runs already."""
     from distributed import Client
 
-    for logger in ("distributed", "distributed.client"):  # what fails is said in one line
+    for logger in ("distributed", "distributed.client"):  # what fails is one line
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         client = _begun(Client, scheduler, timeout=_PATIENCE_S)
@@ -328,7 +328,7 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
     mark = folder.resolve() / f".seen-{uuid4().hex}"
     mark.touch()
     try:
-        answers = client.run(introduce, function, str(mark), on_error="return")
+        answers = client.run(handshake, function, str(mark), on_error="return")
     finally:
         mark.unlink(missing_ok=True)
     if not answers:
@@ -356,8 +356,8 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
             )
 
 
-def introduce(function: str, mark: str) -> tuple[str, str, bool]:
-    """What a worker says of itself: version, code, and whether it can write where a file is."""
+def handshake(function: str, mark: str) -> tuple[str, str, bool]:
+    """A worker's version, code, and whether it can write where a file is."""
     named(function)
     return (
         __version__,

@@ -5,7 +5,7 @@ the origin: their slope is the share of the wave that is left, T. Along the cent
 the measured over the true amplitude, as in the DIC Challenge; other rows, up to half a period away,
 make it less noisy. Over the columns T is smoothed by local quadratic regression in the logarithm
 of the period. A smoothed value's standard error comes from the scatter of the columns about the
-curve, neighbours taken for as dependent as they are seen to be.
+curve, neighbours as dependent as their autocorrelation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _WIDTH = 0.35
 _FEWEST_COLUMNS = 20
 """In a local regression, and for a field to be graded at all."""
 _POINTS = 240
-"""Periods at which the curve is told."""
+"""Periods of the curve."""
 _SPAN = 3.0
 """Ratio of the longest to the shortest period that a field has to cover at least."""
 _NO_MORE = 0.05
@@ -111,7 +111,7 @@ class Attenuation:
 
     @cached_property
     def period(self) -> FloatArray:
-        """(n,) periods at which the curve is told [px]."""
+        """(n,) periods of the curve [px]."""
         first, last = self.columns.period[[0, -1]]
         return np.asarray(np.geomspace(first, last, _POINTS))
 
@@ -213,7 +213,7 @@ def _regression(offset: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _memory(left: FloatArray) -> float:
-    """How many neighbouring columns tell the same, on average: 1 + 2 sum of autocorrelations."""
+    """Correlation length of neighbouring columns: 1 + 2 sum of autocorrelations."""
     size = np.sqrt(ndimage.uniform_filter1d(left**2, max(3, len(left) // 10)))
     z = left / np.maximum(size, np.finfo(float).tiny)
     lags = len(z) // 10

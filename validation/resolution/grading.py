@@ -51,9 +51,9 @@ class StarGrading:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know, in sentences."""
-        told = [f"not graded: {why}" for why in self.refused.values()]
-        return [*told, *(note for grade in self.grades for note in grade.notes)]
+        """What a reader has to know."""
+        refused = [f"not graded: {why}" for why in self.refused.values()]
+        return [*refused, *(note for grade in self.grades for note in grade.notes)]
 
 
 def grade_numbers(grade: StarGrade) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def _none_for_nan(value: Any) -> Any:
 
 
 _PARTS = 10
-"""Stretches of the image whose scatters tell how sure the noise floor is."""
+"""Stretches of the image whose scatters give the standard error of the noise floor."""
 _FEWEST_POINTS = 100
 _TOO_LOUD = 0.7
 """A scatter of the field without motion above this share of the star's is no noise."""
@@ -231,28 +231,28 @@ class StarGrade:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader has to know, in sentences."""
-        found, said = self.attenuation, []
+        """What a reader has to know."""
+        found, notes = self.attenuation, []
         low, high = found.columns.period[[0, -1]]
         if not np.isfinite(found.finest_px):
             above = np.nanmin(found.curve[0]) >= KEPT
             share = "less than 10 %" if above else "10 % or more"
-            said.append(
+            notes.append(
                 f"{self.name}: {share} of the amplitude is lost at all periods measured, "
                 f"{low:.4g} to {high:.4g} px, so that l10 is not known; nothing is extrapolated"
             )
         elif not np.isclose(found.safe_px, found.finest_px):
-            said.append(
+            notes.append(
                 f"{self.name}: beyond {found.finest_px:.4g} px more than 10 % are lost again; only "
                 + (f"from {found.safe_px:.4g} px on less is" if np.isfinite(found.safe_px)
                    else "at no longer period is it less for good")
             )  # fmt: skip
         if self.still is None:
-            said.append(f"{self.name}: no field without motion was given, so n is not known")
+            notes.append(f"{self.name}: no field without motion was given, so n is not known")
         lost = self.moved.lost
         if lost:
-            said.append(f"{self.name}: {lost} of {self.moved.x.size} points were not measured")
-        return tuple(said)
+            notes.append(f"{self.name}: {lost} of {self.moved.x.size} points were not measured")
+        return tuple(notes)
 
 
 def ranked_grades(grades: Sequence[StarGrade]) -> list[StarGrade]:

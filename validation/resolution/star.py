@@ -152,7 +152,7 @@ class Star:
 
 
 def fine_speckle(seed: int = 0) -> SpeckleSpec:
-    """A speckle for subsets from 9 px on: grains of 5 px (width of its autocorrelation).
+    """A speckle for subsets from 9 px on: speckle size 5 px (autocorrelation FWHM).
 
     Noise of a tenth of full scale is cut off at neither end.
     """

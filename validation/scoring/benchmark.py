@@ -6,8 +6,8 @@
            benchmark.json README.md
     TRUTH/ solution.h5 benchmark.json
 
-Nothing in the public folder tells the displacements: neither the solution nor the material, loading
-or imperfection that it could be computed from. The set's id is a digest of its files.
+Nothing in the public folder reveals the displacements: neither the solution nor the material,
+loading or imperfection that it could be computed from. The set's id is a digest of its files.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def publish(
     Parameters
     ----------
     images
-        A finished set, seen by a perfect lens.
+        A finished set, made with a perfect lens.
     specimen
         The undeformed geometry.
     public
@@ -226,7 +226,7 @@ def publish(
     Raises
     ------
     InputError
-        If the images were seen through a lens that distorts or are not what was rendered, or the
+        If the images were made with a lens that distorts or are not what was rendered, or the
         truth would be public.
     """
     public, truth = Path(public), Path(truth)
@@ -277,7 +277,7 @@ def require_no_lens(spec: ImagingSpec) -> None:
 
 
 def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[str, Any]:
-    """Copy the images and write the README; returns what ``benchmark.json`` is to hold."""
+    """Copy the images and write the README; returns the content of ``benchmark.json``."""
     reference = {key: images.info["reference"][key] for key in ("image", "camera_image", "mask")}
     deformed = [
         {"nominal_strain": s["nominal_strain"], "image": s["image"],

@@ -1,6 +1,6 @@
 """Convention checks: axes, signs, units and origin of a displacement field against the truth.
 
-What a DIC code writes can be taken wrongly in many ways, several at once: y up for y down, u and v
+What a DIC code writes can be misread in many ways, several at once: y up for y down, u and v
 or rows and columns exchanged, a sign, deformed positions for reference ones, another origin, px for
 mm. All combinations are tried against the truth. One is reported only if the errors with it are
 smaller than as declared by more than chance explains, and if it leaves nothing of what it was to
@@ -32,7 +32,7 @@ _BLOCKS = 5
 """Along each axis: errors of points near to each other are alike, those of blocks are not."""
 _FEWEST_BLOCKS = 8
 _CHANCE = 1e-7
-"""That a right field is said to be wrong by chance, for each of a few hundred readings."""
+"""Of rejecting a right field, for each of a few hundred readings [-]."""
 _SMALL_PX = 1e-3
 """A mean error that is smaller by less is of no interest [px]."""
 _INEXACT = 0.1
@@ -55,7 +55,7 @@ _COMPONENTS = (
     (_TURN @ _EXCHANGE_UP, 2, "u and v were v and -u (y up)"),
     (-_TURN @ _EXCHANGE_UP, 2, "u and v were -v and u (y up)"),
 )
-"""What u and v may have been, in the physical frame: matrix, how many mistakes, in words."""
+"""What u and v may have been, in the physical frame: matrix, number of changes, text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +74,10 @@ class Reading:
         Factor of displacements: that of a wrong unit [-].
     deformed
         Whether the positions are those of the deformed image.
-    mistakes
-        How many were made.
-    words
-        What they were; empty for the field as declared.
+    changes
+        How many things were declared wrongly.
+    text
+        What they are; empty for the field as declared.
     """
 
     turn: FloatArray
@@ -86,14 +86,14 @@ class Reading:
     components: FloatArray
     scale: float = 1.0
     deformed: bool = False
-    mistakes: int = 0
-    words: tuple[str, ...] = ()
+    changes: int = 0
+    text: tuple[str, ...] = ()
 
-    def but(self, mistakes: int = 1, words: str = "", **changes: object) -> Reading:
-        """The same with another mistake."""
-        told = (*self.words, words) if words else self.words
-        changed: Reading = replace(self, **changes)  # type: ignore[arg-type]
-        return replace(changed, mistakes=self.mistakes + mistakes, words=told)
+    def with_change(self, count: int = 1, text: str = "", **values: object) -> Reading:
+        """The same with another change, or several that go together."""
+        changed: Reading = replace(self, **values)  # type: ignore[arg-type]
+        text_of_all = (*self.text, text) if text else self.text
+        return replace(changed, changes=self.changes + count, text=text_of_all)
 
     def differs_in_origin(self, other: Reading) -> bool:
         """Whether another reading has nothing but another origin."""
@@ -106,7 +106,7 @@ class Reading:
             )
         )
 
-    def taken(
+    def applied(
         self, x: FloatArray, y: FloatArray, u: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Positions (n,), (n,) and displacements (n, 2) as they are with this reading [mm]."""
@@ -123,7 +123,7 @@ def as_declared() -> Reading:
 def check_conventions(
     field: LocalField, truth: Truth, grid: PixelGrid
 ) -> tuple[Reading, tuple[str, ...]]:
-    """What a field means: as declared, or with the fewest mistakes that explain its errors.
+    """What a field means: as declared, or with the fewest changes that explain its errors.
 
     Parameters
     ----------
@@ -150,13 +150,13 @@ def check_conventions(
         return declared, ()
     candidates = [declared, *_promising(sample, grid)]
     best = min(candidates, key=sample.cost)
-    simplest = sorted(candidates, key=lambda reading: (reading.mistakes, sample.cost(reading)))
-    meant = next(r for r in simplest if r is best or not sample.is_beaten(r, best))
-    if meant is declared or not sample.is_beaten(declared, meant):
+    simplest = sorted(candidates, key=lambda reading: (reading.changes, sample.cost(reading)))
+    meant = next(r for r in simplest if r is best or not sample.is_rejected(r, best))
+    if meant is declared or not sample.is_rejected(declared, meant):
         return declared, ()
     before, after = (sample.median_px(reading) for reading in (declared, meant))
-    words = " and ".join(meant.words)
-    explained = f"the median error of {before:.3g} px would be {after:.3g} px if {words}"
+    text = " and ".join(meant.text)
+    explained = f"the median error of {before:.3g} px would be {after:.3g} px if {text}"
     if meant.scale != 1.0:
         raise InputError(
             f"{field.source}: expected displacements in the declared unit, got "
@@ -167,13 +167,13 @@ def check_conventions(
 
 
 def _orientations(grid: PixelGrid) -> Iterator[Reading]:
-    """All ways to turn positions and displacements: those with fewer mistakes first."""
+    """All ways to turn positions and displacements: those with fewer changes first."""
     found: dict[tuple[float, ...], Reading] = {}
     turned = [as_declared(), *_turned_positions(grid)]
-    for reading, (matrix, mistakes, words) in itertools.product(turned, _COMPONENTS):
-        both = reading.but(mistakes, words, components=matrix @ reading.components)
+    for reading, (matrix, changes, text) in itertools.product(turned, _COMPONENTS):
+        both = reading.with_change(changes, text, components=matrix @ reading.components)
         key = tuple(np.round([*both.turn.ravel(), *both.shift, *both.components.ravel()], 9))
-        if key not in found or both.mistakes < found[key].mistakes:
+        if key not in found or both.changes < found[key].changes:
             found[key] = both
     yield from found.values()
 
@@ -183,25 +183,25 @@ def _turned_positions(grid: PixelGrid) -> Iterator[Reading]:
     declared = as_declared()
     first, height = np.array([grid.x0, grid.y0]), (grid.rows - 1) * grid.pixel_size
     low = first - [0.0, height]
-    for matrix, centres, words in (
+    for matrix, centres, text in (
         (_TURN, (0.5 * (first + low), np.zeros(2)), "the y axis pointed the other way"),
         (_EXCHANGE_DOWN, (first, np.zeros(2)), "rows and columns were exchanged"),
         (_EXCHANGE_UP, (low, np.zeros(2)), "x and y (up) were exchanged"),
     ):
         for centre in centres:
             shift = centre - matrix @ centre
-            yield declared.but(1, words, turn=matrix, shift=shift, components=matrix)
-            yield declared.but(1, f"{words}, of positions only", turn=matrix, shift=shift)
+            yield declared.with_change(1, text, turn=matrix, shift=shift, components=matrix)
+            yield declared.with_change(1, f"{text}, of positions only", turn=matrix, shift=shift)
     for matrix in (_TURN @ _EXCHANGE_UP, -_TURN @ _EXCHANGE_UP):
         for before, after in ((first, low), (low, first), (np.zeros(2), np.zeros(2))):
             shift = after - matrix @ before
-            words = "rows and columns were exchanged and the y axis pointed the other way"
-            yield declared.but(2, words, turn=matrix, shift=shift, components=matrix)
-            yield declared.but(2, f"{words}, of positions only", turn=matrix, shift=shift)
+            text = "rows and columns were exchanged and the y axis pointed the other way"
+            yield declared.with_change(2, text, turn=matrix, shift=shift, components=matrix)
+            yield declared.with_change(2, f"{text}, of positions only", turn=matrix, shift=shift)
 
 
 def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
-    """Where else positions may have been counted from: (2,) [mm], in words."""
+    """Where else positions may have been counted from: (2,) [mm], and its text."""
     first, last = (np.array(grid.to_mm(*at)) for at in ((0, 0), (grid.rows - 1, grid.cols - 1)))
     yield first, "positions were counted from the upper left pixel"
     yield np.array([first[0], last[1]]), "positions were counted from the lower left pixel"
@@ -211,7 +211,7 @@ def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
 
 
 def _near_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
-    """What else the first pixel's centre may have been called: (2,) [mm], in words."""
+    """What else the first pixel's centre may have been called: (2,) [mm], and its text."""
     for number, y_down in itertools.product((0.5, 1.0, -0.5, -1.0), (1.0, -1.0)):
         shift = -number * grid.pixel_size * np.array([1.0, -y_down])
         called = f"({number:g}, {number:g})" + (" (y up)" if y_down < 0 else "")
@@ -227,32 +227,32 @@ def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
     few = sample.every(4)
     turned = list(_orientations(grid))
     turned += [
-        reading.but(1, words, origin=shift)
-        for reading, (shift, words) in itertools.product(turned, _far_origins(grid))
+        reading.with_change(1, text, origin=shift)
+        for reading, (shift, text) in itertools.product(turned, _far_origins(grid))
     ]
     best = few.best(turned)
-    for factor, words in (
+    for factor, text in (
         (1.0 / grid.pixel_size, "mm had been declared as pixels"),
         (grid.pixel_size, "pixels had been declared as mm"),
     ):
         if abs(np.log(factor)) > 0.1:
-            best += few.best([reading.but(1, words, scale=factor) for reading in turned])
+            best += few.best([reading.with_change(1, text, scale=factor) for reading in turned])
     best += [_in_deformed_positions(reading) for reading in (as_declared(), *best)]
     return best + [
-        reading.but(1, words, origin=reading.origin + shift)
+        reading.with_change(1, text, origin=reading.origin + shift)
         for reading in (as_declared(), *sample.best(best))
-        for shift, words in _near_origins(grid)
+        for shift, text in _near_origins(grid)
     ]
 
 
 def _in_deformed_positions(reading: Reading) -> Reading:
     """The same at positions in the deformed image; there, the other sign leads back."""
     back = "u led from the deformed image back to the reference"
-    sign = next(words for matrix, _, words in _COMPONENTS if (matrix == -_KEEP).all())
-    if sign in reading.words:
-        rest = tuple(words for words in reading.words if words != sign)
-        return replace(reading, deformed=True, words=(*rest, back))
-    return reading.but(1, "the positions were those of the deformed image", deformed=True)
+    sign = next(text for matrix, _, text in _COMPONENTS if (matrix == -_KEEP).all())
+    if sign in reading.text:
+        rest = tuple(text for text in reading.text if text != sign)
+        return replace(reading, deformed=True, text=(*rest, back))
+    return reading.with_change(1, "the positions were those of the deformed image", deformed=True)
 
 
 class _FieldSample:
@@ -296,7 +296,7 @@ class _FieldSample:
         }
         if not new:
             return
-        at = [reading.taken(self.x, self.y, self.u) for reading in new.values()]
+        at = [reading.applied(self.x, self.y, self.u) for reading in new.values()]
         true = self.truth(
             np.concatenate([x for x, _, _ in at]), np.concatenate([y for _, y, _ in at])
         )
@@ -325,13 +325,13 @@ class _FieldSample:
         """Median length of the displacement's error on the material [px]."""
         return reading.scale * float(np.nanmedian(_length(self.errors(reading))))
 
-    def is_beaten(self, one: Reading, other: Reading) -> bool:
+    def is_rejected(self, one: Reading, other: Reading) -> bool:
         """Whether a reading's errors hold what it differs by from another, beyond chance.
 
         The errors e of the one are fitted by c d, with d what the readings differ by: c is 0 if
         the one is right, 1 if the other is. So it must be, too, where affine parts are taken out of
-        e and d: a lens or a tilted camera leaves such errors. A mere difference of origin is told
-        from a bias by how the motion varies from point to point.
+        e and d: a lens or a tilted camera leaves such errors. A mere difference of origin is
+        distinguished from a bias by how the motion varies from point to point.
         """
         mine, others = self.errors(one), self.errors(other)
         known = np.isfinite(mine - others).all(axis=1)

@@ -33,7 +33,7 @@ _ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Declared:
-    """What is said of a field's file that it doesn't say itself.
+    """What is declared of a field's file that it doesn't state itself.
 
     Parameters
     ----------
@@ -123,22 +123,22 @@ def claimed_benchmark(path: Path) -> str | None:
 
 
 def _claim(path: Path) -> str | None:
-    suffix, said = path.suffix.lower(), ""
+    suffix, text = path.suffix.lower(), ""
     if suffix in _TEXT:
         with path.open(encoding="utf-8", errors="replace") as file:
-            said = "".join(
+            text = "".join(
                 line for _, line in zip(range(50), file, strict=False) if line[0] in "#%"
             )
     elif suffix == ".npz":
         with path.open("rb") as stream:
             file = np.load(stream, allow_pickle=False)
-            said = f"benchmark {file['benchmark']}"
+            text = f"benchmark {file['benchmark']}"
     elif h5py.is_hdf5(path):
         with open_hdf5(path, "a displacement field") as file:
-            said = f"benchmark {file.attrs['benchmark']}"
+            text = f"benchmark {file.attrs['benchmark']}"
     elif suffix == ".mat":
-        said = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
-    found = _ID.search(said)
+        text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
+    found = _ID.search(text)
     return found.group(1).lower() if found else None
 
 

@@ -43,7 +43,7 @@ class Grading:
     spectra
         Of each field's error, by its name; None where it has none.
     remarks
-        Sentences about probable mistakes in what was declared.
+        Probable errors in what was declared.
     refused
         By its file's name, why a field was not graded.
     """
@@ -76,16 +76,16 @@ class Grading:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know, in sentences."""
-        told = [f"not graded: {why}" for why in self.refused.values()]
-        told += self.remarks
+        """What a reader has to know."""
+        notes = [f"not graded: {why}" for why in self.refused.values()]
+        notes += self.remarks
         for graded in self.scores:
             if graded.covered < ENOUGH_COVERED:
-                told.append(
+                notes.append(
                     f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less "
                     f"than {100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
                 )
-        return told
+        return notes
 
 
 def grading_summary(grading: Grading) -> dict[str, Any]:

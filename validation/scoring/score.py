@@ -44,7 +44,7 @@ def regions(
 
     Returns
     -------
-    (rows, cols) index into :data:`REGIONS`, -1 where there is no material. Edges are told first,
+    (rows, cols) index into :data:`REGIONS`, -1 where there is no material. Edges come first,
     then what lies outside the cellular part (bulk); the rest belongs to the ligament or junction
     whose middle is nearest.
     """
@@ -259,7 +259,7 @@ def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: Pixe
     there = float((_labels_at(own_x, own_y, labels, grid) >= 0).mean())
     row, col = grid.to_px(own_x, own_y)
     last, px, mm = grid.rows - 1, "pixels declared as mm", "mm declared as pixels"
-    for (x, y), words in (
+    for (x, y), text in (
         (grid.to_mm(-own_y, own_x), px),  # rows down
         (grid.to_mm(last - own_y, own_x), px),
         ((col, -row), mm),
@@ -269,7 +269,7 @@ def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: Pixe
         if share > 0.1 and there < 0.2 * share:
             raise InputError(
                 f"{field.source}: expected positions in the declared unit, got {100 * there:.0f} % "
-                f"of them on the specimen, but {100 * share:.0f} % if they are {words} (a pixel is "
+                f"of them on the specimen, but {100 * share:.0f} % if they are {text} (a pixel is "
                 f"{grid.pixel_size} mm); declare the unit that the file is in"
             )
     if there == 0.0:
@@ -341,7 +341,7 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
         return None
     try:
         u, points, mask = gridded(_averaged(graded, grid))
-        unit = 10.0 * points.pixel_size  # any: wavelengths are told in px
+        unit = 10.0 * points.pixel_size  # any: wavelengths are in px
         spectrum = spectral_density(u, points, mask, unit, bins_per_cell=10, padding=1)
     except InputError:
         return None

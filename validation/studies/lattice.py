@@ -39,7 +39,7 @@ class FirstModeLimit:
         The largest d/l found at which something else comes first, and the smallest at which
         the pattern does [-].
     instead
-        What comes first below, in the words of :class:`ModeRow`.
+        What comes first below, as in :class:`ModeRow`.
     """
 
     loading: str
@@ -203,7 +203,7 @@ def run_lattice_study(
     pitches
         Other l [mm]; the mesh is scaled, too.
     materials
-        Names of other materials, among ``independence.MATERIALS``.
+        Names of other materials, among ``STUDIED_MATERIALS``.
     shown
         d/l of the overlays [-], under the reference's loading.
     progress

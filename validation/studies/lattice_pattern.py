@@ -367,7 +367,7 @@ def _normalised_pair(
 
 
 def kind_of(found: LatticeCritical, largest: float) -> str:
-    """What is critical first up to the largest load, in the words of :class:`ModeRow`."""
+    """What is critical first up to the largest load, as in :class:`ModeRow`."""
     from modeharvest.fem.bloch.zone import is_same
 
     if not found.found:

@@ -101,16 +101,16 @@ class SpecimenPatterns:
         )
 
 
-def deviations(seen: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
+def deviations(measured: pd.DataFrame, prefix: str = "") -> pd.DataFrame:
     """Parameters less those of Eq. (mode), phases in shares of l."""
-    values = seen[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
-    return pd.DataFrame(values, seen.index, list(PARAMETERS))
+    values = measured[[prefix + name for name in PARAMETERS]].to_numpy(np.float64) - IDEAL
+    return pd.DataFrame(values, measured.index, list(PARAMETERS))
 
 
-def standardised_errors(seen: pd.DataFrame) -> NDArray[np.float64]:
+def standardised_errors(measured: pd.DataFrame) -> NDArray[np.float64]:
     """(specimens, 7) measured less best fit, in standard deviations by model error."""
-    sd = seen[[f"{name}_sd_model_error" for name in PARAMETERS]].to_numpy(np.float64)
-    return np.asarray((deviations(seen) - deviations(seen, "best_")).to_numpy() / sd)
+    sd = measured[[f"{name}_sd_model_error" for name in PARAMETERS]].to_numpy(np.float64)
+    return np.asarray((deviations(measured) - deviations(measured, "best_")).to_numpy() / sd)
 
 
 def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -428,7 +428,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         return ModesAnalysis.of(table)
 
     def _others(self, base: SpecimenSpec) -> Iterator[tuple[str, str, SpecimenSpec]]:
-        """What is varied, its level in words, and the specimen."""
+        """What is varied, its level as text, and the specimen."""
         pitch = base.specimen.pitch
         for ratio in self.ratios:
             yield "d/l", f"{ratio:g}", base.changed(diameter=ratio * pitch)

@@ -172,7 +172,7 @@ class PairedErrors:
 
     @property
     def covered(self) -> FloatArray:
-        """(...): share of the 95 % intervals that hold the truth [-]."""
+        """(...): share of the 95 % intervals that contain the truth [-]."""
         return np.asarray(np.where(self.counted, self._inside.mean(axis=(0, 1)), np.nan))
 
     # -- all that count together --------------------------------------------------------------
@@ -201,7 +201,7 @@ class PairedErrors:
 
     @property
     def coverage(self) -> Estimate:
-        """Share of the 95 % intervals that hold the truth [-]."""
+        """Share of the 95 % intervals that contain the truth [-]."""
         shares = self._inside[:, :, self.counted].mean(axis=(1, 2))
         return Estimate(float(shares.mean()), float(shares.std(ddof=1) / np.sqrt(len(shares))))
 

@@ -233,7 +233,7 @@ class Study(ABC, Generic[A]):
     """A question, as options in a frozen dataclass; see docs/studies.md for one's own."""
 
     question: ClassVar[str]
-    """What is asked, in a sentence or two, for the report."""
+    """What is asked, for the report."""
     function: ClassVar[str]
     """The "package.module:name" of what runs one case."""
     strain: float
@@ -242,7 +242,7 @@ class Study(ABC, Generic[A]):
     @property
     @abstractmethod
     def seeds(self) -> str:
-        """The seeds of all that is random, in words, for the report."""
+        """The seeds of all that is random, as text for the report."""
 
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Raise InputError if the correlation contradicts the study."""

@@ -148,7 +148,7 @@ def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
 
 
 def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
-    """Grey levels about the same middle, seen by a camera: float images know no contrast."""
+    """Grey levels about the same middle, as a camera's: float images know no contrast."""
     speckle = setting.imaging.speckle
     middle = 0.5 * (speckle.dark + speckle.bright)
     middle = min(max(middle, 0.5 * contrast), 1.0 - 0.5 * contrast)

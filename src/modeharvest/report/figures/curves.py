@@ -27,7 +27,7 @@ from modeharvest.report.figures.style import (
     style,
 )
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.onset import Buckling, Moment
+from modeharvest.validation.onset import Buckling, ImageAmplitude
 
 CURVE = (5.2, 3.3)  # of a curve's picture [in]
 EIGENVALUES = 4  # curves of them
@@ -252,7 +252,7 @@ _COLOURS = (BLUE, RED, GREEN, GOLD)
 _DASHES = (0, (3, 2))
 
 
-def draw_onset(moments: Sequence[Moment], buckling: Buckling | None) -> Figure:
+def draw_onset(moments: Sequence[ImageAmplitude], buckling: Buckling | None) -> Figure:
     """Draw the pattern's amplitude over the strain, above what it has to stand out of.
 
     Parameters

@@ -36,7 +36,7 @@ from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.onset import Buckling, Moment, find_buckling, mean_strain
+from modeharvest.validation.onset import Buckling, ImageAmplitude, find_buckling, mean_strain
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ class Harvest:
     noise_source: str
     lattice: HoleLattice | None = None
     skipped: tuple[tuple[str, str], ...] = ()
-    timeline: Sequence[Moment] = ()
+    timeline: Sequence[ImageAmplitude] = ()
     buckling: Buckling | None = None
     calibration: Calibration | None = None
     distortion: Distortion | None = None
@@ -410,9 +410,9 @@ def _parts(
     return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
 
 
-def _moment(frame: HarvestedFrame, cellular: Box) -> Moment:
+def _moment(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
     identified, px = frame.identifiability, frame.result.grid.pixel_size
-    return Moment(
+    return ImageAmplitude(
         name=frame.name,
         strain=frame.strain_x,
         amplitude_px=float(np.linalg.norm(identified.amplitude_px)),

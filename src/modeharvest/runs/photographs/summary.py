@@ -174,7 +174,7 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
         ],
         "buckling": None if buckling is None else {
             "before": buckling.before, "after": buckling.after, "estimate": buckling.estimate,
-            "text": buckling.sentence},
+            "text": buckling.text},
         "lattice": _lattice(harvest),
         "optics": _optics(harvest),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
