@@ -194,11 +194,6 @@ class WavePattern:
     start_amplitude: float
     text: tuple[str, ...]
 
-    @property
-    def supported(self) -> bool:
-        """Whether the parametrisation of Eq. (mode) is supported."""
-        return self.family == SQUARE
-
 
 def read_pattern(spectrum: Spectrum) -> WavePattern:
     """Find the waves of a long-range correlated pattern and check whether Eq. (mode) fits them."""
