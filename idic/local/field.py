@@ -195,6 +195,7 @@ def field_between(
     return LocalField(x, y, np.column_stack([x2 - x, y2 - y]), source=source)
 
 
+_UNITS, _AXES = ("px", "mm"), ("up", "down")
 _WRITTEN = ("x [mm]", "y up [mm]", "u [mm]", "v up [mm]", "sd_u [mm]", "sd_v [mm]", "valid")
 
 
@@ -244,10 +245,12 @@ def read_field(
     """
     table = read_table(path)
     chosen = choose(list(table), columns or {}, units, str(path))
-    position = _unit(chosen, ("x", "y"), units, str(path))
+    positions, motions = [chosen["x"], chosen["y"]], [chosen["u"], chosen["v"]]
+    position = _declared("units", _UNITS, positions, units, str(path))
     same = units or ("px" if chosen["x"].of_image_code else None)
-    motion = _unit(chosen, ("u", "v"), displacement_units or same, str(path))
-    down = _axis(chosen, y_axis, str(path)) == "down"
+    motion = _declared("units", _UNITS, motions, displacement_units or same, str(path))
+    up_or_down = _declared("y_axis", _AXES, [*positions, chosen["v"]], y_axis, str(path))
+    down = up_or_down == "down"
     if "px" in (position, motion) and grid is None:
         raise InputError(f"{path}: expected a grid for a field in pixels; give the pixel size")
     x, y, u, v = _same_shape([table[chosen[role].name] for role in ROLES], chosen, str(path))
@@ -291,40 +294,25 @@ def write_field(path: Path | str, field: LocalField) -> None:
             np.savetxt(part, data, formats, ",", header=",".join(_WRITTEN), comments="")
 
 
-def _unit(
-    chosen: dict[str, Column], roles: tuple[str, ...], declared: str | None, where: str
+def _declared(
+    option: str, values: tuple[str, str], columns: list[Column], given: str | None, where: str
 ) -> str:
-    if declared not in (None, "px", "mm"):
-        raise InputError(f"{where}: expected units 'px' or 'mm', got {declared!r}")
-    named = {chosen[role].unit for role in roles} - {None}
-    if len(named) > 1 or (declared and named and named != {declared}):
-        names = ", ".join(repr(chosen[role].name) for role in roles)
+    """The value of an option, "units" or "y_axis", given or stated by the columns' names."""
+    both = " or ".join(map(repr, values))
+    if given not in (None, *values):
+        raise InputError(f"{where}: expected {option} {both}, got {given!r}")
+    stated = {c.unit if option == "units" else c.y_axis for c in columns} - {None}
+    names = ", ".join(repr(c.name) for c in columns)
+    if len(stated) > 1 or (given and stated and stated != {given}):
         raise InputError(
-            f"{where}: expected {names} in {declared or 'one unit'}, but they are named as "
-            f"{' and '.join(sorted(map(str, named)))}; leave units out, or name other columns"
+            f"{where}: expected {option} {given or 'of one kind'!r} for {names}, but they are "
+            f"named as {' and '.join(sorted(map(str, stated)))}; leave {option} out, or name other "
+            "columns"
         )
-    unit = declared or next(iter(named), None)
-    if unit is None:
-        names = " and ".join(repr(chosen[role].name) for role in roles)
-        raise InputError(f"{where}: expected units for {names}, got none; give units='px' or 'mm'")
-    return unit
-
-
-def _axis(chosen: dict[str, Column], declared: str | None, where: str) -> str:
-    if declared not in (None, "up", "down"):
-        raise InputError(f"{where}: expected y_axis 'up' or 'down', got {declared!r}")
-    named = {chosen[role].y_axis for role in ("x", "y", "v")} - {None}
-    if len(named) > 1 or (declared and named and named != {declared}):
-        raise InputError(
-            f"{where}: expected y_axis {declared or 'one way'!r}, but by the columns' names it is "
-            f"{' and '.join(sorted(map(str, named)))}; leave y_axis out, or name other columns"
-        )
-    axis = declared or next(iter(named), None)
-    if axis is None:
-        raise InputError(
-            f"{where}: expected to know where y grows, got nothing; give y_axis='up' or 'down'"
-        )
-    return axis
+    found = given or next(iter(stated), None)
+    if found is None:
+        raise InputError(f"{where}: expected {option} for {names}, got none; give {option}={both}")
+    return found
 
 
 def _same_shape(

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ from modeharvest.idic.spectra.waves import GROWTH, select_waves
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, write_json
+from modeharvest.util.typed import to_plain
 
 
 def overlap(
@@ -282,22 +283,16 @@ def write_family(
     InputError
         If ``info`` can't be written as JSON, or the file can't be written.
     """
-    family = found.family
     content: dict[str, Any] = {
         "format": FORMAT,
         "conventions": _CONVENTIONS,
-        "name": family.name,
+        **to_plain(found.family),
         "pitch": found.pitch,
         "amplitude": found.amplitude,
         "captured": found.captured,
         "growth": [list(step) for step in found.growth],
         "text": list(found.text),
         "waves": found.waves.tolist(),
-        "matrix": family.matrix.tolist(),
-        "offset": family.offset.tolist(),
-        "start": family.start.tolist(),
-        "names": list(family.names),
-        "units": list(family.units),
         "info": {**found.info, **(info or {})},
     }
     if spectrum is not None:
@@ -315,16 +310,8 @@ def read_family(path: Path | str) -> FoundFamily:
     """Read what :func:`write_family` wrote; InputError if it is damaged or something else."""
     with reading(path, _WHAT):
         content = read_record(path, FORMAT, _WHAT, "make it again")
-        family = ModeFamily(
-            str(content["name"]),
-            np.array(content["matrix"], dtype=np.float64),
-            np.array(content["offset"], dtype=np.float64),
-            np.array(content["start"], dtype=np.float64),
-            tuple(str(name) for name in content["names"]),
-            tuple(str(unit) for unit in content["units"]),
-        )
         return FoundFamily(
-            family,
+            ModeFamily(**{f.name: content[f.name] for f in fields(ModeFamily)}),
             float(content["pitch"]),
             float(content["amplitude"]),
             float(content["captured"]),
