@@ -30,8 +30,8 @@ from modeharvest.idic.slow_fields import orders
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.report.grades import write_star_grading
-from modeharvest.report.terminal import print_star_grading
+from modeharvest.report.grades import star_report, write_star_grading
+from modeharvest.report.model import print_report
 from modeharvest.validation.resolution.attenuation import Attenuation
 from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
 from modeharvest.validation.resolution.star import (
@@ -72,7 +72,7 @@ def main() -> None:
         }
         grading = StarGrading(star_set, tuple(ranked_grades(list(grades.values()))))
         write_star_grading(out / "graded", grading)
-        print_star_grading(grading, out / "graded")
+        print_report(star_report(grading), out / "graded")
     expected = ["theory", "this speckle"]
     columns = ["subset", "l10 [px]", *expected, "n [10⁻³ px]", *expected, "n l10 [px²]", *expected]
     print(f"| {' | '.join(columns)} |", "|---" * len(columns) + "|", sep="\n")

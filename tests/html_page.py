@@ -1,9 +1,14 @@
-"""A page as the reports' tests see it."""
+"""A page and a report's tables as their tests see them."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from html.parser import HTMLParser
+
+import pandas as pd
+
+from modeharvest.report.model import ReportTable
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 
@@ -40,3 +45,9 @@ class Page(HTMLParser):
             value = attributes.get(name)
             if value is not None:
                 (self.links if tag in ("a", "use") else self.sources).append(value)
+
+
+def frame(tables: Sequence[ReportTable], title: str) -> pd.DataFrame:
+    """The rows of the table of that title."""
+    (table,) = (table for table in tables if table.title == title)
+    return pd.DataFrame(table.rows, columns=list(table.columns))

@@ -18,7 +18,7 @@ from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.report.figures.experiment import ExperimentReportData
+from modeharvest.report.figures.experiment import ExperimentData
 from modeharvest.runs.case import Case
 from modeharvest.validation.truth import Comparison
 
@@ -117,16 +117,12 @@ def solution(strains: tuple[float, ...], info: dict[str, Any] | None = None) -> 
     return Solution(mesh, shots, {"critical": CRITICAL, "path": PATH} if info is None else info)
 
 
-def atlas(
-    strains: tuple[float, ...] = (0.05, 0.1), ansatz: Ansatz | None = None
-) -> ExperimentReportData:
+def data(strains: tuple[float, ...] = (0.05, 0.1), ansatz: Ansatz | None = None) -> ExperimentData:
     """Everything that the pictures show."""
     found = [comparison(e, 4.0 if _branch(e) != "primary" else 0.1, ansatz) for e in strains]
     images = MadeUpImages(Path(), {})
     results, spectra = [c.result for c in found], [spectrum(c) for c in found]
-    return ExperimentReportData(
-        solution(strains), images, strains, results, found, spectra, UNIT_CELL
-    )
+    return ExperimentData(solution(strains), images, strains, results, found, spectra, UNIT_CELL)
 
 
 def case() -> dict[str, Any]:
@@ -136,10 +132,11 @@ def case() -> dict[str, Any]:
     return plain
 
 
-def summary(of: ExperimentReportData, critical: float | None = 0.06) -> dict[str, Any]:
+def summary(of: ExperimentData, critical: float | None = 0.06) -> dict[str, Any]:
     """What ``summary.json`` would hold, numbers made up."""
     return {
         "title": "Made up <for tests>",
+        "case": case(),
         "critical_strain": critical,
         "energy_below_unstable": [],
         "snapshots": [_snapshot(c, pattern) for c, (_, pattern)

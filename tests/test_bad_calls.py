@@ -344,13 +344,12 @@ def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
 
 
 def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    from modeharvest.report.terminal import print_experiment
+    from modeharvest.report.model import Card, Report, ReportTable, Section, print_report
 
-    summary = {
-        "title": "[/bold] [red]", "snapshots": [], "critical_strain": None,
-        "warnings": ["[/x]"], "expected": [], "case": Case.read("paper-virtual").plain(),
-    }  # fmt: skip
-    print_experiment(summary, Path("out[/bold]"))
+    table = ReportTable("[/t]", ["[b]"], [["[/b]"]], on_terminal=True)
+    section = Section("s", "S", [Card.tabular(table)])
+    report = Report("kind", "[/bold] [red]", sections=[section], warnings=["[/x]"])
+    print_report(report, Path("out[/bold]"))
     text = capsys.readouterr().out
     assert "[/x]" in text
     assert "out[/bold]/report.html" in text

@@ -24,11 +24,24 @@ from modeharvest.idic.modes import FourierMode, Taper, free_family
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
-from modeharvest.report import photographs as words
 from modeharvest.report.figures.outlines import mask_boundary
-from modeharvest.report.figures.photograph_panels import photograph_panels, unaffine
-from modeharvest.report.figures.photographs import MOST_SHOWN, PhotographReportData
-from modeharvest.report.photographs import write_harvest_report
+from modeharvest.report.figures.photographs import (
+    MOST_SHOWN,
+    PhotographState,
+    photograph_states,
+    shown_frames,
+    unaffine,
+)
+from modeharvest.report.model import write_page
+from modeharvest.report.photographs import (
+    frame_rows,
+    key_numbers,
+    mode_cards,
+    notes,
+    photograph_labels,
+    photograph_panels,
+    photographs_report,
+)
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.runs.photographs.summary import harvest_summary
 from modeharvest.util.errors import InputError
@@ -51,8 +64,12 @@ def text(harvest: Harvest, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def report(harvest: Harvest, folder: File) -> str:
     path = folder / "report.html"
-    write_harvest_report(path, harvest)
+    write_page(photographs_report(harvest_summary(harvest), harvest), path)
     return path.read_text("utf-8")
+
+
+def states(harvest: Harvest) -> list[PhotographState]:
+    return photograph_states(harvest, {frame.name: frame.name for frame in harvest.frames})
 
 
 def bare(harvest: Harvest) -> Harvest:
@@ -78,9 +95,9 @@ def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
 
 def test_every_panel_is_there_for_every_photograph(harvest: Harvest, text: str) -> None:
     ids = Page(text).ids
-    every = photograph_panels(PhotographReportData(harvest))
+    every = photograph_panels(states(harvest))
     assert {"image", "Sxx", "v0y", "v1", "phi1", "fluc1x", "residual", "w", "v0-noise",
-            "fluc1-model_error", "loss"} <= {panel.key for panel in every}  # fmt: skip
+            "fluc1-model", "loss"} <= {panel.key for panel in every}  # fmt: skip
     for panel in every:
         assert all(ids[f"{panel.key}-{k}"] == 1 for k in (1, 2))
     for name in ("hero", "keys", "reference", "distortion", "distortion-sd", "distortion-error",
@@ -111,15 +128,16 @@ def test_words_of_users_are_escaped_and_said(text: str) -> None:
 
 def test_what_is_not_known_is_left_out(harvest: Harvest, tmp_path: File) -> None:
     told: list[float] = []
-    write_harvest_report(tmp_path / "report.html", bare(harvest),
-                         progress=lambda done, total, what: told.append(done / total))  # fmt: skip
+    unknown = bare(harvest)
+    write_page(photographs_report(harvest_summary(unknown), unknown), tmp_path / "report.html",
+               lambda done, total, what: told.append(done / total))  # fmt: skip
     assert told == sorted(told)
     assert told[-1] == 1.0
     page = Page((tmp_path / "report.html").read_text("utf-8"))
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    for panel in photograph_panels(PhotographReportData(harvest)):
+    for panel in photograph_panels(states(harvest)):
         known = panel.key not in ("Sxx", "Syy", "w", "true_w", "best", "loss")
-        known &= not panel.key.endswith("model_error")
+        known &= not panel.key.endswith("-model")
         assert (f"{panel.key}-1" in page.ids) is known, panel.key
     for name in ("skipped", "optics", "obtained", "timeline", "truth"):
         assert name not in page.ids
@@ -152,22 +170,22 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
     frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
-    atlas = PhotographReportData(replace(bare(harvest), frames=(frame,)))
-    second = [panel for panel in photograph_panels(atlas) if "2" in panel.key]
+    both_modes = replace(bare(harvest), frames=(frame,))
+    (state,) = states(both_modes)
+    second = [panel for panel in photograph_panels([state]) if "2" in panel.key]
     assert [panel.key for panel in second] == [
         "v2", "phi2", "fluc2x", "fluc2y", "v2-noise", "fluc2-noise"]  # fmt: skip
-    drawn = second[0].draw(atlas, frame)
+    drawn = second[0].draw(state)
     drawn.canvas.draw()
-    told = harvest_summary(atlas.harvest)["frames"][0]
+    told = harvest_summary(both_modes)["frames"][0]
     assert told["modes"][1]["waves"][0]["xi"] == pytest.approx([0.6, 0.2])
-    tables = words.mode_tables([told])
-    assert [len(table["rows"]) for table in tables] == [7, 4]
-    assert words.panel_numbers("v2", told).startswith("largest among the holes 400 ±")
+    cards = mode_cards([told], {told["name"]: "it"})
+    assert [len(table.rows) for card in cards for table in card.tables] == [7, 4]
 
 
 def test_photographs_alike_are_told_apart_by_their_names(summary: dict[str, Any]) -> None:
     first, second = summary["frames"]
-    said = words.photograph_labels([first, second, second | {"name": "again"}])
+    said = photograph_labels([first, second, second | {"name": "again"}])
     at = "After buckling · 7\N{NO-BREAK SPACE}%"
     assert list(said.values())[1:] == [f"{at} · IMG_2", f"{at} · again"]
     assert "IMG_1" not in said["IMG_1"]
@@ -192,11 +210,11 @@ def test_many_photographs_have_numbers_and_some_have_pictures(harvest: Harvest) 
     )
     moments = [made_up.moment(frame) for frame in frames]
     long = replace(harvest, frames=frames, timeline=moments, truth=None)
-    shown = PhotographReportData(long).shown
+    shown = shown_frames(long)
     assert len(shown) == MOST_SHOWN
     first = next(k for k, moment in enumerate(moments) if moment.has_pattern)
     assert {frames[0], frames[first - 1], frames[first], frames[-1]} <= set(shown)
-    assert len(words.frame_rows(harvest_summary(long))) == 20
+    assert len(frame_rows(harvest_summary(long))) == 20
 
 
 def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) -> None:
@@ -281,28 +299,29 @@ def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:
 def test_warnings_outcomes_and_the_noise_are_told(summary: dict[str, Any]) -> None:
     change = {"outcome": "stagnated", "outcome_why": "No step.", "warnings": ["beware of this"]}
     frame = summary["frames"][1] | change
-    said = words.notes(summary | {"frames": [frame]})
+    said = notes(summary | {"frames": [frame]})
     at = "IMG_2, 7\N{NO-BREAK SPACE}%: "
     assert f"{at}the correlation ended as “stagnated”: No step." in said
-    assert f"{at}beware of this." in said
+    report = photographs_report(summary | {"frames": [frame]})
+    assert "IMG_2: beware of this." in report.warnings
     assert any("25 grey levels, 0.61 % of full scale, measured" in note for note in said)
 
 
 @pytest.mark.parametrize(
     ("buckling", "value"),
     [
-        (None, "–"),
-        ({"before": None, "after": None, "estimate": None}, "–"),
+        (None, None),
+        ({"before": None, "after": None, "estimate": None}, None),
         ({"before": None, "after": 0.05, "estimate": None}, "< 5"),
         ({"before": 0.04, "after": 0.05, "estimate": 0.045}, "4 … 5"),
     ],
 )
 def test_buckling_is_told_as_far_as_it_is_known(
-    summary: dict[str, Any], buckling: dict[str, Any] | None, value: str
+    summary: dict[str, Any], buckling: dict[str, Any] | None, value: str | None
 ) -> None:
-    keys = words.key_numbers(summary | {"buckling": buckling, "truth": []})
-    assert next(key for key in keys if key["name"] == "buckling")["value"] == value
-    assert keys[0]["value"] == "2 of 3"
+    keys = key_numbers(summary | {"buckling": buckling, "truth": []})
+    assert next(key for key in keys if key.name == "buckling").value == value
+    assert keys[0].value == "2 of 3"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from modeharvest.cli.root import main
 from modeharvest.fem.bloch.dispersion import Dispersion
 from modeharvest.fem.bloch.modes import read_modes
 from modeharvest.fem.materials import TwoTermI1
-from modeharvest.report.terminal import print_lattice
+from modeharvest.report.lattice import lattice_report
+from modeharvest.report.model import print_report
 from modeharvest.runs import run
 from modeharvest.runs.lattice.case import (
     DispersionPlan,
@@ -267,8 +268,8 @@ def test_a_study_goes_on_from_where_it_was(
     assert len((tmp_path / "study.csv").read_text("utf-8").splitlines()) == 2
     assert summary["study"]["lattices"] == 1
     assert 0.9 < summary["study"]["overlap"][0] <= 1.0
-    print_lattice(summary, tmp_path)
-    assert "study of 1 lattice" in capsys.readouterr().out
+    print_report(lattice_report(summary), tmp_path)
+    assert "Study of 1 lattice" in capsys.readouterr().out
 
 
 def test_the_commands_print_a_short_table(
@@ -276,9 +277,9 @@ def test_the_commands_print_a_short_table(
 ) -> None:
     assert command(monkeypatch, "modes", case, "--out", folder) == 0
     text = capsys.readouterr().out
-    assert "critical strain 1.1" in text
+    assert "Critical strain 1.1" in text
     assert "k·a = (π, π)" in text
-    assert "0 → 1" in text
+    assert "below: 0, above: 1" in text
     assert "mode φ₁" in text
     assert str(folder / "report.html") in text.replace("\n", "")
 

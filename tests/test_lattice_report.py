@@ -10,21 +10,29 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import synthetic_lattice as made_up
 from html_page import Page
 
-from modeharvest.report import lattice as words
-from modeharvest.report.lattice import write_lattice_report
-from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
+from modeharvest.report.lattice import (
+    lattice_report,
+    notes,
+    proof,
+    study_text,
+    wave_name,
+    waves_text,
+)
+from modeharvest.report.model import write_page
+from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField, summary_of
 from modeharvest.util.errors import InputError
 
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
 
 
 def page(run: LatticeRun, folder: Path) -> str:
-    write_lattice_report(folder / "report.html", run)
+    write_page(lattice_report(summary_of(run, run.patterns), run), folder / "report.html")
     return (folder / "report.html").read_text("utf-8")
 
 
@@ -82,23 +90,31 @@ def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
     text = page(run, tmp_path)
     assert "stable so far" in text
     assert "critical wave</dt>" not in text
-    assert "lowest measure 0.3 MPa, above zero" in text
-    assert "no critical point was found up to 28 %" in text
+    assert "lowest filling · λ/k² is 0.3 MPa, above zero" in text
+    assert "no critical point was found up to 28\N{NO-BREAK SPACE}%" in text
+
+
+def critical(point: CriticalPoint) -> dict[str, Any]:
+    """As it is in ``summary.json``."""
+    summary: dict[str, Any] = summary_of(made_up.run(critical=(point,)), ())
+    return summary
 
 
 def test_long_waves_are_named_by_their_direction() -> None:
     point = CriticalPoint("uniaxial", 0.21, True, "critical", value=0.0, angle=math.pi / 4)
-    assert words.waves_text(point) == "long waves along 45°"
-    assert "acoustic tensor" in words.proof(point)
-    notes = words.notes(made_up.run(critical=(point,)))
-    assert any("loss of ellipticity" in note for note in notes)
+    summary = critical(point)
+    assert waves_text(summary["critical"]) == "long waves along 45°"
+    assert "acoustic tensor" in proof(summary["critical"])
+    assert any("loss of ellipticity" in note for note in notes(summary))
 
 
 def test_waves_that_come_earlier_are_not_kept_quiet() -> None:
     point = CriticalPoint("uniaxial", 0.1, True, "critical", (made_up.M,), (0,), (1,))
-    assert words.proof(point).endswith("no other wave of the grid is unstable before")
+    text = proof(critical(point)["critical"])
+    assert text.endswith("no other wave of the grid is unstable before")
     point = replace(point, earlier=((1.0, 2.0), (1.5, 2.0)))
-    assert words.proof(point).endswith("but 2 other waves are unstable before")
+    text = proof(critical(point)["critical"])
+    assert text.endswith("but 2 other waves are unstable before")
 
 
 def test_a_branch_that_could_not_be_followed_has_its_row(tmp_path: Path) -> None:
@@ -129,8 +145,9 @@ def test_patterns_without_modes_are_refused() -> None:
 
 def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:
     told: list[float] = []
-    write_lattice_report(tmp_path / "r.html", made_up.run(study=None),
-                         lambda done, total, what: told.append(done / total))  # fmt: skip
+    run = made_up.run(study=None)
+    report = lattice_report(summary_of(run, run.patterns), run)
+    write_page(report, tmp_path / "r.html", lambda done, total, what: told.append(done / total))
     assert told == sorted(told)
     assert told[-1] == 1.0
 
@@ -145,12 +162,12 @@ def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:
     ],
 )
 def test_waves_are_written_in_units_of_pi(wave: tuple[float, float], written: str) -> None:
-    assert words.wave_name(wave) == written
+    assert wave_name(wave) == written
 
 
 def test_a_study_says_where_the_pattern_stops_coming_first() -> None:
-    said = " ".join(words.study_text(made_up.study()))
+    said = " ".join(study_text(made_up.study()))
     assert "from d/l = 0.69 on; at 0.67 it is long waves" in said
     assert "between 0.930 (d/l = 0.3" in said
     every = replace(made_up.study(), ratios=(made_up.row(0.7), made_up.row(0.9)), limits=())
-    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(words.study_text(every))
+    assert "first for every d/l looked at, from 0.7 to 0.9" in " ".join(study_text(every))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from html_page import frame
 from numpy.typing import NDArray
 
 from modeharvest.fem.experiment import Experiment
@@ -205,11 +206,12 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     assert math.isnan(row["a1"])
     found = report_modes(study, table, folder)
     assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.sentences)
-    assert len(found.tables["How they buckle"]) == 3
-    assert list(found.tables["Parameters"]["level"]) == ["", "3.8 mm"]
-    assert len(found.attachments["Every parameter"]) == 2 * 7
-    assert [p.name for p in found.plots] == ["parameters", "overlaps", "patterns", "others"]
-    assert all(p.drawn.axes for p in found.plots)
+    assert len(frame(found.tables, "Buckling")) == 3
+    assert list(frame(found.tables, "Parameters")["level"]) == ["", "3.8 mm"]
+    assert len(frame(found.attachments, "Every parameter")) == 2 * 7
+    figures = [figure for card in found.figures for figure in card.figures]
+    assert [f.name for f in figures] == ["parameters", "overlaps", "patterns", "others"]
+    assert all(figure.draw().axes for figure in figures)
 
 
 def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:

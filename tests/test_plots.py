@@ -27,21 +27,31 @@ from modeharvest.report.figures.curves import (
     pattern_density,
 )
 from modeharvest.report.figures.experiment import (
-    PANELS,
-    ExperimentReportData,
-    SnapshotPanel,
+    ExperimentData,
+    SnapshotState,
     draw_hero,
+    snapshot_panels,
 )
+from modeharvest.report.figures.fits import Panel
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
+from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, to_svg
 
 UNITS = {"µm", "mm⁶"}
 FRACTIONS = {"image", "residual"}  # of full scale: grey levels have no unit
 
 
+PANELS = snapshot_panels(1)
+
+
 @pytest.fixture(scope="module")
-def atlas() -> ExperimentReportData:
-    return made_up.atlas()
+def data() -> ExperimentData:
+    return made_up.data()
+
+
+@pytest.fixture(scope="module")
+def states(data: ExperimentData) -> list[SnapshotState]:
+    return data.states
 
 
 def colour_bar_units(drawn: Figure) -> list[str]:
@@ -55,9 +65,9 @@ def pixels(drawn: Figure) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.key)
 def test_every_panel_states_the_unit_of_its_colours(
-    atlas: ExperimentReportData, panel: SnapshotPanel
+    states: list[SnapshotState], panel: Panel[SnapshotState]
 ) -> None:
-    units = colour_bar_units(panel.draw(atlas, 1))
+    units = colour_bar_units(panel.draw(states[1]))
     if panel.key in FRACTIONS:
         assert units == [""]
     else:
@@ -71,11 +81,11 @@ def test_the_panels_of_the_paper_are_all_there() -> None:
 
 
 @pytest.mark.parametrize("name", ["residual", "w", "best", "loss"])
-def test_a_field_without_any_value_is_drawn_blank(atlas: ExperimentReportData, name: str) -> None:
-    nothing = np.full_like(atlas.comparisons[0].displacement, np.nan)
-    empty = replace(atlas.comparisons[0], displacement=nothing, residual=nothing[..., 0])
+def test_a_field_without_any_value_is_drawn_blank(data: ExperimentData, name: str) -> None:
+    nothing = np.full_like(data.comparisons[0].displacement, np.nan)
+    empty = replace(data.comparisons[0], displacement=nothing, residual=nothing[..., 0])
     panel = next(p for p in PANELS if p.key == name)
-    drawn = panel.draw(replace(atlas, comparisons=[empty, empty]), 0)
+    drawn = panel.draw(replace(data, comparisons=[empty, empty]).states[0])
     assert colour_bar_units(drawn)
 
 
@@ -95,7 +105,7 @@ def sides(drawn: Figure) -> dict[str, NDArray[np.float64]]:
 
 
 def test_a_field_is_drawn_the_right_way_up() -> None:
-    sheet = MapFrame.of(made_up.plate(), made_up.GRID)
+    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
     up = np.repeat(np.sign(sheet.grid.y)[:, None], sheet.grid.cols, axis=1)
     colour = sides(draw_field(sheet, up, ColourScale.signed(up, "µm")))
     for side in ("left", "right"):
@@ -105,7 +115,7 @@ def test_a_field_is_drawn_the_right_way_up() -> None:
 
 
 def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
-    sheet = MapFrame.of(made_up.plate(), made_up.GRID)
+    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
     X, Y = sheet.moved_corners(None)
     moved_X, moved_Y = sheet.moved_corners(
         lambda x, y: np.stack(np.broadcast_arrays(0.3 + 0 * x * y, 2 * y + 0 * x), axis=-1)
@@ -118,7 +128,7 @@ def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
 
 
 def test_averages_leave_missing_pixels_out() -> None:
-    sheet = MapFrame.of(made_up.plate(), made_up.GRID, cells=26)
+    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID, cells=26)
     assert sheet.factor == 5
     field = np.full(made_up.GRID.shape, 2.0)
     field[::2] = np.nan
@@ -167,8 +177,8 @@ def test_paths_of_any_completeness_are_drawn(
     assert pixels(draw_eigenvalues(path, critical)).size
 
 
-def test_the_rings_are_at_the_wave_vectors(atlas: ExperimentReportData) -> None:
-    spectrum, _ = atlas.spectra[1]
+def test_the_rings_are_at_the_wave_vectors(data: ExperimentData) -> None:
+    spectrum, _ = data.spectra[1]
     waves = (
         PlaneWave((1.0, 0.9), (0.1, 0.1), 0.0, 0.0),
         PlaneWave((-1.0, 0.8), (0.1, 0.1), 0.0, 0.0),
@@ -191,17 +201,17 @@ def test_the_colours_of_a_density_end_at_the_pattern() -> None:
     assert pattern_density(made_spectrum, replace(pattern, waves=())) == 0.0
 
 
-def test_each_level_of_the_correlation_is_a_curve(atlas: ExperimentReportData) -> None:
-    history = atlas.comparisons[0].result.history
-    curves = draw_convergence(atlas.comparisons[0].result).axes[0].lines
+def test_each_level_of_the_correlation_is_a_curve(data: ExperimentData) -> None:
+    history = data.comparisons[0].result.history
+    curves = draw_convergence(data.comparisons[0].result).axes[0].lines
     assert [len(np.asarray(line.get_xdata())) for line in curves] == [2, 2]
     drawn = np.concatenate([np.asarray(line.get_ydata()) for line in curves])
     np.testing.assert_array_equal(drawn, [step.step_px for step in history])
-    assert draw_convergence(replace(atlas.comparisons[0].result, history=())).axes
+    assert draw_convergence(replace(data.comparisons[0].result, history=())).axes
 
 
-def test_the_svg_stands_on_its_own(atlas: ExperimentReportData) -> None:
-    svg = to_svg(draw_hero(atlas, 1), "hero", 'a "title" & more')
+def test_the_svg_stands_on_its_own(states: list[SnapshotState]) -> None:
+    svg = to_svg(draw_hero(states[1]), "hero", 'a "title" & more')
     assert svg.startswith("<svg viewBox=")
     assert svg.endswith("</svg>")
     assert 'aria-label="a &quot;title&quot; &amp; more"' in svg
@@ -219,7 +229,7 @@ def test_the_svg_stands_on_its_own(atlas: ExperimentReportData) -> None:
     assert to_hex(MUTED) not in svg
 
 
-def test_drawing_leaves_matplotlib_as_it_was(atlas: ExperimentReportData) -> None:
+def test_drawing_leaves_matplotlib_as_it_was(states: list[SnapshotState]) -> None:
     before = dict(mpl.rcParams)
-    to_svg(draw_hero(atlas, 0), "hero", "")
+    to_svg(draw_hero(states[0]), "hero", "")
     assert dict(mpl.rcParams) == before

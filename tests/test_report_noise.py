@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic_report as made_up
 
-from modeharvest.report import experiment as words
+from modeharvest.report.experiment import key_numbers, notes, number_cards
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.experiment import Run
 from modeharvest.util.files import read_json
@@ -76,20 +76,24 @@ def test_gain_and_offset_are_told_where_they_were_unknown(exposed: Run) -> None:
 
 
 def summary(**snapshot: Any) -> dict[str, Any]:
-    made = made_up.summary(made_up.atlas((0.1,)))
+    made = made_up.summary(made_up.data((0.1,)))
     made["snapshots"][0] |= {"pattern_inner_px": 0.2} | snapshot
     return made
 
 
 def note(made: dict[str, Any], about: str) -> str:
-    (found,) = (said for said in words.notes(made) if about in said)
+    (found,) = (said for said in notes(made) if about in said)
     return found
 
 
+def row_labels(made: dict[str, Any]) -> list[str]:
+    return [str(row[0]) for card in number_cards(made) for t in card.tables for row in t.rows]
+
+
 def test_rows_that_no_snapshot_has_are_left_out() -> None:
-    labels = [row["label"] for row in words.number_rows(summary(noise_sd=None, chi_square=None))]
+    labels = row_labels(summary(noise_sd=None, chi_square=None))
     assert not any("χ²" in label or "gain" in label for label in labels)
-    labels = [row["label"] for row in words.number_rows(summary(noise_sd=0.01, chi_square=1.2))]
+    labels = row_labels(summary(noise_sd=0.01, chi_square=1.2))
     assert sum("χ²" in label for label in labels) == 1
 
 
@@ -103,8 +107,8 @@ def test_what_standard_errors_mean_depends_on_the_images() -> None:
 
 def test_a_held_mode_has_no_parameters_off_the_ideal() -> None:
     held = summary(mode=[], mode_deviation_percent=[])
-    assert "Held at the ideal pattern" in note(held, "there is no pattern")
-    assert not any("nan" in said for said in words.notes(held))
-    (key,) = (k for k in words.key_numbers(held) if k["name"] == "mode off the ideal")
-    assert (key["value"], key["remark"]) == ("–", "held at the ideal pattern")
-    assert "% off the ideal" in note(summary(), "there is no pattern")
+    assert "Fixed at the ideal pattern" in note(held, "no pattern is observable")
+    assert not any("nan" in said for said in notes(held))
+    (key,) = (k for k in key_numbers(held) if k.name == "deviation of the mode")
+    assert (key.value, key.remark) == (None, "fixed at the ideal pattern")
+    assert "% off the ideal" in note(summary(), "no pattern is observable")

@@ -18,7 +18,7 @@ from scipy import ndimage
 from modeharvest.cli import root
 from modeharvest.idic.local.field import LocalField
 from modeharvest.imaging.photographs.files import read_image
-from modeharvest.report.model import short
+from modeharvest.report.model import number
 from modeharvest.runs.benchmark import grade_star
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
@@ -261,7 +261,7 @@ def star_set(tmp_path_factory: pytest.TempPathFactory) -> StarSet:
 
 def short_of(code: dict[str, float]) -> str:
     """As the page writes it."""
-    return f">{short(code['finest_px'])}<"
+    return f">{number(code['finest_px'])}<"
 
 
 def write(path: Path, star_set: StarSet, v: FloatArray, u: FloatArray | None = None) -> Path:

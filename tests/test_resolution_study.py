@@ -217,7 +217,8 @@ def test_findings_of_a_resolution_study(
         assert d["indicator_px2"]["v1"] == pytest.approx(mean * d["floor_px"]["v1phi1"])
     # Theory: a subset's n l10 is 3.99 sqrt(2) s / G.
     assert 0.3 < found.numbers["affine_subset_indicator_px2"] < 3.0
-    assert len(found.plots) == 4
+    assert len(found.figures) == 4
+    assert all(f.draw().axes for card in found.figures for f in card.figures)
     assert len(found.sentences) == 7
     assert not any("nan" in sentence for sentence in found.sentences)
 

@@ -23,7 +23,7 @@ from synthetic_benchmark import PIXEL, STRAIN
 from modeharvest.cli.root import main
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.report.model import short
+from modeharvest.report.model import number
 from modeharvest.validation.scoring import score as grades
 from modeharvest.validation.scoring import score as spectra
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
@@ -110,7 +110,7 @@ def test_files_and_page_tell_the_same(command: tuple[Path, str, int]) -> None:
         rms = field["everywhere"]["rms_px"]
         (row,) = (r for r in rows if (r["field"], r["region"]) == (field["name"], "everywhere"))
         assert float(row["rms [px]"]) == pytest.approx(rms, rel=1e-5)
-        assert short(float(f"{rms:.3g}")) in page
+        assert number(rms, 3) in page
     assert "sparse covers" in said
     assert "sparse covers" in page
     assert "report.html" in said

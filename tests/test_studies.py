@@ -13,14 +13,14 @@ import numba
 import numpy as np
 import pandas as pd
 import pytest
-from html_page import Page
+from html_page import Page, frame
 from scipy import stats
 from test_cli import called, error_line
 
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.pair import ImagePair
-from modeharvest.report import study_robustness as report
 from modeharvest.report.study_noise import report_noise
+from modeharvest.report.study_robustness import report_robustness
 from modeharvest.report.study_systematic import report_systematic
 from modeharvest.runs.case import shipped_cases, shipped_solution
 from modeharvest.runs.study import StudyAnalysis, StudyCase
@@ -106,7 +106,7 @@ def test_numbers_of_a_robustness_study() -> None:
     table.loc[98, "outcome"] = "local_minimum"
     table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
-    found = report.report_robustness(RobustnessStudy(), table, Path())
+    found = report_robustness(RobustnessStudy(), table, Path())
     numbers = found.numbers
     assert (numbers["starts"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
     assert numbers["success"] == 0.97
@@ -115,10 +115,11 @@ def test_numbers_of_a_robustness_study() -> None:
     assert numbers["mean_epsilon_without_outliers_percent"] == pytest.approx(0.5 / 98)
     assert numbers["largest_distance_px"] == 2.0
     assert numbers["other_minimum_called_converged"] == 1
-    assert found.sentences[0].startswith("97 of 100 starts")
-    assert any("1 failed, and count as not arrived" in s for s in found.sentences)
-    assert any("does not see 1 of the 2 ends elsewhere" in s for s in found.sentences)  # 0.5 %
-    assert any("2 that end elsewhere, 1 pass for converged" in s for s in found.sentences)
+    assert found.sentences[0].startswith("97 of 100 initial guesses")
+    assert any("1 failed, and count as not converged" in s for s in found.sentences)
+    # Its epsilon is 0.5 %.
+    assert any("does not detect 1 of the 2 results in other" in s for s in found.sentences)
+    assert any("2 in other minima, 1 are called converged" in s for s in found.sentences)
 
 
 def test_the_basin_ends_where_the_first_start_is_lost() -> None:
@@ -128,11 +129,11 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
                             + ["converged"] * (4 - lost))  # fmt: skip
         parts.append(part.assign(radius=radius))
     table = pd.concat(parts, ignore_index=True)
-    found = report.report_robustness(RobustnessStudy(), table, Path())
-    (said,) = [s for s in found.sentences if "All starts arrive" in s]
+    found = report_robustness(RobustnessStudy(), table, Path())
+    (said,) = [s for s in found.sentences if "All initial guesses converge" in s]
     assert "up to 10 % off" in said
     assert "50 %: 1 of 4" in said
-    basin = found.tables["Basin of convergence"]
+    basin = frame(found.tables, "Basin of convergence")
     assert list(basin["same minimum"]) == [4, 4, 3, 4, 1]
     assert list(basin["other minima detected"]) == [
         "0 of 0",
@@ -244,13 +245,14 @@ def test_noise_study_on_tiny_images(
     rows = [{**case, "error": "", **asdict(one_realisation(case, folder))}
             for case in cases]  # fmt: skip
     found = report_noise(study, pd.DataFrame(rows), folder)
-    summary = found.attachments["Noise levels"].set_index("quantity")
+    summary = frame(found.attachments, "Noise levels").set_index("quantity")
     # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
     assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
     assert 0.6 < summary.loc["u", "rms error / bound"] < 1.6
-    assert len(found.attachments["Each unknown"]) == 77
+    assert len(frame(found.attachments, "Each unknown")) == 77
     plots = {"causes", "bars", "ratio", "bias", "coverage", "unknowns", "maps"}
-    assert plots == {p.name for p in found.plots}
+    assert plots == {f.name for card in found.figures for f in card.figures}
+    assert all(f.draw().axes for card in found.figures for f in card.figures)
     # n and -n push the other way: what is common to them is of second order.
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
     assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)
@@ -279,7 +281,7 @@ def test_systematic_study_on_tiny_images(subject: ImagePairSpec, folder: Path) -
     }
     assert (kept, gone) == ({True}, {False})
     found = report_systematic(study, pd.DataFrame(rows), folder)
-    levels = found.tables["Every level"].set_index(["name", "level"])
+    levels = frame(found.tables, "Every level").set_index(["name", "level"])
     moved = levels["moved from the base [px]"]
     assert moved["order", 5] == 0.0
     assert 0.0 < moved["bits", 10] < 0.1 * moved["bits", 2]  # rounding errors: 341 times
@@ -395,7 +397,7 @@ def test_a_study_from_the_command_line(
     case.write_text(TINY, "utf-8")
     arguments = ("study", case, "--out", out, "--solution", PAPER, "--workers", "1")
     assert called(monkeypatch, *arguments) == 0
-    assert "2 of 2 starts" in (printed := capsys.readouterr().out)
+    assert "2 of 2 initial guesses" in (printed := capsys.readouterr().out)
     assert "report.html" in printed
     summary = read_json(out / "summary.json")
     assert summary["numbers"]["starts"] == 2
@@ -409,9 +411,7 @@ def test_a_study_from_the_command_line(
     monkeypatch.setattr("modeharvest.validation.workers.Workers.client", None)
     assert called(monkeypatch, *arguments) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "cases").iterdir()} == before
-    assert (
-        "1 stored results of modeharvest 0.0.0 were left alone" in (out / "report.html").read_text()
-    )
+    assert "1 stored results of modeharvest 0.0.0" in (out / "report.html").read_text()
 
 
 def test_a_folder_with_something_else_is_not_taken(
@@ -478,10 +478,10 @@ def check_page(text: str, summary: dict[str, Any]) -> None:
     assert not {"script", "link", "iframe"} & set(seen.tags)
     assert {"distances", "epsilon", "basin"} <= set(seen.ids)
     assert "A &lt;tiny&gt; study" in text
-    made = re.findall(r'<p class="fact made">(.*?)</p>', text)
+    made = re.findall(r'<p class="fact">(.*?)</p>', text)
     assert len(made) == 3
     assert all("modeharvest study" in m and "seed 0" in m for m in made)
-    assert text.index("2 of 2 starts") < text.index('id="figures"')  # sentences first
+    assert text.index("2 of 2 initial guesses") < text.index('id="figures"')  # sentences first
     assert summary["command"] in text
 
 

@@ -29,7 +29,8 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image, read_mask
-from modeharvest.report.terminal import print_grading
+from modeharvest.report.grades import grading_report
+from modeharvest.report.model import print_report
 from modeharvest.runs.benchmark import make_benchmark, score, truth_folder
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.util.errors import InputError, MissingDependencyError
@@ -153,7 +154,8 @@ def main() -> None:
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
         fields.append(field)
     graded = OUT / "graded"
-    print_grading(score(fields, truth_folder(public), arguments.strain, graded), graded)
+    done = score(fields, truth_folder(public), arguments.strain, graded)
+    print_report(grading_report(done), graded)
 
 
 def _arguments() -> argparse.Namespace:

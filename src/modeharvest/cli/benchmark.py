@@ -83,7 +83,8 @@ def score(
     Leaves report.html, scores.json and scores.csv in DIR. Fields that can't be graded are named at
     the end, and the exit code is then 2.
     """
-    from modeharvest.report.terminal import print_grading
+    from modeharvest.report.grades import grading_report
+    from modeharvest.report.model import print_report
     from modeharvest.runs.benchmark import declarations
     from modeharvest.runs.benchmark import score as score_fields
     from modeharvest.util.stages import exclusive
@@ -91,7 +92,7 @@ def score(
     declared = declarations(fields, name, unit, y_axis, first_pixel, column)
     with bars() as progress, exclusive(out):
         done = score_fields(declared, truth, strain, out, progress=progress)
-    print_grading(done, out)
+    print_report(grading_report(done), out)
     _refuse(done.refused)
 
 
@@ -152,7 +153,8 @@ def resolution(
     All in px. --y-axis and --first-pixel count for all fields, or are given once for each FIELD;
     its --still has the same. Leaves report.html, resolution.json and resolution.csv in DIR.
     """
-    from modeharvest.report.terminal import print_star_grading
+    from modeharvest.report.grades import star_report
+    from modeharvest.report.model import print_report
     from modeharvest.runs.benchmark import declarations, grade_star
     from modeharvest.util.stages import exclusive
 
@@ -160,5 +162,5 @@ def resolution(
     quiet = declarations(still, name, None, y_axis, first_pixel, column) if still else {}
     with bars() as progress, exclusive(out):
         done = grade_star(declared, quiet, folder, out, progress)
-    print_star_grading(done, out)
+    print_report(star_report(done), out)
     _refuse(done.refused)

@@ -45,7 +45,9 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     same command again after an interruption: finished stages are not repeated. The twin of a real
     experiment is photographed, harvested from its photographs alone, and set against its truth.
     """
-    from modeharvest.report.terminal import print_experiment, print_harvest
+    from modeharvest.report.experiment import experiment_report
+    from modeharvest.report.model import print_report
+    from modeharvest.report.photographs import photographs_report
     from modeharvest.runs.case import Case
 
     checked = Case.read(case)  # before the heavy imports, so that a typo is reported at once
@@ -54,11 +56,11 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
 
         with bars() as progress:
             summary = TwinRun(checked, out, progress, solution).all()
-        print_harvest(summary, out / "harvest")
+        print_report(photographs_report(summary), out / "harvest")
         return
     with _stages(case, out, solution) as stages:
         summary = stages.all()
-    print_experiment(summary, out)
+    print_report(experiment_report(summary), out)
 
 
 def fem(case: CaseName, out: OutFolder) -> None:
@@ -67,7 +69,7 @@ def fem(case: CaseName, out: OutFolder) -> None:
     Finds the critical strain, proves stability by the tangent's inertia, follows the buckled
     branch. Under mpirun it runs in parallel.
     """
-    from modeharvest.report.terminal import critical_line
+    from modeharvest.report.experiment import critical_line
 
     with _stages(case, out) as stages:
         solution = stages.fem()
@@ -104,11 +106,12 @@ def correlate(case: CaseName, out: OutFolder) -> None:
 
 def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
-    from modeharvest.report.terminal import print_experiment
+    from modeharvest.report.experiment import experiment_report
+    from modeharvest.report.model import print_report
 
     with _stages(case, out, solution) as stages:
         summary = stages.validate()
-    print_experiment(summary, out)
+    print_report(experiment_report(summary), out)
 
 
 @contextmanager
@@ -129,11 +132,12 @@ def bloch(case: CaseName, out: OutFolder) -> None:
     Leaves the first critical load and waves with their proof, the lowest eigenvalues against the
     wave vector at several loads (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
-    from modeharvest.report.terminal import print_lattice
+    from modeharvest.report.lattice import lattice_report
+    from modeharvest.report.model import print_report
 
     with _analysis(case, out) as analysis:
         summary = analysis.bloch()
-    print_lattice(summary, out)
+    print_report(lattice_report(summary), out)
 
 
 def modes(case: CaseName, out: OutFolder) -> None:
@@ -142,11 +146,12 @@ def modes(case: CaseName, out: OutFolder) -> None:
     Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
     cell, branches with their energies, spectra, and the Fourier mode families found in them.
     """
-    from modeharvest.report.terminal import print_lattice
+    from modeharvest.report.lattice import lattice_report
+    from modeharvest.report.model import print_report
 
     with _analysis(case, out) as analysis:
         summary = analysis.all()
-    print_lattice(summary, out)
+    print_report(lattice_report(summary), out)
 
 
 @contextmanager
@@ -191,12 +196,13 @@ def harvest(
     experiment.toml'. Leaves results/, report.html and summary.json in DIR. Run the same command
     again after an interruption: finished photographs are not measured again.
     """
-    from modeharvest.report.terminal import print_harvest
+    from modeharvest.report.model import print_report
+    from modeharvest.report.photographs import photographs_report
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
 
     with bars() as progress:
         summary = harvest_photographs(experiment, out, progress)
-    print_harvest(summary, out)
+    print_report(photographs_report(summary), out)
 
 
 def study(
@@ -232,7 +238,7 @@ def study(
         raise InputError(
             "expected --workers or --scheduler, got both: a scheduler has workers of its own"
         )
-    from modeharvest.report.terminal import print_study
+    from modeharvest.report.model import print_report, study_report
     from modeharvest.runs.study import StudyAnalysis, StudyCase
     from modeharvest.validation.workers import Workers
 
@@ -243,4 +249,4 @@ def study(
     with bars() as progress:
         case = checked.quick() if quick else checked
         summary = StudyAnalysis(case, out, progress, crew, solution, command).all()
-    print_study(summary, out)
+    print_report(study_report(summary), out)

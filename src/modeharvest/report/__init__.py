@@ -1,1 +1,1 @@
-"""Reports for readers: pages, figures, tables and terminal output; nothing here computes results."""
+"""Reports: pages, tables and terminal output of runs."""

@@ -1,180 +1,117 @@
-"""``report.html`` of a virtual experiment: figures of every snapshot, tables, notes."""
+"""Report of a virtual experiment: every panel of the paper's figures for every snapshot, tables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.report.figures.curves import draw_convergence, draw_eigenvalues, draw_load
 from modeharvest.report.figures.experiment import (
-    ExperimentReportData,
-    SnapshotPanel,
+    ExperimentData,
+    SnapshotState,
     draw_hero,
-    panels_of,
+    snapshot_label,
+    snapshot_panels,
 )
-from modeharvest.report.figures.style import to_svg
-from modeharvest.report.model import Picture, material_text, render
-from modeharvest.util.files import atomic
-from modeharvest.util.progress import Progress, silent
+from modeharvest.report.figures.fits import panel_sections, shape_numbers
+from modeharvest.report.model import (
+    Card,
+    Cell,
+    KeyNumber,
+    Mark,
+    Measured,
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    material_text,
+    number,
+    percent,
+)
 from modeharvest.util.typed import quantities
 from modeharvest.validation.summary import SnapshotSummary
 
 Snapshot = Mapping[str, Any]
+Summary = Mapping[str, Any]
 
-_MODE = (("a₁", "–"), ("a₂", "–"), ("a₃", "–"), ("a₄", "–"), ("a₅", "–"), ("a₆", "mm"),
-         ("a₇", "mm"))  # fmt: skip
-_DETAILS = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}
-
-
-def key_numbers(summary: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The few numbers at the top: what they are called, the number, its unit, a remark."""
-    last = summary["snapshots"][-1]
-    at = f"at {100 * last['nominal_strain']:.4g}\N{NO-BREAK SPACE}%"
-    critical = summary.get("critical_strain")
-    expected = summary.get("expected", [])
-    met = sum(bool(row["ok"]) for row in expected)
-    keys = [
-        _key("critical strain", None if critical is None else 100 * critical, "%",
-             "none found" if critical is None else "where the pattern sets in", 4),
-        _key("pattern", last["pattern_amplitude_px"], "px", f"largest {_symbol(last)} {at}", 3),
-        _key("best possible fit", last["rms_best_fit_px"], "px", "rms, what the model can't say",
-             3),
-        _key("IDIC − best fit", last["rms_idic_to_best_fit_px"], "px",
-             "rms, what the measurement loses", 2),
-        {"name": "expected values met", "value": f"{met} of {len(expected)}" if expected else "–",
-         "unit": "", "remark": "table below" if expected else "none known for this specimen"},
-    ]  # fmt: skip
-    if "modes" in last:
-        observable = [mode["observable"] for mode in last["modes"]]
-        text = f"{sum(observable)} of {len(observable)}"
-        mode = {"name": "modes", "value": text, "unit": "", "remark": f"observable {at}"}
-    else:
-        free = bool(last.get("mode_deviation_percent"))
-        remark = f"the worst of a₁ … a₇ {at}" if free else "held at the ideal pattern"
-        mode = _key("mode off the ideal", _largest_deviation(last), "%", remark, 2)
-    return [*keys[:2], mode, *keys[2:]]
+_LEAD = (
+    "A finite-element model of a cellular elastomer is compressed until its pattern of holes "
+    "buckles. Its exact displacements make speckle images whose truth is known at every pixel; "
+    "micromorphic digital image correlation measures those images. This page gives the error of "
+    "the measurement and its parts."
+)
+_MODE = tuple(
+    zip(("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇"), ("-",) * 5 + ("mm",) * 2, strict=True)
+)
 
 
-def number_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the table of numbers: label, unit, a value for each snapshot."""
-    snapshots = summary["snapshots"]
-    return [
-        {
-            "label": label.replace("v₁φ₁", _symbol(snapshots[0])),
-            "unit": unit,
-            "values": [s.get(key) for s in snapshots],
-        }
-        for label, unit, key in quantities(SnapshotSummary)
-        if any(s.get(key) is not None for s in snapshots)
-    ]
+def experiment_report(summary: Summary, data: ExperimentData | None = None) -> Report:
+    """The report of a virtual experiment.
 
-
-def mode_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the modes' parameters: for each snapshot value, standard errors and best fit."""
-    snapshots = [s for s in summary["snapshots"] if len(s.get("mode", ())) == len(_MODE)]
-    if not snapshots:
-        return _rows_of_modes([s["modes"] for s in summary["snapshots"] if "modes" in s])
-    ideal = snapshots[0].get("mode_ideal", REFERENCE_MODE)
-    return [
-        {"name": name, "unit": unit, "ideal": ideal[k],
-         "cells": [{"value": s["mode"][k], "error": _item(s.get("mode_standard_error"), k),
-                    "model": _item(s.get("mode_model_error"), k),
-                    "best": _item(s.get("mode_best_fit"), k)} for s in snapshots]}
-        for k, (name, unit) in enumerate(_MODE)
-    ]  # fmt: skip
-
-
-def _rows_of_modes(snapshots: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """The same for several modes, their parameters one below the other."""
-    return [
-        {"name": f"φ{'₁₂₃'[i]} {name}", "unit": mode["units"][k].replace("-", "–"),
-         "ideal": mode["ideal"][k],
-         "cells": [{"value": s[i]["found"][k], "error": _item(s[i]["standard_error"], k),
-                    "model": _item(s[i]["model_error"], k),
-                    "best": _item(s[i]["best_fit"], k)} for s in snapshots]}
-        for i, mode in enumerate(snapshots[0] if snapshots else ())
-        for k, name in enumerate(mode["names"])
-    ]  # fmt: skip
-
-
-def panel_numbers(key: str, snapshot: Snapshot) -> str:
-    """One line of numbers under the picture of a panel; empty if there is nothing to add."""
-    if key in _DETAILS:
-        details = snapshot.get("details_px", {}).get(_DETAILS[key])
-        if details is None:
-            return ""
-        return (
-            f"rms {details['rms_per_component']:.3g} px per component; lengths: median "
-            f"{details['median_length']:.3g} px, largest {details['max_length']:.3g} px"
-        )
-    if key == "residual":
-        return f"rms {snapshot['rms_residual']:.3g} of full scale"
-    if key == "v1" and "pattern_inner_px" in snapshot:
-        return (
-            f"{_symbol(snapshot)}: at most {snapshot['pattern_inner_px']:.3g} px inside, "
-            f"{snapshot['pattern_corners_px']:.3g} px in the corner cells"
-        )
-    return ""
-
-
-def notes(summary: Mapping[str, Any]) -> list[str]:
-    """What a reader should know before trusting the numbers, drawn from the data."""
-    said = [_expected(summary.get("expected", []))]
-    if str(summary.get("simulation_outcome") or "complete") != "complete":
-        said.append(f"The simulation is {summary['simulation_outcome']}.")
-    for snapshot in summary["snapshots"]:
-        said += _about(snapshot)
-    said += [
-        _standard_errors(summary),
-        "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
-        "gradient and leaves out the rims of the holes: even without any noise the two differ.",
-        "rms is per component: the root of the mean square over both components of all material "
-        "pixels. The rms length of the vectors is √2 times that.",
-    ]
-    if summary.get("expected"):
-        said.append(
-            "The paper does not give its material constants and prints fields, not numbers. The "
-            "expected values come from an independent calculation with this project's choice of "
-            "material."
-        )
-    return said
-
-
-def _standard_errors(summary: Mapping[str, Any]) -> str:
-    """What the standard errors mean for these images."""
-    noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
-    sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
-    if noise:
-        said = (
-            "The images are single exposures of the virtual camera, with a predicted noise of "
-            f"{max(noise):.2g} of full scale (rms; rounding to whole grey levels is part of it): "
-            "where χ² is above 1, the rest of the residual is"
-        )
-    elif sensor.get("read_noise") or sensor.get("full_well"):
-        said = (
-            "The sensor makes noise, but what was measured are its noise-free averages "
-            "(“camera = true” measures the exposures): the residual is"
-        )
-    else:
-        said = "No noise was added to these images: the residual is"
-    return (
-        "Of a parameter's two standard errors the first takes the whole residual for white noise "
-        f"in both images. {said} what the ansatz can't describe, so it says how firmly the images "
-        "hold a parameter, not how far it is from the truth. The second, by model error, takes "
-        "each unit cell's share of the residual for one draw. Compare them with the best fit "
-        "beside."
+    Parameters
+    ----------
+    summary
+        The content of ``summary.json``.
+    data
+        What its figures show; without, the report has numbers only, as for the terminal.
+    """
+    case = summary.get("case", {})
+    imperfection = case.get("experiment", {}).get("imperfection")
+    seeds = [f"speckle {case['imaging']['speckle']['seed']}"] if "imaging" in case else []
+    seeds += [f"imperfection {imperfection['seed']}"] if imperfection else []
+    material = case.get("experiment", {}).get("material")
+    factorisations = number(summary.get("factorisations"))
+    residual = number(summary["inverse_map_max_residual_px"])
+    states = data.states if data is not None else []
+    return Report(
+        kind="virtual experiment",
+        title=summary.get("title") or "Validation",
+        lead=_LEAD,
+        findings=(
+            [critical_line(summary.get("critical_strain"), material)]
+            + [text for text in (_expected(summary), *_energies(summary)) if text]
+        ),
+        keys=key_numbers(summary),
+        sections=[
+            Section("expected", "Obtained and expected values", _expected_cards(summary)),
+            *([] if data is None else _figures(data, summary)),
+            Section("numbers", "Numbers", number_cards(summary)),
+            *([_convergence(states, summary["snapshots"])] if states else []),
+        ],
+        warnings=summary.get("warnings", []),
+        notes=notes(summary),
+        command="modeharvest run CASE --out DIR",
+        remark="CASE is the name of a shipped case (paper-virtual is the paper’s) or a TOML file "
+        f"with the values below. Seeds: {', '.join(seeds)}.",
+        case=case,
+        costs={
+            "factorisations of the whole path": factorisations,
+            "largest residual of the inverse mapping": f"{residual} px",
+        },
+        versions=summary.get("versions", {}),
+        hero=_hero(data) if data is not None else None,
+        hero_caption=Markup(
+            "{}: the deformed speckle turns, from left to right, into the length of the "
+            "pattern that was measured in it, in the deformed configuration."
+        ).format(states[-1].label if states else ""),
     )
 
 
-def _expected(rows: Sequence[Mapping[str, Any]]) -> str:
-    if not rows:
-        return "No expected values are known for this specimen: nothing to compare with."
+def critical_line(strain: float | None, material: Mapping[str, Any] | None) -> str:
+    """A sentence on the critical strain [-], None if the path has no bifurcation, and of what."""
+    text = "No bifurcation on the path (stable, imperfect, or odd numbers of holes both ways)"
+    if strain is not None:
+        text = f"Critical strain {100 * strain:.4f} %"
+    return f"{text}; {material_text(material)}." if material else f"{text}."
+
+
+def _expected(summary: Summary) -> str:
+    rows = summary.get("expected", [])
     missed = [
         f"{row['quantity']}: expected {row['expected']}, obtained {row['obtained']:.4g} "
         f"{row['unit']}"
@@ -183,51 +120,345 @@ def _expected(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     if missed:
         return f"Missed {len(missed)} of {len(rows)} expected values: {'; '.join(missed)}."
-    return f"All {len(rows)} expected values are met."
+    return f"All {len(rows)} expected values are met." if rows else ""
 
 
-def _about(snapshot: Snapshot) -> list[str]:
-    """Warnings about one snapshot."""
-    at = f"At {100 * snapshot['nominal_strain']:.4g} %"
-    said = []
-    if snapshot.get("negative_pivots"):
-        said.append(
-            f"{at} the state is unstable ({snapshot['negative_pivots']} negative pivots): a real "
-            "specimen would not be found in it."
-        )
-    if snapshot["outcome"] != "converged":
-        said.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
-                    f"{snapshot['outcome_why']}")  # fmt: skip
-    if snapshot.get("undetermined"):
-        said.append(f"{at} the images say nothing about {', '.join(snapshot['undetermined'])}.")
-    said += [f"{at} {warning}." for warning in snapshot.get("identifiability_warnings", ())]
-    if "residual_verdict" in snapshot:
-        verdict = snapshot["residual_verdict"]
-        said.append(f"{at} {verdict[0].lower()}{verdict[1:]}")
-    if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice that noise asks for
-        weighting = snapshot["weighting"]
-        said.append(f"{at} {weighting[0].lower()}{weighting[1:]}")
-    inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
-    if inner is not None and corners is not None and inner < corners:
-        describes = (
-            "The modes describe"
-            if "modes" in snapshot
-            else f"The mode's parameters (up to {_largest_deviation(snapshot):.0f} % off the ideal) "
-            "describe"
-            if _is_free(snapshot)
-            else "Held at the ideal pattern, the mode describes"
-        )
-        said.append(
-            f"{at} there is no pattern to be observed: {_symbol(snapshot)} is at most {inner:.2g} px inside. "
-            f"{describes} the edge effect in the corner cells ({corners:.2g} px) that the mode "
-            "takes up, as in the paper; the best fit to the truth does the same."
-        )
-    return said
+def _energies(summary: Summary) -> list[str]:
+    return [
+        f"At {percent(row['nominal_strain'])} the buckled state stores an energy of "
+        f"{number(row['branch_N'])} N·mm per mm of thickness, the unstable one at the same strain "
+        f"{number(row['unstable_N'])} N·mm."
+        for row in summary.get("energy_below_unstable", [])
+    ]
+
+
+def key_numbers(summary: Summary) -> list[KeyNumber]:
+    """The few numbers at the top."""
+    last = summary["snapshots"][-1]
+    at = f"at {percent(last['nominal_strain'])}"
+    critical = summary.get("critical_strain")
+    expected = summary.get("expected", [])
+    met = sum(bool(row["ok"]) for row in expected)
+
+    def key(name: str, value: float | None, unit: str, remark: str, digits: int = 3) -> KeyNumber:
+        known = value is not None and value == value
+        return KeyNumber(name, f"{value:.{digits}g}" if known else None, unit, remark)
+
+    return [
+        key("critical strain", None if critical is None else 100 * critical, "%",
+            "none found" if critical is None else "where the pattern sets in", 4),
+        key("pattern", last["pattern_amplitude_px"], "px", f"largest {_symbol(last)} {at}"),
+        _mode_key(last, at),
+        key("model (ansatz) error", last["rms_best_fit_px"], "px", f"rms of truth − best fit {at}"),
+        key("measurement error", last["rms_idic_to_best_fit_px"], "px",
+            f"rms of IDIC − best fit {at}", 2),
+        KeyNumber("expected values met", f"{met} of {len(expected)}" if expected else None, "",
+                  "table below" if expected else "none known for this specimen"),
+    ]  # fmt: skip
+
+
+def _mode_key(last: Snapshot, at: str) -> KeyNumber:
+    """The mode against the ideal one; of several modes, how many are observable."""
+    if "modes" in last:
+        observable = [mode["observable"] for mode in last["modes"]]
+        count = f"{sum(observable)} of {len(observable)}"
+        return KeyNumber("modes", count, "", f"observable {at}")
+    if not _is_free(last):
+        return KeyNumber("deviation of the mode", None, "", "fixed at the ideal pattern")
+    remark = f"from the ideal pattern, the largest of a₁ … a₇ {at}"
+    return KeyNumber("deviation of the mode", f"{_largest_deviation(last):.2g}", "%", remark)
 
 
 def _symbol(snapshot: Snapshot) -> str:
     """The pattern, of one mode or of several."""
     return "Σ vᵢφᵢ" if "modes" in snapshot else "v₁φ₁"
+
+
+def _expected_cards(summary: Summary) -> list[Card]:
+    rows = [
+        (row["quantity"], row["obtained"], row["unit"].replace("-", "–"), row["expected"],
+         verdict(row["ok"]), row["source"])
+        for row in summary.get("expected", [])
+    ]  # fmt: skip
+    columns = ("quantity", "obtained", "unit", "expected", "", "source")
+    table = ReportTable("Expected values", columns, rows, name="expected-values")
+    return [Card.tabular(table, wide=True)] if rows else []
+
+
+def verdict(ok: bool) -> Mark:
+    """Whether an expected value was met."""
+    return Mark("✓ met" if ok else "✗ missed", ok)
+
+
+def number_cards(summary: Summary) -> list[Card]:
+    """Tables of all snapshots; rows that no snapshot has are left out."""
+    snapshots, critical = summary["snapshots"], summary.get("critical_strain")
+    rows: list[list[Cell]] = []
+    for label, unit, name in quantities(SnapshotSummary):
+        values = [s.get(name) for s in snapshots]
+        if any(value is not None for value in values):
+            text = label.replace("v₁φ₁", _symbol(snapshots[0]))
+            rows.append([f"{text} [{unit}]" if unit not in ("", "–") else text, *values])
+    labels = [snapshot_label(s["nominal_strain"], s["branch"], critical) for s in snapshots]
+    columns = ("rms: per component, all material", *labels)
+    table = ReportTable("Results", columns, rows, name="results", on_terminal=True)
+    return [Card.tabular(table), *_mode_cards(summary)]
+
+
+def _mode_cards(summary: Summary) -> list[Card]:
+    """The modes' parameters, each with both standard errors, and the best fit's."""
+    strains, snapshots = [], []
+    for snapshot in summary["snapshots"]:
+        if modes := _modes_of(snapshot):
+            strains.append(percent(snapshot["nominal_strain"]))
+            snapshots.append(modes)
+    if not snapshots:
+        return []
+    several = len(snapshots[0]) > 1
+    columns, rows = ["", "ideal"], []
+    for strain in strains:
+        columns += [f"{strain}: IDIC ± noise ± model error", f"{strain}: best fit"]
+    for i, mode in enumerate(snapshots[0]):
+        for k, (name, unit) in enumerate(zip(mode["names"], mode["units"], strict=True)):
+            text = f"φ{i + 1} {name}" if several else name
+            row: list[Cell] = [f"{text} [{unit}]" if unit != "-" else text, mode["ideal"][k]]
+            for modes in snapshots:
+                row += _parameter(modes[i], k)
+            rows.append(row)
+    caption = _SEVERAL_MODES if several else _ONE_MODE
+    table = ReportTable("Parameters of the modes", columns, rows, name="mode")
+    return [Card.tabular(table, caption=caption, wide=True)]
+
+
+_ONE_MODE = (
+    "Of all equivalent sets of parameters the one nearest to the ideal; Eq. (mode) of the paper "
+    "with the origin at a solid junction between four holes."
+)
+_SEVERAL_MODES = (
+    "Each mode has two waves, one towards an M point of the hole lattice and one across: L1 is the "
+    "longitudinal amplitude of the first, T2 the transverse one of the second, both relative to "
+    "the first one’s transverse amplitude; kx and ky [π/l] are the first one’s wave vector, c1 and "
+    "c2 the phases, zero at the holes’ centres."
+)
+
+
+def _modes_of(snapshot: Snapshot) -> Sequence[Mapping[str, Any]]:
+    """The modes with parameters, in the same form for one and for several."""
+    if "modes" in snapshot:
+        return list(snapshot["modes"])
+    if len(snapshot.get("mode", ())) != len(_MODE):
+        return []
+    names, units = zip(*_MODE, strict=True)
+    mode = {"names": names, "units": units, "found": snapshot["mode"]}
+    mode["ideal"] = snapshot.get("mode_ideal", REFERENCE_MODE)
+    keys = ("standard_error", "model_error", "best_fit")
+    return [mode | {key: snapshot.get(f"mode_{key}") for key in keys}]
+
+
+def _parameter(mode: Mapping[str, Any], k: int) -> list[Cell]:
+    """Parameter k with its standard errors, and the best fit's."""
+    noise, best = _item(mode["standard_error"], k), _item(mode["best_fit"], k)
+    errors = float("inf") if noise is None else noise, _item(mode["model_error"], k)
+    return [Measured(mode["found"][k], errors), None if best is None else Measured(best)]
+
+
+def experiment_figures(data: ExperimentData) -> list[ReportFigure]:
+    """The figures that :func:`experiment_report` refers to, before there is a summary."""
+    panels = snapshot_panels(data.modes)
+    cards = [
+        *_path_cards(data.solution),
+        *(_convergence_card(state) for state in data.states),
+        *(panel.card(data.states, lambda key, state: "") for panel in panels),
+    ]
+    return [_hero(data), *(figure for card in cards for figure in card.figures)]
+
+
+def _hero(data: ExperimentData) -> ReportFigure:
+    drawn = partial(draw_hero, data.states[-1])
+    return ReportFigure("hero", "Image and pattern", drawn, late=not data.modes)
+
+
+def _heads(several: bool) -> dict[str, tuple[str, str]]:
+    """Titles and leads of the sections of panels, for one mode as in the paper, or several."""
+    pattern = "Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"
+    return {
+        "images": (
+            "The image and its pattern",
+            f"{'' if several else 'Fig. “spect_virt” of the paper. '}The family of the mode, which "
+            "the paper’s authors read off the spectral densities by eye, is read by the program "
+            "here.",
+        ),
+        "found": (
+            "Measured displacement",
+            Markup(
+                f"{'' if several else 'Fig. “virt” of the paper. '}The displacement is u = "
+                f"v<sub>0</sub> + {pattern}, a smooth field and a correlated pattern with its "
+                "amplitude. Every colour bar has its own range."
+            ),
+        ),
+        "errors": (
+            "Error analysis",
+            "The error w = truth − IDIC has two parts: the model (ansatz) error, which remains "
+            "however well the displacement is measured, and the measurement error on top of it.",
+        ),
+    }
+
+
+def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
+    snapshots: Sequence[Snapshot] = summary["snapshots"]
+    images, *others = panel_sections(
+        snapshot_panels(data.modes), data.states, _heads(data.modes > 1),
+        lambda key, state: panel_numbers(key, snapshots[state.k]) or shape_numbers(key, state),
+    )  # fmt: skip
+    text = {s.label: snapshots[s.k].get("pattern_reading", ()) for s in data.states}
+    reading = Card("Reading of the densities", text=text, name="reading")
+    cards = [*images.cards[:2], reading, *images.cards[2:]]
+    return [
+        Section("path", "Load path", _path_cards(data.solution)),
+        Section(images.name, images.title, cards, images.lead),
+        *others,
+    ]
+
+
+def panel_numbers(key: str, snapshot: Snapshot) -> str:
+    """One line of numbers under the picture of a panel; empty if there is nothing to add."""
+    if key == "residual":
+        return f"rms {snapshot['rms_residual']:.3g} of full scale"
+    part = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}.get(key, "")
+    details = snapshot.get("details_px", {}).get(part)
+    if details is None:
+        return ""
+    return (
+        f"rms {details['rms_per_component']:.3g} px per component; lengths: median "
+        f"{details['median_length']:.3g} px, largest {details['max_length']:.3g} px"
+    )
+
+
+def _path_cards(solution: Solution) -> list[Card]:
+    """Load path and eigenvalues, where the solution has them."""
+    path, critical = solution.info.get("path"), solution.info.get("critical")
+    if not path or not path.get("primary", {}).get("nominal_strain"):
+        return []
+    load = partial(draw_load, path, None if critical is None else critical["strain"])
+    eigenvalues = partial(draw_eigenvalues, path, critical)
+    return [
+        Card.single(
+            "load", "Load over strain", load,
+            "Points are computed equilibria; the lines only join them. Dashed: the primary "
+            "path where it is unstable. Ring: the critical point.",
+        ),
+        Card.single(
+            "eigenvalues", "Stability", eigenvalues,
+            "Of K x = λ M x along the primary path, M the mass matrix of unit density. "
+            "Bold: the lowest; with the states visited while the critical strain was located. "
+            "Square: the lowest on a buckled branch, above zero where it is stable.",
+        ),
+    ]  # fmt: skip
+
+
+def _convergence_card(state: SnapshotState, caption: str = "") -> Card:
+    drawn = partial(draw_convergence, state.result)
+    return Card.single(f"convergence-{state.name}", state.label, drawn, caption)
+
+
+def _convergence(states: Sequence[SnapshotState], snapshots: Sequence[Snapshot]) -> Section:
+    cards = [_convergence_card(state, snapshots[state.k]["outcome_why"]) for state in states]
+    lead = (
+        "Rms change of the displacement in each Gauss–Newton step, from the coarsest images (1/8: "
+        "pixels joined 8 × 8) to the full ones. Model error makes convergence linear."
+    )
+    return Section("solver", "Convergence", cards, lead)
+
+
+def notes(summary: Summary) -> list[str]:
+    """What a reader should know before trusting the numbers, drawn from the data."""
+    text = []
+    if not summary.get("expected"):
+        text.append("No expected values are known for this specimen: nothing to compare with.")
+    if str(summary.get("simulation_outcome") or "complete") != "complete":
+        text.append(f"The simulation is {summary['simulation_outcome']}.")
+    for snapshot in summary["snapshots"]:
+        text += _about(snapshot)
+    text += [
+        _standard_errors(summary),
+        "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
+        "gradient and leaves out the rims of the holes: even without any noise the two differ.",
+        "rms is per component: the root of the mean square over both components of all material "
+        "pixels. The rms length of the vectors is √2 times that.",
+    ]
+    if summary.get("expected"):
+        text.append(
+            "The paper does not give its material constants and prints fields, not numbers. The "
+            "expected values come from an independent calculation with this project's choice of "
+            "material."
+        )
+    return text
+
+
+def _standard_errors(summary: Summary) -> str:
+    """What the standard errors mean for these images."""
+    noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
+    sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
+    if noise:
+        text = (
+            "The images are single exposures of the virtual camera, with a predicted noise of "
+            f"{max(noise):.2g} of full scale (rms; rounding to whole grey levels is part of it): "
+            "where χ² is above 1, the rest of the residual is"
+        )
+    elif sensor.get("read_noise") or sensor.get("full_well"):
+        text = (
+            "The sensor makes noise, but what was measured are its noise-free averages "
+            "(“camera = true” measures the exposures): the residual is"
+        )
+    else:
+        text = "No noise was added to these images: the residual is"
+    return (
+        "Of a parameter's two standard errors the first takes the whole residual for white noise "
+        f"in both images. {text} model error, so this standard error is the sensitivity of the "
+        "images to a parameter, not its distance from the truth. The second, by model error, takes "
+        "each unit cell's share of the residual for one draw. Compare them with the best fit "
+        "beside."
+    )
+
+
+def _about(snapshot: Snapshot) -> list[str]:
+    """Warnings about one snapshot."""
+    at = f"At {100 * snapshot['nominal_strain']:.4g} %"
+    text = []
+    if snapshot.get("negative_pivots"):
+        text.append(
+            f"{at} the state is unstable ({snapshot['negative_pivots']} negative pivots): a real "
+            "specimen would not be found in it."
+        )
+    if snapshot["outcome"] != "converged":
+        text.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
+                    f"{snapshot['outcome_why']}")  # fmt: skip
+    if snapshot.get("undetermined"):
+        text.append(f"{at} the images do not determine {', '.join(snapshot['undetermined'])}.")
+    text += [f"{at} {warning}." for warning in snapshot.get("identifiability_warnings", ())]
+    text += [f"{at} {_lower(snapshot[key])}" for key in ("residual_verdict",) if key in snapshot]
+    if snapshot.get("noise_sd") and "weighting" in snapshot:  # a choice that noise asks for
+        text.append(f"{at} {_lower(snapshot['weighting'])}")
+    inner, corners = snapshot.get("pattern_inner_px"), snapshot.get("pattern_corners_px")
+    if inner is not None and corners is not None and inner < corners:
+        deviation = _largest_deviation(snapshot)
+        describes = (
+            "The modes describe"
+            if "modes" in snapshot
+            else f"The mode's parameters (up to {deviation:.0f} % off the ideal) describe"
+            if _is_free(snapshot)
+            else "Fixed at the ideal pattern, the mode describes"
+        )
+        text.append(
+            f"{at} no pattern is observable: {_symbol(snapshot)} is at most {inner:.2g} px inside. "
+            f"{describes} the edge effect in the corner cells ({corners:.2g} px), as in the "
+            "paper; the best fit to the truth does the same."
+        )
+    return text
+
+
+def _lower(sentence: str) -> str:
+    return f"{sentence[0].lower()}{sentence[1:]}"
 
 
 def _is_free(snapshot: Snapshot) -> bool:
@@ -242,189 +473,3 @@ def _largest_deviation(snapshot: Snapshot) -> float:
 
 def _item(values: Sequence[float | None] | None, k: int) -> float | None:
     return values[k] if values else None
-
-
-def _key(name: str, value: float | None, unit: str, remark: str, digits: int) -> dict[str, str]:
-    known = value is not None and value == value
-    return {
-        "name": name,
-        "value": f"{value:.{digits}g}" if known else "–",
-        "unit": unit if known else "",
-        "remark": remark,
-    }
-
-
-EXPERIMENT_TEMPLATE = "experiment.html"
-EXPERIMENT_SECTIONS = (
-    ("images", "The image and its pattern", ("image", "Sxx", "Syy")),
-    ("found", "What was measured", ("v0x", "v0y", "v1", "phi1", "flucx", "flucy")),
-    ("errors", "How wrong it is, and why", ("residual", "w", "best", "loss")),
-)
-"""Anchor, heading and panels of each group of pictures."""
-
-
-@dataclass(frozen=True)
-class Drawings:
-    """The pictures of a validation, made before there are numbers to write below them.
-
-    Parameters
-    ----------
-    headings
-        How each snapshot is called: ``id``, ``state``, ``strain`` and ``branch``.
-    hero
-        SVG of the last snapshot.
-    panels
-        By key, a picture for each snapshot.
-    curves
-        Load path and eigenvalues, where the solution has them.
-    convergence
-        A picture for each snapshot.
-    """
-
-    headings: list[dict[str, str]]
-    hero: str
-    panels: dict[str, list[Picture]]
-    curves: list[Picture]
-    convergence: list[Picture]
-
-
-def draw(atlas: ExperimentReportData, progress: Progress = silent) -> Drawings:
-    """Draw all that is shown of a validation; what needs the truth last, as it may be on its way.
-
-    Parameters
-    ----------
-    atlas
-        What is shown.
-    progress
-        Listener.
-    """
-    solution = atlas.solution
-    headings = [_heading(solution, strain) for strain in atlas.strains]
-    curves = _curves(solution)
-    convergence = [
-        _picture("convergence", "Convergence", heading, draw_convergence(result))
-        for heading, result in zip(headings, atlas.results, strict=True)
-    ]
-    shown = panels_of(len(atlas.results[0].ansatz.modes))
-    pictures = {}
-    for n, panel in enumerate(sorted(shown, key=lambda panel: panel.needs_truth)):
-        progress(n, len(shown), "report")
-        pictures[panel.key] = [
-            _picture(panel.key, panel.title, heading, panel.draw(atlas, k),
-                     _panel_caption(panel, atlas, k), panel.exact)
-            for k, heading in enumerate(headings)
-        ]  # fmt: skip
-    hero = to_svg(draw_hero(atlas, len(headings) - 1), "hero", "Image and pattern")
-    progress(1, 1, "report")
-    return Drawings(headings, hero, pictures, curves, convergence)
-
-
-def write_experiment_report(
-    path: Path | str, case: Mapping[str, Any], drawings: Drawings, summary: Mapping[str, Any]
-) -> None:
-    """Write the report of a validation, atomically.
-
-    Parameters
-    ----------
-    path
-        The HTML file.
-    case
-        What was run, as plain values (:meth:`modeharvest.runs.case.Case.plain`).
-    drawings
-        Of the same snapshots as the summary's.
-    summary
-        The content of ``summary.json``.
-    """
-    page = render(
-        EXPERIMENT_TEMPLATE,
-        title=summary.get("title") or "Validation",
-        case=case,
-        summary=summary,
-        headings=drawings.headings,
-        hero=drawings.hero,
-        keys=key_numbers(summary),
-        material=material_text(case["experiment"]["material"]),
-        sections=_sections(drawings, summary),
-        curves=drawings.curves,
-        convergence=drawings.convergence,
-        numbers=number_rows(summary),
-        modes=mode_rows(summary),
-        reservations=notes(summary),
-    )
-    with atomic(path) as temporary:
-        temporary.write_text(page, "utf-8")
-
-
-def _sections(drawings: Drawings, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The groups of panels, the numbers of each snapshot below its pictures."""
-    modes = sum(key.startswith("phi") for key in drawings.panels)
-    panels = {panel.key: panel for panel in panels_of(modes)}
-
-    def card(key: str) -> dict[str, Any]:
-        pictures = [
-            replace(picture, fact=picture.fact or panel_numbers(key, snapshot))
-            for picture, snapshot in zip(drawings.panels[key], summary["snapshots"], strict=True)
-        ]
-        return {"panel": panels[key], "pictures": pictures}
-
-    return [
-        {"id": anchor, "title": title, "cards": [card(k) for k in panels if _is_in(k, keys)]}
-        for anchor, title, keys in EXPERIMENT_SECTIONS
-    ]
-
-
-def _is_in(key: str, section: Sequence[str]) -> bool:
-    """Whether a panel belongs to a section; those of further modes, where the first one's are."""
-    return key in section or (key[-1] in "23" and f"{key[:-1]}1" in section)
-
-
-def _panel_caption(panel: SnapshotPanel, atlas: ExperimentReportData, k: int) -> str:
-    """What the drawing itself has to say."""
-    if panel.key.startswith("phi"):
-        i = int(panel.key[3:])
-        return f"drawn as with v{'₁₂₃'[i - 1]} = {atlas.shape_scale(k, i - 1):.3g} mm everywhere"
-    return ""
-
-
-def _curves(solution: Solution) -> list[Picture]:
-    """Load path and eigenvalues, where the solution has them."""
-    path, critical = solution.info.get("path"), solution.info.get("critical")
-    if not path or not path.get("primary", {}).get("nominal_strain"):
-        return []
-    load = draw_load(path, _critical_strain(solution))
-    eigenvalues = draw_eigenvalues(path, critical)
-    return [
-        Picture("load", "Load over strain", to_svg(load, "load", "Load over strain")),
-        Picture("eigenvalues", "Stability", to_svg(eigenvalues, "eigenvalues", "Eigenvalues")),
-    ]
-
-
-def _critical_strain(solution: Solution) -> float | None:
-    critical = solution.info.get("critical")
-    return None if critical is None else float(critical["strain"])
-
-
-def _heading(solution: Solution, strain: float) -> dict[str, str]:
-    """How a snapshot is called on the page."""
-    branch, critical = solution.at(strain).branch, _critical_strain(solution)
-    if branch != "primary":
-        state = "After buckling"
-    elif critical is None:
-        state = "Deformed"
-    else:
-        state = "Before buckling" if strain < critical else "Unstable path"
-    return {"id": f"{round(1e4 * strain):04d}", "state": state, "strain": f"{100 * strain:.4g} %",
-            "branch": branch}  # fmt: skip
-
-
-def _picture(
-    key: str,
-    title: str,
-    heading: Mapping[str, str],
-    drawn: Figure,
-    fact: str = "",
-    exact: bool = False,
-) -> Picture:
-    name = f"{key}-{heading['id']}"
-    label = f"{heading['state']} · {heading['strain']}"
-    return Picture(name, label, to_svg(drawn, name, f"{title}, {label}", exact=exact), fact)

@@ -1,41 +1,36 @@
-"""Pages and figures of graded DIC codes: errors on a benchmark, resolution on the star pattern."""
+"""Reports of graded DIC codes: errors on a benchmark, resolution on the star pattern."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.colors import LogNorm, Normalize, to_hex
+from markupsafe import Markup
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.report.figures.curves import curve
+from modeharvest.report.figures.curves import curve, legend_above, plain_ticks
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.figures.style import (
-    BLUE,
-    GOLD,
-    GREEN,
-    INK,
-    MUTED,
-    RED,
-    SIGNED,
-    SIZE,
-    figure,
-    style,
-    to_svg,
+from modeharvest.report.figures.outlines import MeshBoundary
+from modeharvest.report.figures.style import BLUE, MUTED, SIGNED, SIZE, colour, figure
+from modeharvest.report.model import (
+    Card,
+    Cell,
+    KeyNumber,
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    number,
+    write_page,
 )
-from modeharvest.report.model import Picture, render, short
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic, write_json
 from modeharvest.validation.resolution.attenuation import Attenuation
@@ -56,9 +51,14 @@ from modeharvest.validation.scoring.grading import (
     grading_summary,
     without_nan,
 )
-from modeharvest.validation.scoring.score import PERCENTILES, REGIONS, ErrorSpectrum, Score
+from modeharvest.validation.scoring.score import (
+    PERCENTILES,
+    REGIONS,
+    ErrorSpectrum,
+    RegionScore,
+    Score,
+)
 
-CODE_COLOURS = (BLUE, RED, GREEN, GOLD, *mpl.colormaps["tab10"].colors[4:])  # type: ignore[attr-defined]
 _CELLS = 300
 _SHARES = np.logspace(-4, 0, 200)
 
@@ -97,7 +97,10 @@ class ErrorMaps:
         high = max((end[1] for end in ends), default=1.0)
         low = max(low, 1e-4 * high)
         high = max(high, 2.0 * low)
-        return cls(MapFrame.of(mesh, grid, _CELLS), LogScale(SIZE, low, high, "px", "both"))
+        return cls(
+            MapFrame.of(MeshBoundary.of(mesh), grid, _CELLS),
+            LogScale(SIZE, low, high, "px", "both"),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,75 +149,73 @@ class FieldMaps:
 
 def draw_distribution(scores: Sequence[Score]) -> Figure:
     """Draw which share of a field's points, lost ones counted as wrong, errs by more."""
-    with style():
-        drawn, axes = curve("length of the error [px]", "share of points that err by more [%]")
-        for n, graded in enumerate(scores):
-            length = np.sort(_error_length(graded))[::-1]
-            if not len(length):
-                continue
-            points = graded.everywhere.points
-            lost = points - len(length)
-            share = (lost + np.arange(1, len(length) + 1)) / points
-            some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
-            axes.loglog(np.maximum(length[some], 1e-9), 100 * share[some], color=colour(n))
-        axes.set(ylim=(0.01, 120))
+    drawn, axes = curve("length of the error [px]", "share of points that err by more [%]")
+    for n, graded in enumerate(scores):
+        length = np.sort(_error_length(graded))[::-1]
+        if not len(length):
+            continue
+        points = graded.everywhere.points
+        lost = points - len(length)
+        share = (lost + np.arange(1, len(length) + 1)) / points
+        some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
+        axes.loglog(
+            np.maximum(length[some], 1e-9), 100 * share[some], color=colour(n), label=graded.source
+        )
+    axes.set(ylim=(0.01, 120))
+    legend_above(axes)
     return drawn
 
 
 def draw_histogram(scores: Sequence[Score]) -> Figure:
     """Draw how many of a field's points err by how much, in tenths of a decade."""
-    with style():
-        drawn, axes = curve("length of the error [px]", "share of points per tenth of a decade [%]")
-        for n, graded in enumerate(scores):
-            length = np.maximum(_error_length(graded), 1e-9)
-            if not len(length):
-                continue
-            low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
-            edges = 10.0 ** (np.arange(low, high + 2) / 10)
-            count, _ = np.histogram(length, edges)
-            axes.stairs(100 * count / graded.everywhere.points, edges, lw=1.5, color=colour(n))
-        axes.set(xscale="log", ylim=(0, None))
+    drawn, axes = curve("length of the error [px]", "share of points per tenth of a decade [%]")
+    for n, graded in enumerate(scores):
+        length = np.maximum(_error_length(graded), 1e-9)
+        if not len(length):
+            continue
+        low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
+        edges = 10.0 ** (np.arange(low, high + 2) / 10)
+        count, _ = np.histogram(length, edges)
+        axes.stairs(
+            100 * count / graded.everywhere.points,
+            edges,
+            lw=1.5,
+            color=colour(n),
+            label=graded.source,
+        )
+    axes.set(xscale="log", ylim=(0, None))
+    legend_above(axes)
     return drawn
 
 
 def draw_regions(scores: Sequence[Score]) -> Figure:
     """Draw bars of the rms error by region."""
-    with style():
-        drawn, axes = curve("", "rms per component [px]")
-        width = 0.8 / max(len(scores), 1)
-        for n, graded in enumerate(scores):
-            at = np.arange(len(REGIONS)) + (n - 0.5 * (len(scores) - 1)) * width
-            rms = [graded.by_region[name].rms_px for name in REGIONS]
-            axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=colour(n))
-        axes.set_xticks(range(len(REGIONS)), REGIONS)
-        if any(graded.everywhere.rms_px > 0 for graded in scores):
-            axes.set_yscale("log")
+    drawn, axes = curve("", "rms per component [px]")
+    width = 0.8 / max(len(scores), 1)
+    for n, graded in enumerate(scores):
+        at = np.arange(len(REGIONS)) + (n - 0.5 * (len(scores) - 1)) * width
+        rms = [graded.by_region[name].rms_px for name in REGIONS]
+        axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=colour(n), label=graded.source)
+    axes.set_xticks(range(len(REGIONS)), REGIONS)
+    if any(graded.everywhere.rms_px > 0 for graded in scores):
+        axes.set_yscale("log")
+    legend_above(axes)
     return drawn
 
 
 def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
     """Draw the rms error by wavelength, in thirds of an octave."""
-    with style():
-        drawn, axes = curve("wavelength [px]", "rms per component in a third of an octave [px]")
-        for n, spectrum in enumerate(spectra.values()):
-            if spectrum is not None and (spectrum.rms_px > 0).any():
-                axes.loglog(spectrum.wavelength_px, spectrum.rms_px, marker="o", ms=2.5,
-                            color=colour(n))  # fmt: skip
+    drawn, axes = curve("wavelength [px]", "rms per component in a third of an octave [px]")
+    for n, (name, spectrum) in enumerate(spectra.items()):
+        if spectrum is not None and (spectrum.rms_px > 0).any():
+            axes.loglog(spectrum.wavelength_px, spectrum.rms_px, marker="o", ms=2.5,
+                        color=colour(n), label=name)  # fmt: skip
+    legend_above(axes)
     return drawn
 
 
 def _error_length(graded: Score) -> FloatArray:
     return np.hypot(graded.error_px[:, 0], graded.error_px[:, 1])
-
-
-def colour(n: int) -> str:
-    """Of the n-th code in all curves and bars, "#rrggbb"."""
-    return str(to_hex(CODE_COLOURS[n % len(CODE_COLOURS)]))
-
-
-GRADING_TEMPLATE = "scores.html"
-
-"""Rows of the table beside the regions."""
 
 
 def write_grading(folder: Path | str, grading: Grading) -> None:
@@ -223,124 +224,184 @@ def write_grading(folder: Path | str, grading: Grading) -> None:
     write_json(folder / "scores.json", without_nan(grading_summary(grading)))
     with atomic(folder / "scores.csv") as part:
         part.write_text("\n".join(csv_lines(grading)) + "\n", "utf-8")
-    with atomic(folder / "report.html") as part:
-        part.write_text(grading_page(grading), "utf-8")
+    write_page(grading_report(grading), folder / "report.html")
 
 
-def grading_page(grading: Grading) -> str:
-    """The report, HTML."""
-    shared = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, grading.scores)
-    maps = [FieldMaps(shared, graded) for graded in grading.scores]
-    curves = [
-        _picture("histogram", "Histogram of errors", draw_histogram(grading.scores)),
-        _picture("distribution", "Share of points with a larger error",
-                 draw_distribution(grading.scores)),
-        _picture("regions", "By region", draw_regions(grading.scores)),
-    ]  # fmt: skip
-    if any(grading.spectra.values()):
-        drawn = draw_spectra(grading.spectra)
-        curves.append(_picture("spectrum", "By wavelength", drawn))
-    return render(
-        GRADING_TEMPLATE,
+def grading_report(grading: Grading) -> Report:
+    """The report of displacement fields, graded and ranked."""
+    scores, best = grading.scores, grading.scores[0]
+    shared = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, scores)
+    maps = [FieldMaps(shared, graded) for graded in scores]
+    several = len(scores) > 1
+    what = f"Displacement fields of {len(scores)} codes, ranked" if several else (
+        "A displacement field")  # fmt: skip
+    common = (
+        f"; “{COMMON}” is the {100 * grading.common_share:.0f} % of the material that every field "
+        "covers" if several else ""
+    )  # fmt: skip
+    return Report(
+        kind="scores",
         title=f"Benchmark {grading.truth.id} at {100 * grading.strain:g} %",
-        grading=grading,
-        hero=to_svg(maps[0].draw_length(), "best", "Length of the best one's error"),
-        everywhere=EVERYWHERE,
-        common=COMMON,
-        percentiles=PERCENTILES,
-        regions=REGIONS,
-        colour=colour,
-        three=_three_digits,
-        curves=curves,
-        fields=[_field(of_field, n) for n, of_field in enumerate(maps)],
-    )
-
-
-def _field(maps: FieldMaps, n: int) -> dict[str, Any]:
-    """A field's maps."""
-    return {
-        "score": maps.graded,
-        "pictures": [
-            _picture(f"length-{n}", "Length of the error", maps.draw_length()),
-            _picture(f"x-{n}", "Error along x", maps.draw_component(0)),
-            _picture(f"y-{n}", "Error along y", maps.draw_component(1)),
+        lead=f"{what} against the truth of a set of images: the displacement of the finite "
+        "elements that the images were made of, at the very points that were returned.",
+        keys=[
+            KeyNumber(f"{'Best: ' * several}{best.source}", number(best.everywhere.rms_px, 3),
+                      "px", "rms error per component"),
+            KeyNumber("95 % of its points", number(best.everywhere.percentiles_px[2], 3), "px",
+                      "have a smaller error"),
+            KeyNumber("Covered", f"{100 * best.covered:.1f}", "%",
+                      "of the material, within one spacing of a measured point"),
         ],
-    }
+        sections=[
+            Section(
+                "ranking", "Ranking", _ranking(grading),
+                "By rms error per component over all points on the material; a field that covers "
+                "less than half of the material comes after those that cover more. 50 %, 95 %: of "
+                "the points have a smaller error (its length). Edges are material within "
+                f"{grading.edge_px} px of a hole or of the outside; what else there is of the "
+                "cellular part is a ligament or a junction, whichever middle is nearer; the rest "
+                f"is bulk. Points are those of the field itself{common}.",
+            ),
+            Section(
+                "curves", "Distribution, regions, wavelengths", _score_curves(grading),
+                "Lost points are missing in the histogram and count as wrong in the distribution. "
+                "The spectrum is that of the error without its affine part, gaps counted as zero.",
+            ),
+            Section(
+                "maps", "Maps", [_score_maps(of_field, n) for n, of_field in enumerate(maps)],
+                "Lengths of errors share one logarithmic scale; components have a scale for each "
+                "field. Blank: nothing measured within one spacing.",
+            ),
+        ],
+        warnings=grading.notes,
+        command=f"modeharvest score FIELD … --truth DIR --strain {grading.strain} --out DIR",
+        remark="The numbers of this page are in scores.json and scores.csv beside it.",
+        hero=ReportFigure("best", "Length of the best one’s error", maps[0].draw_length),
+        hero_caption=f"Length of the error of {best.source}.",
+    )  # fmt: skip
 
 
-def _three_digits(value: float) -> str:
-    return short(float(f"{value:.3g}"))
+def _ranking(grading: Grading) -> list[Card]:
+    several = len(grading.scores) > 1
+    columns = ["field", "rms [px]", "50 % [px]", "95 % [px]", "largest [px]",
+               *(f"rms, {name} [px]" for name in REGIONS),
+               *([f"rms, {COMMON} [px]"] if several else []),
+               "points", "returned", "material covered"]  # fmt: skip
+    rows: list[list[Cell]] = []
+    details: list[list[Cell]] = []
+    for rank, graded in enumerate(grading.scores, start=1):
+        every, name = graded.everywhere, f"{rank}. {graded.source}"
+        row: list[Cell] = [name, *_three(every.rms_px, *every.percentiles_px[::2], every.max_px)]
+        row += _three(*(graded.by_region[region].rms_px for region in REGIONS))
+        row += _three(grading.common[graded.source].rms_px) if several else []
+        rows.append([*row, every.points, _returned(every), f"{100 * graded.covered:.1f} %"])
+        details += [
+            [name if where == EVERYWHERE else "", where, part.points, _returned(part),
+             *_three(*part.bias_px, part.rms_px, *part.percentiles_px, part.max_px)]
+            for where, part in grading.parts(graded).items()
+        ]  # fmt: skip
+    heads = ["field", "where", "points", "returned", "bias along x [px]", "along y, up [px]",
+             "rms [px]", *(f"{p} % [px]" for p in PERCENTILES), "largest [px]"]  # fmt: skip
+    tables = [
+        ReportTable("Ranking", columns, rows, on_terminal=True),
+        ReportTable("Bias and percentiles, by region", heads, details, folded=True),
+    ]
+    return [Card("Ranking", tables=tables, wide=True)]
 
 
-def _picture(name: str, label: str, drawn: Figure) -> Picture:
-    return Picture(name, label, to_svg(drawn, name, label))
+def _three(*values: float) -> list[str]:
+    return [number(value, 3) for value in values]
 
 
-STAR_COLOURS = (BLUE, RED, GREEN, GOLD, *mpl.colormaps["tab10"].colors[4:])  # type: ignore[attr-defined]
-"""A code keeps its colour in all pictures."""
+def _returned(part: RegionScore) -> str:
+    return f"{100 * part.returned:.1f} %" if part.points else "–"
+
+
+def _score_curves(grading: Grading) -> list[Card]:
+    scores = grading.scores
+    parts = {
+        "histogram": ("Histogram of errors", partial(draw_histogram, scores)),
+        "distribution": ("Share of points with a larger error",
+                         partial(draw_distribution, scores)),
+        "regions": ("By region", partial(draw_regions, scores)),
+    }  # fmt: skip
+    if any(grading.spectra.values()):
+        parts["spectrum"] = ("By wavelength", partial(draw_spectra, grading.spectra))
+    return [Card.single(name, title, drawn)
+            for name, (title, drawn) in parts.items()]  # fmt: skip
+
+
+def _score_maps(maps: FieldMaps, n: int) -> Card:
+    graded = maps.graded
+    figures = [
+        ReportFigure(f"length-{n}", "Length of the error", maps.draw_length),
+        ReportFigure(f"x-{n}", "Error along x", partial(maps.draw_component, 0)),
+        ReportFigure(f"y-{n}", "Error along y", partial(maps.draw_component, 1)),
+    ]
+    text = f"a point every {number(round(graded.spacing_px, 2))} px"
+    if graded.off_material:
+        text += f", {number(graded.off_material)} points off the material not graded"
+    return Card(f"{n + 1}. {graded.source}", figures, paper=text, wide=True)
+
+
 _CELL_PX = 10
 """Edge of a cell of the maps; the image has far more pixels than a page."""
 
 
 def draw_attenuation(grades: Sequence[StarGrade]) -> Figure:
     """Draw T over the period, a band of two standard errors about it, and where it crosses 0.9."""
-    with style():
-        drawn, axes = _curve("period of the wave [px]", "share of its amplitude that is left [–]")
-        axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
-        for n, grade in enumerate(grades):
-            found = grade.attenuation
-            share, error = found.curve
-            colour = STAR_COLOURS[n % len(STAR_COLOURS)]
-            axes.fill_between(found.period, share - 2 * error, share + 2 * error, color=colour,
-                              alpha=0.2, linewidth=0)  # fmt: skip
-            axes.plot(found.period, share, color=colour, label=grade.name)
-            if np.isfinite(found.finest_px):
-                axes.plot([found.finest_px], [KEPT], "o", ms=4.5, color=colour)
-        axes.set(xscale="log", ylim=(-0.3, 1.15))
-        _plain_numbers(axes.xaxis)
-        _legend(axes)
+    drawn, axes = curve("period of the wave [px]", "measured over true amplitude [–]")
+    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+    for n, grade in enumerate(grades):
+        found = grade.attenuation
+        share, error = found.curve
+        axes.fill_between(found.period, share - 2 * error, share + 2 * error, color=colour(n),
+                          alpha=0.2, linewidth=0)  # fmt: skip
+        axes.plot(found.period, share, color=colour(n), label=grade.name)
+        if np.isfinite(found.finest_px):
+            axes.plot([found.finest_px], [KEPT], "o", ms=4.5, color=colour(n))
+    axes.set(xscale="log", ylim=(-0.3, 1.15))
+    plain_ticks(axes.xaxis)
+    legend_above(axes)
     return drawn
 
 
 def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
     """Draw the noise floor over l10, lines of equal indicator below."""
     known = [g for g in grades if np.isfinite(g.indicator_px2) and g.indicator_px2 > 0.0]
-    with style():
-        drawn, axes = _curve("l₁₀ % [px]", "noise floor n [px]")
-        x = [g.attenuation.finest_px for g in known]
-        y = [g.noise.v_px for g in known if g.noise is not None]
-        low, high = 0.7 * min(x), 1.5 * max(x)
-        bottom, top = 0.6 * min(y), 1.7 * max(y)
-        for value in _round_values(min(x) * min(y), max(x) * max(y)):
-            axes.plot([low, high], [value / low, value / high], color=MUTED, linewidth=0.6,
-                      alpha=0.6)  # fmt: skip
-            end = min(high, value / (1.04 * bottom))
-            if low < end and value / end < top:
-                axes.annotate(f"{value:g} px²", (end, value / end), (-3, 3), fontsize=6.5,
-                              textcoords="offset points", ha="right", color=MUTED)  # fmt: skip
-        for n, grade in enumerate(grades):
-            if grade not in known or grade.noise is None:
-                continue
-            axes.errorbar(grade.attenuation.finest_px, grade.noise.v_px,
-                          2 * grade.noise.v_se_px, 2 * grade.attenuation.finest_se_px, marker="o",
-                          ms=5, capsize=2, color=STAR_COLOURS[n % len(STAR_COLOURS)], linewidth=1,
-                          linestyle="none", label=grade.name)  # fmt: skip
-        axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(bottom, top))
-        _plain_numbers(axes.xaxis)
-        _plain_numbers(axes.yaxis)
-        _legend(axes)
+    drawn, axes = curve("l₁₀ % [px]", "noise floor n [px]")
+    x = [g.attenuation.finest_px for g in known]
+    y = [g.noise.v_px for g in known if g.noise is not None]
+    low, high = 0.7 * min(x), 1.5 * max(x)
+    bottom, top = 0.6 * min(y), 1.7 * max(y)
+    for value in _round_values(min(x) * min(y), max(x) * max(y)):
+        axes.plot([low, high], [value / low, value / high], color=MUTED, linewidth=0.6,
+                  alpha=0.6)  # fmt: skip
+        end = min(high, value / (1.04 * bottom))
+        if low < end and value / end < top:
+            axes.annotate(f"{value:g} px²", (end, value / end), (-3, 3), fontsize=6.5,
+                          textcoords="offset points", ha="right", color=MUTED)  # fmt: skip
+    for n, grade in enumerate(grades):
+        if grade not in known or grade.noise is None:
+            continue
+        axes.errorbar(grade.attenuation.finest_px, grade.noise.v_px,
+                      2 * grade.noise.v_se_px, 2 * grade.attenuation.finest_se_px, marker="o",
+                      ms=5, capsize=2, color=colour(n), linewidth=1,
+                      linestyle="none", label=grade.name)  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(bottom, top))
+    plain_ticks(axes.xaxis, axes.yaxis)
+    legend_above(axes)
     return drawn
 
 
-def draw_centre_row(found: Attenuation, colour: str = BLUE) -> Figure:
+def draw_centre_row(found: Attenuation, look: str = BLUE) -> Figure:
     """Draw the centre row's T, raw, and the smoothed curve through all rows."""
-    with style():
-        drawn, axes = _curve("period of the wave [px]", "measured over true [–]", (9.0, 2.1))
-        axes.plot(found.centre.period, found.centre.share, color=MUTED, linewidth=0.5, alpha=0.8)
-        axes.plot(found.period, found.curve[0], color=colour, linewidth=1.8)
-        axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
-        low, high = np.quantile(found.centre.share, (0.005, 0.995))
-        axes.set_ylim(min(low, 0.0) - 0.05, max(high, 1.0) + 0.05)
+    drawn, axes = curve("period of the wave [px]", "measured over true [–]", (9.0, 2.1))
+    axes.plot(found.centre.period, found.centre.share, color=MUTED, linewidth=0.5, alpha=0.8)
+    axes.plot(found.period, found.curve[0], color=look, linewidth=1.8)
+    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+    low, high = np.quantile(found.centre.share, (0.005, 0.995))
+    axes.set_ylim(min(low, 0.0) - 0.05, max(high, 1.0) + 0.05)
     return drawn
 
 
@@ -359,30 +420,19 @@ def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> 
     total = np.histogram2d(*at, shape, limits, weights=values[seen])[0]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     top = float(np.quantile(np.abs(values[seen]), 0.99)) if end is None else end
-    with style():
-        drawn = figure(9.0, 1.75)
-        axes = drawn.add_axes((0.035, 0.24, 0.88, 0.72))
-        image = axes.imshow(mean, cmap=SIGNED, vmin=-top, vmax=top, aspect="auto",
-                            extent=(*limits[1], *limits[0][::-1]),
-                            interpolation="nearest")  # fmt: skip
-        periods = [p for p in (10, 25, 50, 100, 150, 200, 250, 300)
-                   if star.shortest_px <= p <= star.longest_px]  # fmt: skip
-        axes.set_xticks(star.column(periods), [str(p) for p in periods])
-        axes.set_xlabel("period [px]")
-        axes.set_yticks([])
-        bar = drawn.add_axes((0.93, 0.24, 0.011, 0.72))
-        drawn.colorbar(image, cax=bar).ax.set_title("px", fontsize=7.5)
+    drawn = figure(9.0, 1.75)
+    axes = drawn.add_axes((0.035, 0.24, 0.88, 0.72))
+    image = axes.imshow(mean, cmap=SIGNED, vmin=-top, vmax=top, aspect="auto",
+                        extent=(*limits[1], *limits[0][::-1]),
+                        interpolation="nearest")  # fmt: skip
+    periods = [p for p in (10, 25, 50, 100, 150, 200, 250, 300)
+               if star.shortest_px <= p <= star.longest_px]  # fmt: skip
+    axes.set_xticks(star.column(periods), [str(p) for p in periods])
+    axes.set_xlabel("period [px]")
+    axes.set_yticks([])
+    bar = drawn.add_axes((0.93, 0.24, 0.011, 0.72))
+    drawn.colorbar(image, cax=bar).ax.set_title("px", fontsize=7.5)
     return drawn
-
-
-def _curve(x: str, y: str, size: tuple[float, float] = (5.2, 3.3)) -> tuple[Figure, Axes]:
-    """An empty picture for curves."""
-    drawn = figure(*size)
-    axes = drawn.add_subplot()
-    axes.set(xlabel=x, ylabel=y)
-    axes.grid(color=MUTED, alpha=0.18, lw=0.6)
-    drawn.subplots_adjust(0.6 / size[0], 0.45 / size[1], 0.985, 0.92 if size[1] > 3 else 0.96)
-    return drawn, axes
 
 
 def _round_values(low: float, high: float) -> list[float]:
@@ -392,69 +442,81 @@ def _round_values(low: float, high: float) -> list[float]:
     return [v for v in every if 0.3 * low <= v <= 3.0 * high]
 
 
-def _plain_numbers(axis: Axis) -> None:
-    """Write 20 rather than 2 x 10^1."""
-    shown = FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "1235" else "")
-    axis.set_major_formatter(shown)
-    axis.set_minor_formatter(shown)
-    axis.set_tick_params(which="minor", labelsize=7, labelcolor=INK)
-
-
-def _legend(axes: Axes) -> None:
-    """Names above the picture, where no curve is."""
-    count = len(axes.get_legend_handles_labels()[0])
-    if count:
-        axes.legend(frameon=False, fontsize=7.5, ncols=min(count, 4), loc="lower right",
-                    bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)  # fmt: skip
-
-
-STAR_TEMPLATE = "star.html"
-
-"""Heading of a number in tables: its key in ``resolution.json``."""
-
-
 def write_star_grading(folder: Path | str, grading: StarGrading) -> None:
-    """Write the three files, each whole or not at all."""
+    """Write ``resolution.json``, ``resolution.csv`` and ``report.html``, each whole or not."""
     folder = Path(folder)
     write_json(folder / "resolution.json", star_summary(grading))
     with atomic(folder / "resolution.csv") as part:
         part.write_text("\n".join(star_csv_lines(grading.grades)) + "\n", "utf-8")
-    with atomic(folder / "report.html") as part:
-        part.write_text(star_page(grading), "utf-8")
+    write_page(star_report(grading), folder / "report.html")
 
 
-def star_page(grading: StarGrading) -> str:
-    """The report, HTML."""
-    grades = grading.grades
-    curves = [_star_picture("attenuation", "What is left of a wave", draw_attenuation(grades))]
+def star_report(grading: StarGrading) -> Report:
+    """The report of codes that measured the star pattern."""
+    grades, star = grading.grades, grading.star_set.spec.star
+    rows = [grade_numbers(grade) for grade in grades]
+    best, several = rows[0], len(rows) > 1
+    cells = [[f"{n}. {row['name']}", *(row[key] for key in GRADE_COLUMNS.values())]
+             for n, row in enumerate(rows, start=1)]  # fmt: skip
+    table = ReportTable("Ranking", ["code", *GRADE_COLUMNS], cells, on_terminal=True)
+    return Report(
+        kind="resolution",
+        title="Displacement resolution on the star pattern",
+        lead=f"The star of DIC Challenge 2.0: a wave of {star.amplitude_px} px whose period grows "
+        f"from {number(star.shortest_px)} to {number(star.longest_px)} px along the image. The "
+        "amplitude ratio, measured over true, is the spatial resolution of a code; its result "
+        "without motion is its noise.",
+        keys=[
+            KeyNumber(f"{'Best: ' * several}{best['name']}", best["indicator_px2"], "px²",
+                      "indicator n l₁₀ %; the less, the better"),
+            KeyNumber("l₁₀ %", best["finest_px"], "px",
+                      "period at which 10 % of the amplitude is lost"),
+            KeyNumber("Noise floor n", best["noise_px"], "px",
+                      "standard deviation of v without motion"),
+        ],
+        sections=[
+            Section(
+                "ranking", "Ranking", [Card.tabular(table, wide=True)],
+                "By the indicator. l₁₀ % is read off the curve through all rows within half a "
+                "period of the centre; “centre row” is the DIC Challenge’s own reading, a "
+                "polynomial of degree 12 through that row alone. ± is one standard error. Ripple: "
+                "rms of the centre row about the curve, at periods above l₁₀ %.",
+            ),
+            Section("curves", "Curves", _star_curves(grades),
+                    "Bands and bars are two standard errors. Grey lines: equal indicators."),
+            Section("maps", "Maps", [_star_maps(grade, n) for n, grade in enumerate(grades)],
+                    "The whole image, stretched along y; blank: nothing was measured. Errors have "
+                    "a scale for each code."),
+        ],
+        warnings=grading.notes,
+        command="modeharvest benchmark resolution FIELD … --still FIELD … --set DIR --out DIR",
+        remark=Markup(
+            "The numbers and curves of this page are in resolution.json and resolution.csv beside "
+            "it. Images: set {}. Method: P. L. Reu et al., Exp. Mech. 2022, "
+            '<a href="https://doi.org/10.1007/s11340-021-00806-6">doi '
+            "10.1007/s11340-021-00806-6</a>; M. Grédiac, B. Blaysat, F. Sur, Exp. Mech. 2017, "
+            '<a href="https://doi.org/10.1007/s11340-017-0279-x">doi '
+            "10.1007/s11340-017-0279-x</a>."
+        ).format(grading.star_set.id),
+    )  # fmt: skip
+
+
+def _star_curves(grades: Sequence[StarGrade]) -> list[Card]:
+    parts = {"attenuation": ("Amplitude ratio of a wave", partial(draw_attenuation, grades))}
     if any(np.isfinite(g.indicator_px2) and g.indicator_px2 > 0.0 for g in grades):
-        curves.append(
-            _star_picture("trade-off", "Noise against resolution", draw_trade_off(grades))
-        )
-    return render(
-        STAR_TEMPLATE,
-        title="How fine a displacement is resolved",
-        grading=grading,
-        star=grading.star_set.spec.star,
-        columns=GRADE_COLUMNS,
-        rows=[grade_numbers(grade) for grade in grades],
-        curves=curves,
-        codes=[_code(grade, n) for n, grade in enumerate(grades)],
-    )
+        parts["trade-off"] = ("Noise against resolution", partial(draw_trade_off, grades))
+    return [Card.single(name, title, drawn)
+            for name, (title, drawn) in parts.items()]  # fmt: skip
 
 
-def _code(grade: StarGrade, n: int) -> dict[str, Any]:
-    """A code's row and maps."""
-    colour = STAR_COLOURS[n % len(STAR_COLOURS)]
+def _star_maps(grade: StarGrade, n: int) -> Card:
     down = np.where(grade.moved.good, -grade.moved.u[:, 1], np.nan)
-    maps = {
-        "row": ("Along the centre row", draw_centre_row(grade.attenuation, colour)),
-        "v": ("v, down", draw_map(grade, down, 1.2 * grade.star.amplitude_px)),
-        "error": ("Its error, down", draw_map(grade, -grade.error_px[:, 1])),
+    end = 1.2 * grade.star.amplitude_px
+    parts = {
+        "row": ("Along the centre row", partial(draw_centre_row, grade.attenuation, colour(n))),
+        "v": ("v, down", partial(draw_map, grade, down, end)),
+        "error": ("Its error, down", partial(draw_map, grade, -grade.error_px[:, 1])),
     }
-    pictures = [_star_picture(f"{key}-{n}", *drawn) for key, drawn in maps.items()]
-    return {"name": grade.name, "pictures": pictures}
-
-
-def _star_picture(name: str, label: str, drawn: Figure) -> Picture:
-    return Picture(name, label, to_svg(drawn, name, label))
+    figures = [ReportFigure(f"{key}-{n}", label, drawn, wide=True)
+               for key, (label, drawn) in parts.items()]  # fmt: skip
+    return Card(f"{n + 1}. {grade.name}", figures, wide=True)

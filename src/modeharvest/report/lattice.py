@@ -1,53 +1,49 @@
-"""``report.html`` of an infinite lattice: one page like the paper's Figs. "modes" and "graded"."""
+"""Report of an infinite lattice: one page like the paper's Figs. "modes" and "graded"."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
-from modeharvest.fem.bloch.modes import Branch
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import upward
-from modeharvest.report.figures.lattice import (
-    draw_amplitudes,
-    draw_captured,
-    draw_critical_strains,
-    draw_differences,
-    draw_dispersion,
-    draw_energies,
-    draw_growth,
-    draw_lattice,
-    draw_lattice_spectrum,
-    draw_overlaps,
-    draw_overlay,
-    draw_zone_map,
-)
+from modeharvest.report.figures import lattice as figures
 from modeharvest.report.figures.outlines import LatticePatch
-from modeharvest.report.figures.style import to_svg
-from modeharvest.report.model import Picture, material_text, render, short
+from modeharvest.report.model import (
+    Card,
+    Cell,
+    KeyNumber,
+    Mark,
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    fixed,
+    material_text,
+    number,
+    percent,
+)
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
     FoundPattern,
     LatticeRun,
     combination_name,
 )
-from modeharvest.util.arrays import FloatArray
-from modeharvest.util.files import atomic
-from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 from modeharvest.validation.studies.lattice_pattern import ModeRow, PatternMode
 
-if TYPE_CHECKING:
-    from modeharvest.runs.lattice.results import CriticalPoint
+Summary = Mapping[str, Any]
 
-
+CELLS = 4
+"""Unit cells along the side of a picture's window."""
+VISIBLE = 0.12
+"""Largest fluctuation that a deformed lattice is drawn with, at least [l]."""
 _KINDS = {
     "pattern": "(π, π)",
     "long waves": "long waves",
@@ -55,9 +51,53 @@ _KINDS = {
     "none": "none in the range",
     "path ends": "the path ends before",
 }
+_LEAD = (
+    "An infinite lattice is loaded. Where the energy of waves of some length and direction "
+    "vanishes, a pattern sets in. This page says whether it does, at which load and in which "
+    "waves, what it looks like, and with how few Fourier terms it can be written for micromorphic "
+    "homogenization."
+)
 
 
-def wave_name(wave: Wave) -> str:
+def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
+    """The report of a lattice.
+
+    Parameters
+    ----------
+    summary
+        The content of ``summary.json``.
+    run
+        What its figures show; without, the report has numbers only, as for the terminal.
+    """
+    return Report(
+        kind="lattice",
+        title=summary["title"],
+        lead=_LEAD,
+        findings=findings(summary),
+        keys=key_numbers(summary),
+        sections=[
+            *([_pattern_section(run)] if run else []),
+            Section("critical", "Critical point", _critical_cards(summary), _CRITICAL_LEAD),
+            Section("dispersion", "Dispersion", _dispersion_cards(summary, run), _DISPERSION_LEAD),
+            *([_mode_section(run)] if run else []),
+            Section("branches", "Branches", _branch_cards(summary, run), _BRANCH_LEAD),
+            *([_family_section(run), _study_section(run)] if run else []),
+        ],
+        warnings=summary["notes"],
+        notes=notes(summary),
+        command=run.command if run else "",
+        case=summary["case"],
+        files=summary["files"],
+        costs={"nodes of the primitive cell": number(len(run.mesh.nodes))} if run else {},
+        versions=summary["versions"],
+        hero=_hero(run) if run else None,
+        hero_caption="The pattern growing from left to right, up to a largest displacement of "
+        f"{DRAWN_AMPLITUDE} l. No equilibrium; the colours are the displacement’s length."
+        if summary["modes"] else "",
+    )  # fmt: skip
+
+
+def wave_name(wave: Wave | Sequence[float]) -> str:
     """Phases in units of pi where they are simple fractions of it: "(π, 0)", "(4π/3, 2π/3)"."""
     return f"({', '.join(_phase(phase) for phase in wave)})"
 
@@ -73,240 +113,136 @@ def _phase(phase: float) -> str:
     return ("−" if part < 0 else "") + f"{above}π{below}"
 
 
-def percent(value: float, digits: int = 4) -> str:
-    """A share or a strain in percent, without the sign of it."""
-    return "–" if math.isnan(value) else f"{100 * value:.{digits}g}"
-
-
-def waves_text(point: CriticalPoint) -> str:
-    """The critical waves of a point, long ones by their direction."""
-    if not point.found:
+def waves_text(critical: Mapping[str, Any]) -> str:
+    """The critical waves, long ones by their direction."""
+    if not critical["found"]:
         return "–"
-    if point.angle is not None:
-        return f"long waves along {math.degrees(point.angle) + 0.0:.3g}°"
-    return ", ".join(wave_name(wave) for wave in point.waves)
+    if critical["long_wave_angle"] is not None:
+        return f"long waves along {math.degrees(critical['long_wave_angle']) + 0.0:.3g}°"
+    return ", ".join(wave_name(wave) for wave in critical["waves"])
 
 
-def proof(point: CriticalPoint) -> str:
+def proof(critical: Mapping[str, Any]) -> str:
     """What shows that the point is critical, and the first one."""
-    if not point.found:
-        return f"lowest measure {short(point.value)} MPa, above zero"
-    if point.angle is not None:
-        said = "the acoustic tensor of the effective moduli is singular"
+    if not critical["found"]:
+        return f"lowest filling · λ/k² is {number(critical['value'])} MPa, above zero"
+    if critical["long_wave_angle"] is not None:
+        text = "the acoustic tensor of the effective moduli is singular"
     else:
-        below, above = (", ".join(map(str, n)) for n in (point.below, point.above))
-        said = f"negative eigenvalues a millionth below: {below}, above: {above}"
-    others = len(point.earlier)
-    return said + (f"; but {others} other waves are unstable before" if others else
+        below, above = (", ".join(map(str, critical[side])) for side in ("below", "above"))
+        text = f"negative eigenvalues a millionth below: {below}, above: {above}"
+    others = len(critical["earlier"])
+    return text + (f"; but {others} other waves are unstable before" if others else
                    "; no other wave of the grid is unstable before")  # fmt: skip
 
 
-def key_numbers(run: LatticeRun) -> list[dict[str, str]]:
-    """The few numbers at the top: what they are called, the number, its unit, a remark."""
-    keys = []
-    if run.critical:
-        point = run.critical[0]
+def findings(summary: Summary) -> list[str]:
+    """What was found, in sentences."""
+    text, point = [], summary["critical"]
+    if point is not None and point["found"]:
+        text.append(
+            f"Critical strain {100 * point['load']:.4f} % under {point['loading']} loading, "
+            f"k·a = {waves_text(point)}: {proof(point)}."
+        )
+    elif point is not None:
+        text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
+    text += [
+        f"Lowest λ/k² of the whole zone at {percent(part['load'])}: {wave_name(part['wave'])}, "
+        f"eigenvalue {part['eigenvalue']:.4g} N/mm⁴."
+        for part in summary["zone"]
+    ]
+    text += [
+        f"{family['of']}: family “{family['family']}”, {len(family['waves'])} waves, "
+        f"{family['parameters']} parameters, captures {percent(family['captured'])} of the energy."
+        for family in summary["families"]
+    ]
+    study = summary["study"]
+    if study is not None:
+        low, high = study["overlap"]
+        count = f"{study['lattices']} lattice{'s' * (study['lattices'] != 1)}"
+        text.append(f"Study of {count}: overlap with the analytic mode {low:.4f} to {high:.4f}.")
+    text.append(f"The lattice is of the {material_text(summary['case']['material'])}.")
+    return text
+
+
+def key_numbers(summary: Summary) -> list[KeyNumber]:
+    """The few numbers at the top."""
+    keys, point = [], summary["critical"]
+    if point is not None:
+        load = f"{100 * point['load']:.4g}"
+        if point["found"]:
+            keys += [KeyNumber("critical strain", load, "%", point["loading"]),
+                     _waves_key(point, summary)]  # fmt: skip
+        else:
+            keys += [KeyNumber("stable up to", load, "%", point["loading"]),
+                     KeyNumber("lowest filling · λ/k²", point["value"], "MPa",
+                               "above zero")]  # fmt: skip
+        if point["found"] and point["long_wave_angle"] is None:
+            change = f"{sum(point['below'])} → {sum(point['above'])}"
+            keys.append(KeyNumber("negative eigenvalues", change, "", "a millionth below → above"))
+    if summary["families"]:
+        family = summary["families"][0]
+        waves = len(family["waves"])
         keys += [
-            _key("critical strain" if point.found else "stable up to", percent(point.load), "%",
-                 point.loading),
-            _waves_key(point, run) if point.found else
-            _key("lowest measure", short(point.value), "MPa", "filling · λ / k², above zero"),
+            KeyNumber("captured", f"{100 * family['captured']:.3g}", "%",
+                      f"of the energy of {family['of']}, by {waves} wave{'s' * (waves != 1)}"),
+            KeyNumber("mode family", str(family["parameters"]), "parameters", family["family"]),
         ]  # fmt: skip
-        if point.found and point.angle is None:
-            before = f"{sum(point.below)} → {sum(point.above)}"
-            keys.append(_key("negative eigenvalues", before, "", "a millionth below → above"))
-    if run.patterns:
-        family = next((p for p in run.patterns if p.stable), run.patterns[0]).family
-        waves = family.family.wave_count
-        keys += [
-            _key("captured", percent(family.captured, 3), "%",
-                 f"of the pattern's energy, by {waves} wave{'s' * (waves != 1)}"),
-            _key("mode family", str(family.family.size), "parameters", family.family.name),
-        ]  # fmt: skip
-    stable = [b for b in run.branches if b.states and b.states[-1].negative_eigenvalues == 0]
+    stable = [b for b in summary["branches"]
+              if b["states"] and b["states"][-1]["negative_eigenvalues"] == 0]  # fmt: skip
     if stable:
-        low = min(stable, key=lambda b: b.states[-1].energy - b.states[-1].primary_energy)
-        keys.append(_key("stable branch", combination_name(low.combination), "",
-                         f"lowest energy at {percent(low.states[-1].load)} %"))  # fmt: skip
+        low = min(stable, key=lambda b: _excess(b["states"][-1]))
+        remark = f"lowest energy at {percent(low['states'][-1]['load'])}"
+        keys.append(KeyNumber("stable branch", combination_name(low["combination"]), "", remark))
     return keys
 
 
-def _waves_key(point: CriticalPoint, run: LatticeRun) -> dict[str, str]:
-    copies = (run.modes.info if run.modes is not None else {}).get("copies")
+def _waves_key(point: Mapping[str, Any], summary: Summary) -> KeyNumber:
+    copies = (summary["modes"] or {}).get("copies")
     remark = f"repeat after {copies[0]} × {copies[1]} cells" if copies else "phases (k·a₁, k·a₂)"
-    named = waves_text(point)
-    if len(point.waves) > 1:
-        return _key("critical waves", str(len(point.waves)), "at once", named)
-    return _key("critical wave", "long" if point.angle is not None else named, "", remark)
+    if len(point["waves"]) > 1:
+        return KeyNumber("critical waves", str(len(point["waves"])), "at once", waves_text(point))
+    is_long = point["long_wave_angle"] is not None
+    return KeyNumber("critical wave", "long" if is_long else waves_text(point), "", remark)
 
 
-def _key(name: str, value: str, unit: str, remark: str) -> dict[str, str]:
-    return {"name": name, "value": value, "unit": unit, "remark": remark}
+def _excess(state: Mapping[str, Any]) -> float:
+    """Energy over that of the primary path at the same load [kPa]."""
+    return 1e3 * float(state["energy"] - state["primary_energy"])
 
 
-def branch_rows(branches: Sequence[Branch]) -> list[dict[str, Any]]:
-    """Rows of the table of branches, at their last state."""
-    rows = []
-    for branch in branches:
-        row: dict[str, Any] = {"name": combination_name(branch.combination),
-                               "outcome": branch.outcome}  # fmt: skip
-        if branch.states:
-            state = branch.states[-1]
-            row |= {
-                "load": percent(state.load),
-                "excess": 1e3 * (state.energy - state.primary_energy),
-                "negative": state.negative_eigenvalues,
-                "amplitudes": ", ".join(short(float(a)) for a in _cleared(state.amplitudes)),
-            }
-        rows.append(row)
-    return rows
-
-
-def _cleared(amplitudes: FloatArray) -> FloatArray:
-    """What is nothing beside the largest is 0."""
-    return np.where(np.abs(amplitudes) > 1e-6 * np.abs(amplitudes).max(), amplitudes, 0.0)
-
-
-def study_text(study: LatticeModeStudy) -> list[str]:
-    """What a study says, drawn from its rows."""
-    said = []
-    for limit in study.limits:
-        said.append(
-            f"Under {limit.loading} loading the pattern is what buckles first from d/l = "
-            f"{limit.with_:.4g} on; at {limit.without:.4g} it is {_KINDS[limit.instead]}."
-        )
-    limited = {limit.loading for limit in study.limits}
-    for loading in dict.fromkeys(row.loading for row in study.ratios):
-        rows = [row for row in study.ratios if row.loading == loading]
-        if loading not in limited and all(row.is_first for row in rows):
-            ratios = [row.ratio for row in rows]
-            said.append(f"Under {loading} loading it is the first for every d/l "
-                        f"looked at, from {min(ratios):.4g} to {max(ratios):.4g}.")  # fmt: skip
-    if study.ratios:
-        best = max(study.ratios, key=lambda row: row.overlap)
-        worst = min(study.ratios, key=lambda row: row.overlap)
-        said.append(
-            f"The overlap with Eq. (mode) lies between {worst.overlap:.3f} (d/l = "
-            f"{worst.ratio:.4g}, {worst.loading}) and {best.overlap:.4f} (d/l = {best.ratio:.4g}, "
-            f"{best.loading})."
-        )
-    said += _likeness_text(study.scales, "cell sizes", "1 to rounding by construction: equations and "
-                      "mesh scale, only rounding differs")  # fmt: skip
-    said += _likeness_text(study.materials, "materials", "")
-    return said
-
-
-def _likeness_text(rows: Sequence[ModeRow], what: str, remark: str) -> list[str]:
-    known = [row.likeness for row in rows if not math.isnan(row.likeness)]
-    if not known:
-        return []
-    least = min(known)
-    number = f"1 − {short(1 - least)}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
-    text = f"Modes of other {what} overlap with the reference's by at least {number}"
-    return [text + (f" ({remark})." if remark else ".")]
-
-
-def study_rows(rows: Sequence[ModeRow]) -> list[dict[str, Any]]:
-    """Rows of the study's tables."""
-    return [
-        {
-            "material": row.material,
-            "loading": row.loading,
-            "pitch": row.pitch,
-            "ratio": row.ratio,
-            "first": percent(row.first) if row.found else f"> {percent(row.first)}",
-            "kind": _KINDS[row.kind],
-            "is_first": row.is_first,
-            "pattern": percent(row.pattern),
-            "overlap": f"{row.overlap:.4f}",
-            "captured": f"{percent(row.captured)} ({row.waves})",
-            "likeness": "–" if math.isnan(row.likeness) else f"{row.likeness:.6f}",
-        }
-        for row in rows
-    ]
-
-
-def notes(run: LatticeRun) -> list[str]:
+def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
-    said = list(run.notes)
-    for point in run.critical:
-        if not point.found:
-            said.append(
-                f"Under {point.loading} no critical point was found up to {percent(point.load)} %. "
-                f"That is no proof beyond: {point.outcome}."
-            )
-        elif point.angle is not None:
-            said.append(
-                f"Under {point.loading} waves much longer than the cell come first: a loss of "
-                "ellipticity of the effective medium, which no finite cell has as a mode."
-            )
-    if any(branch.states for branch in run.branches):
-        said.append(
-            "Stability of branches is judged for fields with the period of the cell shown; longer "
-            "waves are not looked at there. Contact is not modelled."
+    text, point = [], summary["critical"]
+    if point is not None and not point["found"]:
+        text.append(
+            f"Under {point['loading']} no critical point was found up to {percent(point['load'])}. "
+            f"That is no proof beyond: {summary['outcome']}."
         )
-    if run.study is not None:
-        said.append(
+    elif point is not None and point["long_wave_angle"] is not None:
+        text.append(
+            f"Under {point['loading']} waves much longer than the cell come first: a loss of "
+            "ellipticity of the effective medium, which no finite cell has as a mode."
+        )
+    if any(branch["states"] for branch in summary["branches"]):
+        text.append(
+            "Stability of branches is assessed for fields with the period of the cell shown; "
+            "longer waves are not looked at there. Contact is not modelled."
+        )
+    if summary["study"] is not None:
+        text.append(
             "The paper does not give its material constants, and its overlays show the mode that "
             "was identified in a specimen; here the analytic mode is Eq. (mode) with its ideal "
             "parameters."
         )
-    said.append(
+    text.append(
         "The spectral densities are of a field that is zero in the holes, integrated over one cell "
-        "that repeats; they are drawn in decibels, so that small ones are seen."
+        "that repeats; they are drawn in decibels, so that small ones are visible."
     )
-    return said
+    return text
 
 
-LATTICE_TEMPLATE = "lattice.html"
-WORDS = {
-    "percent": percent,
-    "key_numbers": key_numbers,
-    "branch_rows": branch_rows,
-    "study_sentences": study_text,
-    "study_rows": study_rows,
-    "notes": notes,
-    "waves_in_words": waves_text,
-    "proof": proof,
-}
-"""What the template calls by name."""
-CELLS = 4
-"""Unit cells along the side of a picture's window."""
-VISIBLE = 0.12
-"""Largest fluctuation that a deformed lattice is drawn with, at least [l]."""
-
-
-def write_lattice_report(path: Path | str, run: LatticeRun, progress: Progress = silent) -> None:
-    """Write the report of a lattice, atomically.
-
-    Parameters
-    ----------
-    path
-        The HTML file.
-    run
-        What it shows.
-    progress
-        Listener.
-    """
-    parts = [_hero, _reference, _patterns, _dispersion, _modes, _branches, _study]
-    content: dict[str, Any] = {}
-    for n, part in enumerate(parts):
-        progress(n, len(parts), "report")
-        content[part.__name__.removeprefix("_")] = part(run)
-    material = material_text(run.case["material"])
-    page = render(
-        LATTICE_TEMPLATE, title=run.title, run=run, words=WORDS, material=material, **content
-    )
-    with atomic(path) as temporary:
-        temporary.write_text(page, "utf-8")
-    progress(1, 1, "report")
-
-
-def _lattice_picture(name: str, label: str, drawn: Figure, fact: str = "") -> Picture:
-    return Picture(name, label, to_svg(drawn, name, label), fact)
-
-
-def _window(run: LatticeRun, width: float, height: float) -> LatticePatch:
+def _window(run: LatticeRun, width: float = CELLS, height: float = CELLS) -> LatticePatch:
     """Cells of the modes where there are some, primitive ones otherwise [l]."""
     mesh, lattice = run.mesh, run.lattice
     if run.modes is not None:
@@ -314,129 +250,339 @@ def _window(run: LatticeRun, width: float, height: float) -> LatticePatch:
     return LatticePatch.of(mesh, lattice, (width * run.pitch, height * run.pitch))
 
 
-def _hero(run: LatticeRun) -> str:
-    if run.modes is None:
-        drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch)
-    else:
+def _hero(run: LatticeRun) -> ReportFigure:
+    drawn = partial(figures.draw_lattice, _window(run), run.pitch)
+    if run.modes is not None:
         shape, patterns = run.modes.shapes[0], run.patterns
         if patterns:
             shown = next((p for p in patterns if p.stable), patterns[0])
             shape = shown.fluctuation
-        drawn = draw_growth(_window(run, 7.0, 5.6), shape, DRAWN_AMPLITUDE * run.pitch, run.pitch)
-    return to_svg(drawn, "hero", "The lattice and its pattern")
+        amplitude = DRAWN_AMPLITUDE * run.pitch
+        drawn = partial(figures.draw_growth, _window(run, 7.0, 5.6), shape, amplitude, run.pitch)
+    return ReportFigure("hero", "The lattice and its pattern", drawn)
 
 
-def _reference(run: LatticeRun) -> Picture:
-    drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch)
-    return _lattice_picture("reference", "Reference", drawn, "dashed: the cell that repeats")
-
-
-def _patterns(run: LatticeRun) -> list[dict[str, Any]]:
-    """For each pattern the deformed lattice and both densities, and its family."""
-    return [
-        {"found": found, "waves": found.family.waves,
-         "pictures": [_deformed(run, found, n), *_densities(found, n)]}
+def _pattern_section(run: LatticeRun) -> Section:
+    """The reference, and for each pattern the deformed lattice and both densities."""
+    drawn = partial(figures.draw_lattice, _window(run), run.pitch)
+    reference = ReportFigure("reference", "Reference", drawn, "dashed: the cell that repeats")
+    cards = [
+        Card(found.name, [*([reference] if n == 1 else []), _deformed(run, found, n),
+                          *_densities(found, n)], paper="paper: Fig. modes", wide=True)
         for n, found in enumerate(run.patterns, start=1)
     ]  # fmt: skip
+    lead = (
+        "Fig. “modes” of the paper: reference and deformed configuration, and the energy spectral "
+        "densities of the displacement without its affine part. A periodic field has energy at the "
+        "reciprocal vectors of its cell only: dots."
+    )
+    cards = cards or [Card("The lattice", [reference])]
+    return Section("lattice", "Lattice and pattern", cards, lead if run.patterns else "")
 
 
-def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> Picture:
-    """The deformed lattice; a fluctuation that is too small to be seen is magnified."""
+def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> ReportFigure:
+    """The deformed lattice; a fluctuation that is too small to be visible is magnified."""
     assert run.modes is not None
     fluctuation = found.fluctuation
     largest = float(np.linalg.norm(fluctuation, axis=1).max()) / run.pitch
     factor = DRAWN_AMPLITUDE / largest if found.stable is None else max(1.0, VISIBLE / largest)
     u = found.displacement + (factor - 1.0) * fluctuation
-    drawn = draw_lattice(_window(run, CELLS, CELLS), run.pitch, u, found.gradient)
+    drawn = partial(figures.draw_lattice, _window(run), run.pitch, u, found.gradient)
     if found.stable is None:
-        fact = f"a mode, no equilibrium; largest displacement {DRAWN_AMPLITUDE} l"
+        text = f"a mode, no equilibrium; largest displacement {DRAWN_AMPLITUDE} l"
     else:
-        fact = "stable; " if found.stable else "unstable; "
-        fact += f"fluctuation × {factor:.3g}" if factor > 1.005 else "true to scale"
-    return _lattice_picture(f"deformed-{n}", "Deformed", drawn, fact)
+        text = "stable; " if found.stable else "unstable; "
+        text += f"fluctuation × {factor:.3g}" if factor > 1.005 else "true to scale"
+    return ReportFigure(f"deformed-{n}", "Deformed", drawn, text)
 
 
-def _densities(found: FoundPattern, n: int) -> list[Picture]:
+def _densities(found: FoundPattern, n: int) -> list[ReportFigure]:
     spectrum = found.spectrum
     both = {"xx": spectrum.S_xx, "yy": spectrum.S_yy}
     largest = float(max(S.max() for S in both.values()))
-    pictures = []
+    made = []
     for name, S in both.items():
         up = np.where(upward(spectrum.xi), S, 0.0)
         xi = [float(x) for x in spectrum.xi[int(np.argmax(up))]]
-        of = "" if found.stable is None else f" {short(float(S.max()))} mm⁶"  # a mode has no size
-        fact = f"largest{of} at ±({short(xi[0])}, {short(xi[1])})"
-        svg = to_svg(draw_lattice_spectrum(spectrum.xi, S, largest), f"S{name}-{n}", f"S_{name}")
-        pictures.append(Picture(f"S{name}-{n}", Markup(f"S<sub>{name}</sub>"), svg, fact))
-    return pictures
+        of = "" if found.stable is None else f" {number(float(S.max()))} mm⁶"  # a mode has no size
+        text = f"largest{of} at ±({number(xi[0])}, {number(xi[1])})"
+        drawn = partial(figures.draw_lattice_spectrum, spectrum.xi, S, largest)
+        made.append(ReportFigure(f"S{name}-{n}", Markup(f"S<sub>{name}</sub>"), drawn, text))
+    return made
 
 
-def _dispersion(run: LatticeRun) -> dict[str, Any]:
-    """The path's curves and the zone's maps."""
-    found = run.dispersion
-    if found is None:
-        return {}
-    waves = [wave for point in run.critical for wave in point.waves]
-    return {
-        "path": _lattice_picture("dispersion-path", "Along a path", draw_dispersion(found, waves)),
-        "maps": [
-            _lattice_picture(f"zone-{n}", f"At {100 * part.load:.4g} %",
-                     draw_zone_map(part, run.pitch, waves))
-            for n, part in enumerate(found.zone, start=1)
-        ],
-    }  # fmt: skip
+_CRITICAL_LEAD = (
+    "The first load at which the eigenvalue of some wave is zero, searched over all wave vectors: "
+    "on a grid of the zone, by descent from its best points, and for waves much longer than the "
+    "cell by the acoustic tensor of the effective moduli. Waves are given as phases (k·a₁, k·a₂) "
+    "from cell to cell."
+)
 
 
-def _modes(run: LatticeRun) -> list[Picture]:
+def _critical_cards(summary: Summary) -> list[Card]:
+    point = summary["critical"]
+    if point is None:
+        return []
+    mark = Mark("critical", True) if point["found"] else Mark("stable so far", False)
+    row = (point["loading"], f"{100 * point['load']:.5g}", waves_text(point), mark, proof(point))
+    columns = ("loading", "strain [%]", "critical waves", "", "proof")
+    table = ReportTable("Critical point", columns, [row])
+    return [Card.tabular(table, wide=True)]
+
+
+_DISPERSION_LEAD = (
+    "Lowest eigenvalues of K x = λ M x, M the mass matrix of unit density, with both matrices "
+    "reduced by the Bloch condition. A wave with a negative λ grows."
+)
+
+
+def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
+    rows = summary["dispersion"]
+    if not rows:
+        return []
+    names = dict.fromkeys(name for name, _ in rows[0]["corners"] if name != "Γ")
+    table = ReportTable(
+        "Lowest eigenvalue [N/mm⁴]", ("wave", *(percent(row["load"]) for row in rows)),
+        [(name, *(dict(row["corners"])[name] for row in rows)) for name in names],
+        on_terminal=True,
+    )  # fmt: skip
+    corners = Card.tabular(table)
+    if run is None or run.dispersion is None:
+        return [corners]
+    found, waves = run.dispersion, [wave for point in run.critical for wave in point.waves]
+    path = partial(figures.draw_dispersion, found, waves)
+    maps = [
+        ReportFigure(f"zone-{n}", f"At {100 * part.load:.4g} %",
+                     partial(figures.draw_zone_map, part, run.pitch, waves))
+        for n, part in enumerate(found.zone, start=1)
+    ]  # fmt: skip
+    cards = [
+        Card.single("dispersion-path", "Along a path", path,
+             "Bold: the lowest eigenvalue, at the loads named above; faint: the next ones. "
+             "Ring: a critical wave."),
+        Card("Over the zone", maps,
+             caption="Lowest eigenvalue against the wave vector ξ = k l/2π, Cartesian. Outline: "
+             "the first Brillouin zone. Rings: the critical waves and their images. At Γ it is "
+             "zero: a translation."),
+    ]  # fmt: skip
+    return [*(card for card in cards if card.figures), corners]
+
+
+def _mode_section(run: LatticeRun) -> Section:
     """Every mode of the set upon the undeformed lattice."""
     modes = run.modes
     if modes is None:
-        return []
-    still, pictures = _window(run, CELLS, CELLS), []
+        return Section("modes", "Modes", [])
+    still, drawn = _window(run), []
     for k, (wave, value) in enumerate(zip(modes.waves, modes.eigenvalues, strict=True)):
         shape = modes.shapes[k]
         u = DRAWN_AMPLITUDE * run.pitch / float(np.linalg.norm(shape, axis=1).max()) * shape
         name = combination_name([float(j == k) for j in range(len(modes.waves))])
-        label = f"{name} · wave {wave_name(wave)}"
-        fact = f"eigenvalue {short(float(value))} N/mm⁴"
-        pictures.append(
-            _lattice_picture(f"mode-{k + 1}", label, draw_lattice(still, run.pitch, u), fact)
-        )
-    return pictures
+        drawn.append(ReportFigure(
+            f"mode-{k + 1}", f"{name} · wave {wave_name(wave)}",
+            partial(figures.draw_lattice, still, run.pitch, u),
+            f"eigenvalue {number(float(value))} N/mm⁴",
+        ))  # fmt: skip
+    many = (
+        f"A set of {len(drawn)} modes, orthonormal over the material: any combination of modes of "
+        "the same eigenvalue is a mode as well. "
+    )
+    lead = (
+        f"{many if len(drawn) > 1 else ''}At a load of {percent(modes.load)}; drawn upon the "
+        f"undeformed lattice with a largest displacement of {DRAWN_AMPLITUDE} l."
+    )
+    return Section("modes", "Modes", [Card("Modes", drawn, wide=True)], lead)
 
 
-def _branches(run: LatticeRun) -> list[Picture]:
+_BRANCH_LEAD = (
+    "Equilibria of the cell that repeats, beyond the critical point. The lowest energy at the same "
+    "load is what a lattice at that prescribed load prefers."
+)
+
+
+def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
+    rows = [_branch_row(branch) for branch in summary["branches"]]
+    if not rows:
+        return []
+    columns = ("branch", "last strain [%]", "energy − primary [kPa]", "negative eigenvalues",
+               "amplitudes [mm]", "outcome")  # fmt: skip
+    table = ReportTable("Branches at their last states", columns, rows, on_terminal=True)
+    card = Card.tabular(table, wide=True)
+    return [*(_branch_figures(run) if run else []), card]
+
+
+def _branch_row(branch: Mapping[str, Any]) -> tuple[Cell, ...]:
+    name = combination_name(branch["combination"])
+    if not branch["states"]:
+        return (name, None, None, None, "–", branch["outcome"])
+    state = branch["states"][-1]
+    sizes = np.array(state["amplitudes"])
+    sizes = np.where(np.abs(sizes) > 1e-6 * np.abs(sizes).max(), sizes, 0.0)
+    amplitudes = ", ".join(number(float(a)) for a in sizes)
+    return (name, f"{100 * state['load']:.4g}", _excess(state), state["negative_eigenvalues"],
+            amplitudes, branch["outcome"])  # fmt: skip
+
+
+def _branch_figures(run: LatticeRun) -> list[Card]:
     followed = [branch for branch in run.branches if branch.states]
     if not followed or run.modes is None:
         return []
     critical = run.modes.load
+    parts = {
+        "energies": ("Energy", partial(figures.draw_energies, followed, critical),
+                     "Stored energy per area of the lattice over that of the primary path at the "
+                     "same load. Filled: stable against all fields with the cell’s period; open "
+                     "and dashed: unstable. Ring: the critical point."),
+        "amplitudes": ("Amplitude", partial(figures.draw_amplitudes, followed, critical),
+                       "Of the critical modes together: the root of the sum of their squared "
+                       "amplitudes."),
+        "differences": ("Lowest branch", partial(figures.draw_differences, followed),
+                        "Stored energy per area over that of the lowest of these branches at the "
+                        "same load."),
+    }  # fmt: skip
     return [
-        _lattice_picture("energies", "Energy", draw_energies(followed, critical)),
-        _lattice_picture("amplitudes", "Amplitude", draw_amplitudes(followed, critical)),
-        *([_lattice_picture("differences", "Which one is lowest", draw_differences(followed))]
-          if len(followed) > 1 else []),
+        Card.single(name, title, drawn, caption)
+        for name, (title, drawn, caption) in parts.items()
+        if len(followed) > 1 or name != "differences"
+    ]
+
+
+def _family_section(run: LatticeRun) -> Section:
+    lead = Markup(
+        "φ(x) = Σ (A, B) sin[π/l (k<sub>x</sub> x + k<sub>y</sub> y + c)] over a few waves: what "
+        "the paper reads off the spectral densities by eye. What the waves have in common becomes "
+        "a shared parameter."
+    )
+    return Section("family", "Mode family", [_family_card(found) for found in run.patterns], lead)
+
+
+def _family_card(found: FoundPattern) -> Card:
+    family = found.family
+    rows: list[tuple[Cell, ...]] = [
+        (k, *(fixed(float(v)) for v in wave)) for k, wave in enumerate(family.waves, start=1)
+    ]
+    table = ReportTable(f"Waves of {found.name}", ("wave", "A", "B", "kₓ", "k_y", "c [mm]"), rows)
+    guess = ", ".join(
+        f"{name} = {number(round(float(value), 5))}"
+        for name, value in zip(family.family.names, family.family.start, strict=True)
+    )
+    growth = ", ".join(f"{count}: {percent(share)}" for count, share in family.growth)
+    caption = (
+        f"Initial parameters: {guess}. Energy captured by 1, 2, … independent waves: {growth}."
+    )
+    return Card(found.name, tables=[table], text=family.text, caption=caption,
+                paper=family.family.name, wide=True)  # fmt: skip
+
+
+def _study_section(run: LatticeRun) -> Section:
+    """Curves, overlays and rows of a study."""
+    study = run.study
+    if study is None:
+        return Section("study", "Parameter study", [])
+    overlays = [_overlay(mode, n) for n, mode in enumerate(study.overlays, start=1)]
+    tables = [
+        ReportTable(f"{name}: every value", _STUDY_COLUMNS, study_rows(rows), folded=True)
+        for name, rows in (("Hole size and loading", study.ratios), ("Cell size", study.scales),
+                           ("Material", study.materials)) if rows
+    ]  # fmt: skip
+    cards = [
+        Card("Findings of the study", text=study_text(study), wide=True),
+        Card("A quarter of the mode’s cell", overlays, paper="paper: Fig. graded", wide=True,
+             caption="Line: the numerical mode. Grey: the analytic one, with the same rms "
+             "displacement over the material. The stated largest displacement is the numerical "
+             "one’s."),
+        *_study_figures(study.ratios),
+        Card("Tables", tables=tables, wide=True),
+    ]  # fmt: skip
+    lead = (
+        "The paper’s Section “Graded Microstructures and Size Independence of the Modes”: the "
+        "numerical mode at (π, π) against Eq. (mode), whose two waves are the same for every "
+        "lattice."
+    )
+    return Section("study", "Parameter study",
+                   [c for c in cards if c.figures or c.tables or c.text], lead)  # fmt: skip
+
+
+def _study_figures(rows: Sequence[ModeRow]) -> list[Card]:
+    parts = {
+        "strains": ("Critical strain", figures.draw_critical_strains,
+                    "Line: what is critical first. Dashed: the wave (π, π) alone, where something "
+                    "else comes before. No point: stable in the whole range. Filled dots, here "
+                    "and beside: the pattern comes first."),
+        "overlaps": ("Overlap with Eq. (mode)", figures.draw_overlaps,
+                     "1: the same field but for a factor. Where the pattern isn’t what comes "
+                     "first, its lowest mode in the first critical state, or in the last state "
+                     "looked at."),
+        "captured": ("Energy captured", figures.draw_captured,
+                     "By the family that is found for each mode on its own; it takes more waves "
+                     "(their number beside the dots) where two are not enough."),
+    }  # fmt: skip
+    return [
+        Card.single(name, title, partial(draw, rows), caption)
+        for name, (title, draw, caption) in parts.items() if rows
     ]  # fmt: skip
 
 
-def _study(run: LatticeRun) -> dict[str, Any]:
-    """Curves and overlays of a study."""
-    study = run.study
-    if study is None:
-        return {}
-    curves = [
-        _lattice_picture("strains", "Critical strain", draw_critical_strains(study.ratios)),
-        _lattice_picture("overlaps", "Overlap with Eq. (mode)", draw_overlaps(study.ratios)),
-        _lattice_picture("captured", "Energy captured", draw_captured(study.ratios)),
-    ]
-    overlays = [_overlay(mode, n) for n, mode in enumerate(study.overlays, start=1)]
-    return {"curves": curves if study.ratios else [], "overlays": overlays}
-
-
-def _overlay(mode: PatternMode, n: int) -> Picture:
+def _overlay(mode: PatternMode, n: int) -> ReportFigure:
     """Both modes on one cell, less enlarged where small holes would close."""
     row = mode.row
     size = min(DRAWN_AMPLITUDE, 0.4 * row.ratio)
-    drawn = draw_overlay(mode.mesh, row.pitch, mode.shape, mode.analytic, size * row.pitch)
-    fact = f"overlap {row.overlap:.4f}; largest displacement {size:.3g} l; {row.loading}, state at "
-    fact += f"{100 * row.state:.4g} %" + ("" if row.is_first else ", where it is not critical")
-    return _lattice_picture(f"overlay-{n}", f"d/l = {row.ratio:.4g}", drawn, fact)
+    drawn = partial(figures.draw_overlay, mode.mesh, row.pitch, mode.shape, mode.analytic,
+                    size * row.pitch)  # fmt: skip
+    text = f"overlap {row.overlap:.4f}; largest displacement {size:.3g} l; {row.loading}, state at "
+    text += percent(row.state) + ("" if row.is_first else ", where it is not critical")
+    return ReportFigure(f"overlay-{n}", f"d/l = {row.ratio:.4g}", drawn, text)
+
+
+_STUDY_COLUMNS = (
+    "material", "loading", "l [mm]", "d/l", "first critical", "first waves", "(π, π) critical",
+    "overlap with Eq. (mode)", "captured (waves)", "overlap with reference",
+)  # fmt: skip
+
+
+def study_rows(rows: Sequence[ModeRow]) -> list[tuple[Cell, ...]]:
+    """Rows of the study's tables."""
+    return [
+        (row.material, row.loading, row.pitch, row.ratio,
+         percent(row.first) if row.found else f"> {percent(row.first)}",
+         Mark(_KINDS[row.kind], True) if row.is_first else _KINDS[row.kind],
+         percent(row.pattern), f"{row.overlap:.4f}", f"{percent(row.captured)} ({row.waves})",
+         None if math.isnan(row.likeness) else f"{row.likeness:.6f}")
+        for row in rows
+    ]  # fmt: skip
+
+
+def study_text(study: LatticeModeStudy) -> list[str]:
+    """What a study shows, drawn from its rows."""
+    text = [
+        f"Under {limit.loading} loading the pattern is what buckles first from d/l = "
+        f"{limit.with_:.4g} on; at {limit.without:.4g} it is {_KINDS[limit.instead]}."
+        for limit in study.limits
+    ]
+    limited = {limit.loading for limit in study.limits}
+    for loading in dict.fromkeys(row.loading for row in study.ratios):
+        rows = [row for row in study.ratios if row.loading == loading]
+        if loading not in limited and all(row.is_first for row in rows):
+            ratios = [row.ratio for row in rows]
+            text.append(f"Under {loading} loading it is the first for every d/l "
+                        f"looked at, from {min(ratios):.4g} to {max(ratios):.4g}.")  # fmt: skip
+    if study.ratios:
+        best = max(study.ratios, key=lambda row: row.overlap)
+        worst = min(study.ratios, key=lambda row: row.overlap)
+        text.append(
+            f"The overlap with Eq. (mode) lies between {worst.overlap:.3f} (d/l = "
+            f"{worst.ratio:.4g}, {worst.loading}) and {best.overlap:.4f} (d/l = {best.ratio:.4g}, "
+            f"{best.loading})."
+        )
+    text += _likeness_text(study.scales, "cell sizes", " (1 to rounding by construction: equations "
+                           "and mesh scale, only rounding differs)")  # fmt: skip
+    return text + _likeness_text(study.materials, "materials", "")
+
+
+def _likeness_text(rows: Sequence[ModeRow], what: str, remark: str) -> list[str]:
+    known = [row.likeness for row in rows if not math.isnan(row.likeness)]
+    if not known:
+        return []
+    least = min(known)
+    value = f"1 − {number(1 - least)}" if 0 < 1 - least < 1e-4 else f"{least:.6g}"
+    return [f"Modes of other {what} overlap with the reference's by at least {value}{remark}."]

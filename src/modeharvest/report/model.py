@@ -1,239 +1,502 @@
-"""The report model: key numbers, figures, tables and text of a page, its template, numbers for readers."""
+"""The report model: key numbers, figures, tables and text, for a page, CSV files and the terminal.
+
+Each kind of run has one function that makes its :class:`Report`; everything a reader sees of the
+run follows from that. Figures are functions, drawn one after the other while the page is written.
+"""
 
 from __future__ import annotations
 
+import csv
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from math import isfinite
 from pathlib import Path
-from typing import Any
-
-import jinja2
-import pandas as pd
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from modeharvest.fem.materials import Ogden
-from modeharvest.report.figures.style import to_svg
 from modeharvest.util.files import atomic
+from modeharvest.util.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+NBSP = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture in the page.
+class Mark:
+    """A word in a coloured pill: green if good, red if not."""
 
-    Parameters
-    ----------
-    id
-        Its anchor: the panel's key and the strain in hundredths of a percent.
-    label
-        What is written above it.
-    svg
-        The picture itself.
-    fact
-        One line of numbers below it.
-    """
-
-    id: str
-    label: str
-    svg: str
-    fact: str = ""
+    text: str
+    good: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Plot:
-    """A picture of a study.
+@dataclass(frozen=True)
+class Measured:
+    """A value with its standard errors, of which None is not known and infinity is no limit."""
 
-    Parameters
-    ----------
-    name, title
-        A short name for files and links, and what it is called.
-    drawn
-        The figure, in the style of :mod:`modeharvest.report.figures.style`.
-    caption
-        What is to be seen.
-    wide
-        Whether it needs the whole width of the page.
-    """
+    value: float
+    errors: tuple[float | None, ...] = ()
+    decimals: int = 5
 
-    name: str
-    title: str
-    drawn: Figure
-    caption: str = ""
-    wide: bool = False
+    def __str__(self) -> str:
+        return " ".join([fixed(self.value, self.decimals), *self.error_texts])
+
+    @property
+    def error_texts(self) -> list[str]:
+        """Each standard error: "± 0.00020", "< 0.00001" where it is less than is written."""
+        least = 0.5 * 10.0**-self.decimals
+        return [
+            "± –" if error is None or error != error
+            else "± ∞" if not isfinite(error)
+            else f"± {error:.{self.decimals}f}" if error >= least or error == 0.0
+            else f"< {2 * least:.{self.decimals}f}"
+            for error in self.errors
+        ]  # fmt: skip
+
+
+Cell = str | float | int | None | Mark | Measured
 
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """One of the few numbers that a study is about.
+    """One of the up to six numbers at the top of a page.
 
     Parameters
     ----------
     name, value, unit
-        What it is, its value as a reader wants it, and its unit (may be empty).
+        What it is, its value as a reader wants it or None, and its unit (may be empty).
     remark
         What to compare it with.
     """
 
     name: str
-    value: str
-    unit: str
-    remark: str
+    value: str | float | None
+    unit: str = ""
+    remark: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportFigure:
+    """A figure, drawn when the page is written.
+
+    Parameters
+    ----------
+    name
+        Its anchor, unique in the page.
+    label
+        What is written above it; may be empty.
+    draw
+        Draws it, in the style of :mod:`modeharvest.report.figures.style`.
+    numbers
+        One line of numbers below it.
+    wide
+        Whether it takes the whole width of its card.
+    exact
+        Whether every pixel is kept: for fields as fine as the pixels.
+    late
+        Whether it is drawn after the others, as what it shows may still be computed.
+    """
+
+    name: str
+    label: str
+    draw: Callable[[], Figure]
+    numbers: str = ""
+    wide: bool = False
+    exact: bool = False
+    late: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ReportTable:
+    """A table.
+
+    Parameters
+    ----------
+    title
+        What it holds.
+    columns
+        Headings with their units; the first column names the rows.
+    rows
+        As many cells each as there are columns.
+    name
+        Its anchor; none if empty.
+    file
+        A CSV file beside the page that holds the same.
+    folded
+        Whether the reader has to unfold it.
+    on_terminal
+        Whether it is printed, too.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    name: str = ""
+    file: str = ""
+    folded: bool = False
+    on_terminal: bool = False
+
+    @classmethod
+    def of(cls, title: str, table: pd.DataFrame, **more: Any) -> ReportTable:
+        """A data frame as it is, with a CSV file."""
+        rows = table.astype(object).values.tolist()
+        columns, name = [str(column) for column in table], slug(title)
+        return cls(title, columns, rows, f"table-{name}", f"{name}.csv", **more)
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Which columns hold numbers, as such or in words that begin with one; not the first."""
+        others = [all(map(_is_number, column)) for column in zip(*self.rows, strict=True)][1:]
+        return [False, *others]
+
+
+@dataclass(frozen=True, eq=False)
+class Card:
+    """What belongs together on a page: figures side by side, tables, text.
+
+    Parameters
+    ----------
+    title
+        Its heading.
+    figures, tables
+        The same quantity at several states, for example; in this order.
+    text
+        Statements, as a list; by headings, side by side, where it is a mapping.
+    caption
+        What is seen, below.
+    name
+        Its anchor; none if empty.
+    symbol, paper
+        Beside the heading: of the quantity, and its figure in the paper.
+    wide
+        Whether it takes the whole width of the page.
+    """
+
+    title: str
+    figures: Sequence[ReportFigure] = ()
+    tables: Sequence[ReportTable] = ()
+    text: Sequence[str] | Mapping[str, Sequence[str]] = ()
+    caption: str = ""
+    name: str = ""
+    symbol: str = ""
+    paper: str = ""
+    wide: bool = False
+
+    @classmethod
+    def single(
+        cls, name: str, title: str, draw: Callable[[], Figure], caption: str = "", **more: Any
+    ) -> Card:
+        """One figure over the whole width of its card."""
+        return cls(title, [ReportFigure(name, "", draw, wide=True)], caption=caption, **more)
+
+    @classmethod
+    def tabular(cls, table: ReportTable, **more: Any) -> Card:
+        """One table under its own title."""
+        return cls(table.title, tables=[table], **more)
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A part of a page: its anchor, heading, a paragraph, and cards."""
+
+    name: str
+    title: str
+    cards: Sequence[Card]
+    lead: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """All that a reader sees of a run.
+
+    Parameters
+    ----------
+    kind, title, lead
+        Of which kind of run; what it is called; a paragraph on what the page is about.
+    findings
+        What was found, in sentences, the most important first; also on the terminal.
+    keys
+        Up to six numbers to begin with.
+    sections
+        Figures and tables; empty ones are left out.
+    warnings
+        What to beware of; also on the terminal.
+    notes
+        What to know before trusting the numbers.
+    command, remark
+        What makes it again, and a word on that.
+    case
+        What was run: plain values, or TOML text.
+    files
+        What lies beside the page, and what each file holds.
+    costs, versions
+        Of the run, and of libraries.
+    hero, hero_caption
+        A figure at the top.
+    """
+
+    kind: str
+    title: str
+    lead: str = ""
+    findings: Sequence[str] = ()
+    keys: Sequence[KeyNumber] = ()
+    sections: Sequence[Section] = ()
+    warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    command: str = ""
+    remark: str = ""
+    case: Mapping[str, Any] = field(default_factory=dict)
+    toml: str = ""
+    files: Mapping[str, str] = field(default_factory=dict)
+    costs: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    hero: ReportFigure | None = None
+    hero_caption: str = ""
+
+    @property
+    def cards(self) -> Iterator[Card]:
+        """Those of all sections."""
+        return (card for section in self.sections for card in section.cards)
+
+    @property
+    def figures(self) -> Iterator[ReportFigure]:
+        """Those of all cards, and the one at the top."""
+        yield from (figure for card in self.cards for figure in card.figures)
+        if self.hero is not None:
+            yield self.hero
+
+    @property
+    def tables(self) -> Iterator[ReportTable]:
+        """Those of all cards."""
+        return (table for card in self.cards for table in card.tables)
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a study's table tells.
+    """What a study's table of cases shows.
 
     Parameters
     ----------
     numbers
         The study's results as plain values, with their units in the names.
     sentences
-        The same in words, the most important first.
+        The same in sentences, the most important first.
     keys
         Up to six numbers to begin with.
-    plots
-        Pictures.
-    tables
-        Tables by their titles.
+    figures, tables
+        Of the page.
     attachments
-        Tables that are too long for the page: files only; or, by the title of a table that is
-        written to be read, the same in numbers, which its file then holds.
+        Tables that are files only: too long for the page, or one of its tables in numbers.
     """
 
     numbers: Mapping[str, Any]
-    sentences: tuple[str, ...]
-    keys: tuple[KeyNumber, ...] = ()
-    plots: tuple[Plot, ...] = ()
-    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    attachments: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    sentences: Sequence[str]
+    keys: Sequence[KeyNumber] = ()
+    figures: Sequence[Card] = ()
+    tables: Sequence[ReportTable] = ()
+    attachments: Sequence[ReportTable] = ()
 
 
-def render(template: str, **content: Any) -> str:
-    """Fill one of the templates; a value that it needs and does not get is an error."""
-    folder = str(resources.files(__package__) / "templates")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"short": short, "fixed": fixed}
-    return environment.get_template(template).render(**content)
-
-
-def short(value: Any) -> str:
-    """A number as a reader wants it: three or four digits, a true minus, powers of ten raised."""
-    if value is None:
-        return "–"
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return str(value)
-    if not isfinite(value):
-        return "∞" if value > 0 else "–"
-    if value == int(value) and abs(value) < 1e9:
-        return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
-    if 1e-3 <= abs(value) < 1e5:
-        return f"{value:.4g}".replace("-", "−")
-    digits, power = f"{value:.1e}".split("e")
-    raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{digits} · 10{raised}".replace("-", "−")
-
-
-def fixed(value: float) -> str:
-    """Five decimals with a true minus, and no minus before a zero."""
-    return f"{round(value, 5) + 0.0:.5f}".replace("-", "−")
-
-
-STUDY_TEMPLATE = "study.html"
-
-
-@dataclass(frozen=True, eq=False)
-class StudyRun:
-    """A finished study, and what its report says around the findings.
+def study_report(
+    summary: Mapping[str, Any],
+    findings: Findings | None = None,
+    files: Mapping[str, str] | None = None,
+) -> Report:
+    """The report of a study.
 
     Parameters
     ----------
-    title, question
-        What it is called, and what it asks in a sentence or two.
+    summary
+        The content of ``summary.json``.
     findings
-        What its table tells.
-    command, seeds
-        What makes it again.
-    case
-        Its options and subject, as plain values.
-    notes
-        What to keep in mind: failures, results of other versions.
+        Its figures and tables; without, the report is sentences only, as for the terminal.
     files
-        What lies beside the report, and what each holds.
-    versions
-        Of libraries.
+        What lies beside the page, and what each file holds.
     """
+    found = findings or Findings({}, ())
+    made = f"{summary['command']} · {summary['seeds']}"
+    figures = [
+        replace(card, figures=[replace(figure, numbers=made) for figure in card.figures])
+        for card in found.figures
+    ]
+    return Report(
+        kind="study",
+        title=summary["title"],
+        lead=summary["question"],
+        findings=summary["text"],
+        keys=found.keys,
+        sections=[
+            Section("figures", "Figures", figures),
+            Section("tables", "Tables", [Card.tabular(t, wide=True) for t in found.tables],
+                    "Every case is a row of table.csv."),
+        ],
+        warnings=[f"case {case['file']} failed: {case['error']}" for case in summary["failed"]],
+        notes=_study_notes(summary),
+        command=summary["command"],
+        remark=f"{summary['seeds'].capitalize()}. Run it again after an interruption: finished "
+        "cases are not repeated.",
+        case=summary["case"],
+        files=files or {},
+        versions=summary["versions"],
+    )  # fmt: skip
 
-    title: str
-    question: str
-    findings: Findings
-    command: str
-    seeds: str
-    case: Mapping[str, Any]
-    notes: tuple[str, ...]
-    files: Mapping[str, str]
-    versions: Mapping[str, str]
+
+def _study_notes(summary: Mapping[str, Any]) -> list[str]:
+    """What to keep in mind of how the study went."""
+    own = summary["versions"]["modeharvest"]
+    notes = [
+        f"{count} stored results of {'other options' if label == own else f'modeharvest {label}'} "
+        "are not mixed in."
+        for label, count in summary["other_results_by_version"].items()
+    ]
+    if summary["failed"]:
+        notes.append(f"{len(summary['failed'])} of {summary['cases']} cases failed; their "
+                     "tracebacks are in cases/.")  # fmt: skip
+    return [
+        *notes,
+        "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
+        "not plane) is not in it.",
+    ]
 
 
-def write_study_report(path: Path | str, run: StudyRun) -> None:
-    """Write the report of a study, atomically.
+def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -> dict[str, str]:
+    """Draw figures one after the other, the late ones last; their SVG by their names."""
+    from modeharvest.report.figures.style import style, to_svg
+
+    ordered = sorted(figures, key=lambda figure: figure.late)
+    pictures = {}
+    for n, figure in enumerate(ordered):
+        progress(n, len(ordered), "report")
+        with style():
+            drawn = figure.draw()
+        title = figure.label or figure.name
+        pictures[figure.name] = to_svg(drawn, figure.name, title, exact=figure.exact)
+    progress(1, 1, "report")
+    return pictures
+
+
+def write_page(
+    report: Report,
+    path: Path | str,
+    progress: Progress = silent,
+    pictures: Mapping[str, str] | None = None,
+) -> None:
+    """Write a report as one self-contained HTML file, atomically.
 
     Parameters
     ----------
+    report
+        What to write.
     path
         The HTML file.
-    run
-        What it shows.
+    progress
+        Listener.
+    pictures
+        What :func:`draw_figures` has made of its figures before; they are drawn without.
     """
-    pictures = [_study_picture(plot, run) for plot in run.findings.plots]
-    tables = [
-        {"id": f"table-{slug(title)}", "title": title, "file": f"{slug(title)}.csv",
-         "columns": list(table.columns), "numbers": _number_columns(table),
-         "rows": table.astype(object).values.tolist()}
-        for title, table in run.findings.tables.items()
-    ]  # fmt: skip
-    sentences = [_together(sentence) for sentence in run.findings.sentences]
-    page = render(
-        STUDY_TEMPLATE,
-        title=run.title,
-        run=run,
-        sentences=sentences,
-        pictures=pictures,
-        tables=tables,
-    )
+    import jinja2
+
+    if pictures is None:
+        pictures = draw_figures(report.figures, progress)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(str(resources.files(__package__))), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"number": number, "fixed": fixed, "together": together}
+    environment.tests |= {
+        "mark": lambda cell: isinstance(cell, Mark),
+        "measured": lambda cell: isinstance(cell, Measured),
+    }
+    page = environment.get_template("page.html").render(report=report, pictures=pictures)
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
 
 
-def _number_columns(table: pd.DataFrame) -> list[str]:
-    """The columns of numbers, as such or in words that begin with one; not the first."""
-    others = [str(name) for name in table.columns[1:]]
-    return [name for name in others if table[name].map(_is_number).all()]
+def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
+    """Write every table that has a file as CSV, with all digits, atomically."""
+    for table in tables:
+        if table.file:
+            with (
+                atomic(folder / table.file) as temporary,
+                temporary.open("w", newline="", encoding="utf-8") as file,
+            ):
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(table.columns)
+                writer.writerows(list(map(_for_csv, row)) for row in table.rows)
 
 
-def _is_number(cell: object) -> bool:
-    return not isinstance(cell, str) or cell[:1].isdigit()
+def _for_csv(cell: Cell) -> Any:
+    return "" if cell is None or cell != cell else cell
 
 
-def slug(title: str) -> str:
-    """A title as the name of a file."""
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+def print_report(report: Report, out: Path) -> None:
+    """Print findings, tables and warnings; where the page is, last."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    console.print(f"[bold]{escape(report.title)}[/bold]", soft_wrap=True)
+    for sentence in report.findings:
+        console.print(f"- {escape(sentence)}", soft_wrap=True)
+    for table in (table for table in report.tables if table.on_terminal):
+        printed = Table(title=escape(table.title), title_justify="left")
+        heads, *rows = _upright([list(table.columns), *map(list, table.rows)])
+        for n, head in enumerate(heads):
+            printed.add_column(escape(number(head)), justify="right" if n else "left")
+        for row in rows:
+            printed.add_row(*(escape(number(cell)) for cell in row))
+        console.print(printed)
+    for warning in report.warnings:
+        console.print(f"[yellow]warning:[/yellow] {escape(warning)}", soft_wrap=True)
+    console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def _study_picture(plot: Plot, run: StudyRun) -> dict[str, Any]:
-    svg = to_svg(plot.drawn, plot.name, plot.title)
-    made = Picture(plot.name, plot.title, svg, f"{run.command} · {run.seeds}")
-    return {"plot": plot, "picture": made, "caption": _together(plot.caption)}
+def _upright(lines: list[list[Cell]]) -> list[list[Cell]]:
+    """A table of few long rows turned, so that it fits the terminal."""
+    return (
+        [list(line) for line in zip(*lines, strict=True)] if len(lines) < len(lines[0]) else lines
+    )
 
 
-def _together(words: str) -> str:
-    """No line ends between a number and its unit or error."""
-    return re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", "\N{NO-BREAK SPACE}", words)
+def number(value: Any, digits: int | None = None) -> str:
+    """A number as a reader wants it: at most four digits, a true minus, powers of ten raised.
+
+    With ``digits`` it is rounded to that many before.
+    """
+    if value is None:
+        return "–"
+    if isinstance(value, Mark):
+        return value.text
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return str(value)
+    if not isfinite(value):
+        return "∞" if value > 0 else "–"
+    if digits is not None:
+        value = float(f"{value:.{digits}g}")
+    if value == int(value) and abs(value) < 1e9:
+        return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
+    if 1e-3 <= abs(value) < 1e5:
+        return f"{value:.4g}".replace("-", "−")
+    mantissa, power = f"{value:.1e}".split("e")
+    raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{mantissa} · 10{raised}".replace("-", "−")
+
+
+def fixed(value: float, decimals: int = 5) -> str:
+    """So many decimals, with a true minus and no minus before a zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+
+
+def percent(value: float | None, digits: int = 4) -> str:
+    """A share or a strain [-] in percent, with its sign."""
+    if value is None or value != value:
+        return "–"
+    return f"{100 * value:.{digits}g}{NBSP}%".replace("-", "−")
 
 
 def material_text(table: Mapping[str, Any]) -> str:
@@ -253,3 +516,17 @@ def material_text(table: Mapping[str, Any]) -> str:
 
 def _plain_number(value: Any) -> str:
     return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"
+
+
+def slug(title: str) -> str:
+    """A title as the name of a file."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+
+
+def together(text: str) -> str:
+    """No line ends between a number and its unit or error."""
+    return type(text)(re.sub(r" (?=(?:%|px|mm|±)(?!\w))|(?<=±) ", NBSP, text))
+
+
+def _is_number(cell: Cell) -> bool:
+    return not isinstance(cell, Mark) and (not isinstance(cell, str) or cell[:1].isdigit())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
-from matplotlib.tri import Triangulation
 
 from modeharvest.report.figures.maps import ColourScale
-from modeharvest.report.figures.outlines import MeshBoundary
+from modeharvest.report.figures.outlines import MeshBoundary, triangles
 from modeharvest.report.figures.style import (
     BLUE,
     GOLD,
@@ -25,9 +25,8 @@ from modeharvest.report.figures.style import (
     RED,
     SIGNED,
     figure,
-    style,
 )
-from modeharvest.report.model import Findings, KeyNumber, Plot, short
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.modes import (
     IDEAL,
@@ -41,10 +40,6 @@ from modeharvest.validation.studies.modes import (
 )
 from modeharvest.validation.studies.modes_specimen import specimen_folder
 
-"""Eq. (mode) with a solid junction at the origin, phases in shares of l."""
-
-"""The wave vectors' components."""
-
 _BUCKLING = {
     "smallest_ratio": "d/l from", "largest_ratio": "to", "first": "buckles first into",
     "pattern_share": "pattern’s share of that mode", "critical_strain": "critical strain [%]",
@@ -57,7 +52,7 @@ _LIKENESS = {
     "best_overlap_lattice": "best fit with it",
     "lattice_overlap_ideal": "Eq. (mode) with it", "overlap_truth": "with the specimen: measured",
     "best_overlap_truth": "best fit with that", "w_px": "truth − IDIC [px]",
-    "model_error_px": "truth − best fit [px]", "measurement_error_px": "IDIC − best fit [px]",
+    "model_error_px": "model error [px]", "measurement_error_px": "measurement error [px]",
     "iterations": "iterations", "outcome": "outcome",
 }  # fmt: skip
 
@@ -116,8 +111,7 @@ _WAVE_COLOURS = {"a2": BLUE, "a3": GREEN, "a4": GOLD, "a5": RED}
 _PHASES = {"a6": BLUE, "a7": RED}
 _IDEAL = dict(zip(PARAMETERS, IDEAL, strict=True))
 """Eq. (mode) with a solid junction at the origin; phases in shares of l."""
-_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # triangles of a T6
-_PATTERN_END, _LEFT_END = 0.15, 0.03  # of the colours, in l
+_PATTERN_END, _ERROR_END = 0.15, 0.03  # of the colours, in l
 _PAGE, _WIDEST = 8.9, 1.7  # of all specimens, and of one [in]
 _ROWS = ("truth − v₀", "measured v₁φ₁", "truth − IDIC")
 
@@ -136,27 +130,26 @@ def draw_parameters(done: pd.DataFrame, at: FloatArray, ticks: Sequence[str], la
     label
         Of the axis.
     """
-    with style():
-        drawn = figure(9.6, 3.1 if not len(ticks) else 3.9)
-        aspect, waves, phases = drawn.subplots(1, 3)
-        apart = 0.012 * np.ptp(at) if len(at) > 1 else 0.1
-        for axes, names in ((aspect, {"a1": BLUE}), (waves, _WAVE_COLOURS), (phases, _PHASES)):
-            axes.axhline(0.0, color=MUTED, linestyle=":", linewidth=1)
-            for n, (name, colour) in enumerate(names.items()):
-                _parameter(axes, done, at + apart * (n - 0.5 * (len(names) - 1)), name, colour)
-            _limit(axes, done, names)
-            axes.set_xlabel(label)
-            if len(ticks):
-                axes.set_xticks(at, ticks, rotation=40, ha="right", fontsize=7)
-        lattice = 100.0 * (done["lattice_a1"] - 1.0)
-        aspect.plot(at, lattice, "x", color=INK, markersize=5, label="infinite lattice")
-        aspect.set_ylabel("a₁ − 1 [%]")
-        waves.set_ylabel("wave vectors − ideal [%]")
-        phases.set_ylabel("phases [% of l]")
-        for axes in (aspect, waves, phases):
-            axes.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", handlelength=1.2,
-                        columnspacing=1.0, bbox_to_anchor=(-0.05, 1.0))  # fmt: skip
-        drawn.tight_layout()
+    drawn = figure(9.6, 3.1 if not len(ticks) else 3.9)
+    aspect, waves, phases = drawn.subplots(1, 3)
+    apart = 0.012 * np.ptp(at) if len(at) > 1 else 0.1
+    for axes, names in ((aspect, {"a1": BLUE}), (waves, _WAVE_COLOURS), (phases, _PHASES)):
+        axes.axhline(0.0, color=MUTED, linestyle=":", linewidth=1)
+        for n, (name, colour) in enumerate(names.items()):
+            _parameter(axes, done, at + apart * (n - 0.5 * (len(names) - 1)), name, colour)
+        _limit(axes, done, names)
+        axes.set_xlabel(label)
+        if len(ticks):
+            axes.set_xticks(at, ticks, rotation=40, ha="right", fontsize=7)
+    lattice = 100.0 * (done["lattice_a1"] - 1.0)
+    aspect.plot(at, lattice, "x", color=INK, markersize=5, label="infinite lattice")
+    aspect.set_ylabel("a₁ − 1 [%]")
+    waves.set_ylabel("wave vectors − ideal [%]")
+    phases.set_ylabel("phases [% of l]")
+    for axes in (aspect, waves, phases):
+        axes.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", handlelength=1.2,
+                    columnspacing=1.0, bbox_to_anchor=(-0.05, 1.0))  # fmt: skip
+    drawn.tight_layout()
     return drawn
 
 
@@ -179,34 +172,27 @@ def _parameter(axes: Axes, done: pd.DataFrame, at: FloatArray, name: str, colour
               markeredgewidth=0.8, label="best fit" if name == "a1" else None)  # fmt: skip
 
 
-def draw_overlaps(done: pd.DataFrame, seeds: str) -> Plot:
+def draw_overlaps(done: pd.DataFrame) -> Figure:
     """Draw overlaps against d/l: with the infinite lattice's mode, and with the specimen's."""
-    with style():
-        drawn = figure(9.6, 2.9)
-        lattice, specimen, strains = drawn.subplots(1, 3)
-        for axes, ends in ((lattice, _LATTICE), (specimen, _SPECIMEN)):
-            for key, (text, look) in ends.items():
-                axes.plot(done["ratio"], done[key], linewidth=1, label=text, **look)
-            axes.set(xlabel="d/l [–]", ylabel="overlap [–]")
-            axes.legend(frameon=False, fontsize=7)
-        lattice.set_title("with the infinite lattice’s mode", fontsize=8)
-        specimen.set_title("with the specimen’s own pattern", fontsize=8)
-        for key, text, look in (
-            ("critical_strain", "the specimen", {"color": BLUE, "marker": "o", "markersize": 3}),
-            ("lattice_pattern_strain", "infinite lattice", {"color": INK, "marker": "x",
-                                                            "markersize": 4}),
-        ):  # fmt: skip
-            strains.plot(done["ratio"], 100 * done[key], linewidth=1, label=text, **look)
-        strains.set(xlabel="d/l [–]", ylabel="pattern critical at a strain of [%]")
-        strains.legend(frameon=False, fontsize=7)
-        drawn.tight_layout()
-    caption = (
-        "Overlap |∫ u·φ| / (‖u‖ ‖φ‖) over the material, 1 for fields that differ by a factor. "
-        "Left: of modes of constant amplitude over all cells; middle: of v₁φ₁ with the truth less "
-        "the best fit’s v₀ over the cellular part. Right: where the pattern becomes critical. "
-        f"{seeds.capitalize()}."
-    )
-    return Plot("overlaps", "Overlaps, and when the pattern comes", drawn, caption, wide=True)
+    drawn = figure(9.6, 2.9)
+    lattice, specimen, strains = drawn.subplots(1, 3)
+    for axes, ends in ((lattice, _LATTICE), (specimen, _SPECIMEN)):
+        for key, (text, look) in ends.items():
+            axes.plot(done["ratio"], done[key], linewidth=1, label=text, **look)
+        axes.set(xlabel="d/l [–]", ylabel="overlap [–]")
+        axes.legend(frameon=False, fontsize=7)
+    lattice.set_title("with the infinite lattice’s mode", fontsize=8)
+    specimen.set_title("with the specimen’s own pattern", fontsize=8)
+    for key, text, look in (
+        ("critical_strain", "the specimen", {"color": BLUE, "marker": "o", "markersize": 3}),
+        ("lattice_pattern_strain", "infinite lattice", {"color": INK, "marker": "x",
+                                                        "markersize": 4}),
+    ):  # fmt: skip
+        strains.plot(done["ratio"], 100 * done[key], linewidth=1, label=text, **look)
+    strains.set(xlabel="d/l [–]", ylabel="pattern critical at a strain of [%]")
+    strains.legend(frameon=False, fontsize=7)
+    drawn.tight_layout()
+    return drawn
 
 
 _LATTICE = {
@@ -220,42 +206,32 @@ _SPECIMEN = {
 }
 
 
-def draw_patterns(specimens: Mapping[str, SpecimenPatterns], name: str, title: str) -> Plot:
-    """Draw patterns side by side: the truth, what was measured of it, and what is left.
+def draw_patterns(specimens: Mapping[str, SpecimenPatterns]) -> Figure:
+    """Draw patterns side by side: the truth, what was measured of it, and the error.
 
-    Parameters
-    ----------
-    specimens
-        By what to write above each.
-    name, title
-        Of the picture.
+    ``specimens`` are by the text above each.
     """
-    with style():
-        each = min(_WIDEST, _PAGE / len(specimens))
-        window = np.max([_window(p) for p in specimens.values()], axis=0)
-        tall = each * window[1] / window[0]
-        wide = 0.2 + len(specimens) * each + 0.6
-        drawn = figure(wide, 3.0 * tall + 0.3)
-        grid = drawn.subplots(3, len(specimens), squeeze=False)
-        pattern = ColourScale(SIGNED, -_PATTERN_END, _PATTERN_END, "l", "both")
-        left = ColourScale(SIGNED, -_LEFT_END, _LEFT_END, "l", "both")
-        for column, (text, p) in zip(grid.T, specimens.items(), strict=True):
-            column[0].set_title(text, fontsize=7.5)
-            _show(column[0], p, p.pattern, p.displacement, pattern, window)
-            _show(column[1], p, p.found_pattern, p.found, pattern, window)
-            _show(column[2], p, p.displacement - p.found, p.displacement, left, window)
-        for axes, text in zip(grid[:, 0], _ROWS, strict=True):
-            axes.text(-0.02, 0.5, text, transform=axes.transAxes, rotation=90, va="center",
-                      ha="right", fontsize=7.5)  # fmt: skip
-        top = 1.0 - 0.25 / drawn.get_figheight()
-        drawn.subplots_adjust(0.2 / wide, 0.0, 1.0 - 0.6 / wide, top, 0.02, 0.02)
-        for row, scale in ((0, pattern), (1, pattern), (2, left)):
-            _bar(grid[row, -1], scale)
-    caption = (
-        "The component across the load, in shares of l, on the specimens as they are deformed. v₀ "
-        "is the best fit’s. The colours of what is left are finer."
-    )
-    return Plot(name, title, drawn, caption, wide=True)
+    each = min(_WIDEST, _PAGE / len(specimens))
+    window = np.max([_window(p) for p in specimens.values()], axis=0)
+    tall = each * window[1] / window[0]
+    wide = 0.2 + len(specimens) * each + 0.6
+    drawn = figure(wide, 3.0 * tall + 0.3)
+    grid = drawn.subplots(3, len(specimens), squeeze=False)
+    pattern = ColourScale(SIGNED, -_PATTERN_END, _PATTERN_END, "l", "both")
+    error = ColourScale(SIGNED, -_ERROR_END, _ERROR_END, "l", "both")
+    for column, (text, p) in zip(grid.T, specimens.items(), strict=True):
+        column[0].set_title(text, fontsize=7.5)
+        _show(column[0], p, p.pattern, p.displacement, pattern, window)
+        _show(column[1], p, p.found_pattern, p.found, pattern, window)
+        _show(column[2], p, p.displacement - p.found, p.displacement, error, window)
+    for axes, text in zip(grid[:, 0], _ROWS, strict=True):
+        axes.text(-0.02, 0.5, text, transform=axes.transAxes, rotation=90, va="center",
+                  ha="right", fontsize=7.5)  # fmt: skip
+    top = 1.0 - 0.25 / drawn.get_figheight()
+    drawn.subplots_adjust(0.2 / wide, 0.0, 1.0 - 0.6 / wide, top, 0.02, 0.02)
+    for row, scale in ((0, pattern), (1, pattern), (2, error)):
+        _bar(grid[row, -1], scale)
+    return drawn
 
 
 def _window(p: SpecimenPatterns) -> FloatArray:
@@ -272,10 +248,8 @@ def _show(
     window: FloatArray,
 ) -> None:
     nodes = p.mesh.nodes + moved
-    triangles = p.mesh.cells[:, np.array(_FINER)].reshape(-1, 3)
-    net = Triangulation(nodes[:, 0], nodes[:, 1], triangles)
-    axes.tripcolor(net, field[:, 1] / p.pitch, shading="gouraud", cmap=scale.colours,
-                   norm=scale.normalise, rasterized=True)  # fmt: skip
+    axes.tripcolor(triangles(nodes, p.mesh.cells), field[:, 1] / p.pitch, shading="gouraud",
+                   cmap=scale.colours, norm=scale.normalise, rasterized=True)  # fmt: skip
     axes.add_patch(PathPatch(MeshBoundary.of(p.mesh).path(moved), fill=False, ec=MUTED, lw=0.3,
                              rasterized=True))  # fmt: skip
     width, height = window
@@ -299,7 +273,7 @@ def report_modes(study: MeasuredModesStudy, table: pd.DataFrame, folder: Path) -
 
 
 def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
-    """What the analysis of a study says.
+    """The findings of an analysis.
 
     Parameters
     ----------
@@ -313,15 +287,15 @@ def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
     ran, seen, sizes = found.ran, found.measured, found.sizes
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
-        sentences=tuple(_sentences(found)),
+        sentences=_sentences(found),
         keys=_keys(sizes),
-        plots=tuple(_plots(seen, sizes, folder, seeds)),
-        tables={
-            "How they buckle": buckling_table(ran),
-            "Parameters": parameters_summary(seen),
-            "How alike modes and patterns are": likeness_table(seen),
-        },
-        attachments={"Every parameter": parameters_table(seen)},
+        figures=_figures(seen, sizes, folder, seeds),
+        tables=[
+            ReportTable.of("Buckling", buckling_table(ran)),
+            ReportTable.of("Parameters", parameters_summary(seen)),
+            ReportTable.of("Overlaps and errors", likeness_table(seen)),
+        ],
+        attachments=[ReportTable.of("Every parameter", parameters_table(seen))],
     )
 
 
@@ -346,24 +320,24 @@ def _keys(sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
         KeyNumber("a₁", _percent(deviations(sizes)["a1"]), "", f"furthest from 1; {span}"),
         KeyNumber("overlap", f"{sizes['overlap_lattice'].min():.4f}", "",
                   f"of the measured with the infinite lattice’s mode, the least; {span}"),
-        KeyNumber("IDIC − best fit", short(float(sizes["measurement_error_px"].max())), "px",
-                  f"the most: what the measurement adds; {span}"),
+        KeyNumber("measurement error", number(float(sizes["measurement_error_px"].max())), "px",
+                  f"the largest: rms of IDIC − best fit; {span}"),
     )  # fmt: skip
 
 
 def _sentences(found: ModesAnalysis) -> list[str]:
     """What was found, the most important first."""
     ran, seen, sizes = found.ran, found.measured, found.sizes
-    said = []
+    text = []
     if len(sizes):
-        said += [*_of_parameters(sizes), _of_overlaps(sizes)]
-    said += [
+        text += [*_of_parameters(sizes), _of_overlaps(sizes)]
+    text += [
         *_of_the_others(seen),
         *_of_graded(seen),
         *_not_observable_sentences(ran, seen),
         *_of_strains(ran),
     ]
-    return said
+    return text
 
 
 def _of_parameters(sizes: pd.DataFrame) -> list[str]:
@@ -375,12 +349,14 @@ def _of_parameters(sizes: pd.DataFrame) -> list[str]:
         f"{sizes['ratio'].max():.3g} the measured wave vectors are within "
         f"{_percent(off[WAVE_VECTORS])} of Eq. (mode), a₁ within {_percent(off['a1'])} of 1, the "
         f"phases within {_percent(off[['a6', 'a7']])} of l.",
-        f"The best fits to the specimens’ own displacements are within {_percent(best[WAVE_VECTORS])}, "
-        f"{_percent(best['a1'])} and {_percent(best[['a6', 'a7']])}: that much is the specimens’. "
-        f"The measurement adds {short(float(sizes['measurement_error_px'].min()))} to "
-        f"{short(float(sizes['measurement_error_px'].max()))} px rms, and {int((np.abs(apart) <= 2).sum())} of "
-        f"{apart.size} parameters are within two standard deviations of the best fit’s (rms "
-        f"{np.sqrt((apart**2).mean()):.2f} of them, by what the ansatz leaves over).",
+        "The best fits to the specimens’ own displacements are within "
+        f"{_percent(best[WAVE_VECTORS])}, {_percent(best['a1'])} and "
+        f"{_percent(best[['a6', 'a7']])}: that much is the specimens’. "
+        f"The measurement error is {number(float(sizes['measurement_error_px'].min()))} to "
+        f"{number(float(sizes['measurement_error_px'].max()))} px rms, and "
+        f"{int((np.abs(apart) <= 2).sum())} of {apart.size} parameters are within two standard "
+        f"deviations of the best fit’s (rms "
+        f"{np.sqrt((apart**2).mean()):.2f} of them, by model error).",
     ]
 
 
@@ -397,7 +373,7 @@ def _of_overlaps(sizes: pd.DataFrame) -> str:
 
 def _of_the_others(seen: pd.DataFrame) -> list[str]:
     """How far the mode moves with l and with the material."""
-    base, said = seen[seen["varied"] == "base"], []
+    base, text = seen[seen["varied"] == "base"], []
     for varied, what in (("l", "size of the cells"), ("material", "material")):
         part = seen[seen["varied"] == varied]
         if not len(part) or not len(base):
@@ -405,12 +381,12 @@ def _of_the_others(seen: pd.DataFrame) -> list[str]:
         moved = deviations(part).to_numpy() - deviations(base).to_numpy()
         best = deviations(part, "best_").to_numpy() - deviations(base, "best_").to_numpy()
         levels = ", ".join(map(str, part["level"]))
-        said.append(
+        text.append(
             f"With another {what} ({levels}) no parameter moves by more than {_percent(moved)} "
             f"from the base’s (best fits: {_percent(best)}); overlap with the infinite lattice’s "
             f"mode {_between(part['overlap_lattice'])}."
         )
-    return said
+    return text
 
 
 def _of_graded(seen: pd.DataFrame) -> list[str]:
@@ -424,38 +400,38 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
         f"{part['largest_ratio'].max():.3g}: one family with v₁ modulated has "
         f"wave vectors within {_percent(off[WAVE_VECTORS])} and an overlap with the specimen’s own "
         f"pattern of {_between(part['overlap_truth'])}, least where {worst['varied']} by "
-        f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); truth − best fit is "
-        f"up to {short(float(part['model_error_px'].max()))} px (base: "
-        f"{short(float(base['model_error_px'].iloc[0]))})."
+        f"{worst['level']} (base: {base['overlap_truth'].iloc[0]:.4f}); the model error is "
+        f"up to {number(float(part['model_error_px'].max()))} px (base: "
+        f"{number(float(base['model_error_px'].iloc[0]))})."
     ]
 
 
 def _not_observable_sentences(ran: pd.DataFrame, seen: pd.DataFrame) -> list[str]:
-    """What did not go as meant, specimen by specimen."""
-    said = []
+    """Specimens without a measured pattern, or in an unstable state."""
+    text = []
     for _, row in ran.iterrows():
         name = f"{row['varied']} {row['level']}".strip()
         if row["first"] == "none":
-            said.append(f"{name}: no pattern, {row['simulation']}.")
+            text.append(f"{name}: no pattern, {row['simulation']}.")
             continue
         if row["first"] == "other":
-            said.append(
+            text.append(
                 f"{name}: buckles into something else first (the pattern is "
                 f"{100 * row['pattern_share'] ** 2:.0f} % of the critical mode’s energy), and does "
                 "not count above."
             )
         elif row["outcome"] != "converged":
-            said.append(
+            text.append(
                 f"{name}: the correlation ended {row['outcome']}, and does not count above."
             )
         if row["simulation"] != "complete":
-            said.append(f"{name}: {row['simulation']}.")
+            text.append(f"{name}: {row['simulation']}.")
         if row["unstable_pivots"]:
-            said.append(
-                f"{name}: measured in a state that is not stable at a held strain "
+            text.append(
+                f"{name}: measured in a state that is not stable at a prescribed strain "
                 f"({row['unstable_pivots']:.0f} negative pivots)."
             )
-    return said
+    return text
 
 
 def _of_strains(ran: pd.DataFrame) -> list[str]:
@@ -466,44 +442,60 @@ def _of_strains(ran: pd.DataFrame) -> list[str]:
         return []
     ratio = both["critical_strain"] / both["lattice_pattern_strain"]
     return [
-        "Clamped edges hold a specimen back: it buckles at "
+        "Clamped edges stiffen a specimen: it buckles at "
         f"{ratio.min():.2f} to {ratio.max():.2f} times the strain at which the pattern is critical "
         "in its infinite lattice."
     ]
 
 
-def _plots(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Plot]:
-    made = []
+def _figures(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Card]:
+    cards = []
     if len(sizes):
-        drawn = draw_parameters(sizes, sizes["ratio"].to_numpy(), (), "d/l [–]")
-        made.append(
-            Plot("parameters", "The mode’s parameters against d/l", drawn, _MARKS, wide=True)
-        )
-        made.append(draw_overlaps(sizes, seeds))
-        made.append(_patterns(sizes, folder, "patterns", "Patterns, measured and true"))
+        drawn = partial(draw_parameters, sizes, sizes["ratio"].to_numpy(), (), "d/l [–]")
+        title = "Parameters of the mode against d/l"
+        cards += [
+            Card.single("parameters", title, drawn, _MARKS, wide=True),
+            Card.single(
+                "overlaps", "Overlaps, and critical strain of the pattern",
+                partial(draw_overlaps, sizes),
+                "Overlap |∫ u·φ| / (‖u‖ ‖φ‖) over the material, 1 for fields that differ by a "
+                "factor. Left: of modes of constant amplitude over all cells; middle: of v₁φ₁ with "
+                "the truth less the best fit’s v₀ over the cellular part. Right: where the pattern "
+                f"becomes critical. {seeds.capitalize()}.", wide=True,
+            ),
+            _pattern_card("patterns", "Patterns, measured and true", sizes, folder),
+        ]  # fmt: skip
     others = seen[~seen["varied"].isin(["d/l"])]
     if len(others) > 1:
         names = [f"{row['varied']} {row['level']}".strip() for _, row in others.iterrows()]
-        drawn = draw_parameters(others, np.arange(len(others), dtype=np.float64), names, "")
-        made.append(Plot("others", "The mode’s parameters, all else", drawn, _MARKS, wide=True))
+        drawn = partial(
+            draw_parameters, others, np.arange(len(others), dtype=np.float64), names, ""
+        )
+        title = "Parameters of the mode, all else"
+        cards.append(Card.single("others", title, drawn, _MARKS, wide=True))
     graded = seen[seen["varied"].str.startswith("graded")]
     if len(graded):
-        made.append(_patterns(graded, folder, "graded", "Graded specimens, measured and true"))
-    return made
+        title = "Graded specimens, measured and true"
+        cards.append(_pattern_card("graded", title, graded, folder))
+    return cards
 
 
 _MARKS = (
-    "Dots: measured, with two standard deviations by what the ansatz leaves over; rings: the best "
-    "fit to the specimen’s own displacement; dotted: Eq. (mode) of the paper; crosses: the "
-    "infinite lattice, whose wave vectors and phases are those of Eq. (mode) by symmetry. Bars "
-    "that leave a picture are in the tables."
+    "Dots: measured, with two standard deviations by model error; rings: the best fit to the "
+    "specimen’s own displacement; dotted: Eq. (mode) of the paper; crosses: the infinite lattice, "
+    "whose wave vectors and phases are those of Eq. (mode) by symmetry. Bars that leave a picture "
+    "are in the tables."
 )
 
 
-def _patterns(rows: pd.DataFrame, folder: Path, name: str, title: str) -> Plot:
+def _pattern_card(name: str, title: str, rows: pd.DataFrame, folder: Path) -> Card:
     shown = {}
     for _, row in rows.iterrows():
         is_size = row["varied"] in ("base", "d/l")
         text = f"d/l = {row['ratio']:.3g}" if is_size else f"{row['varied']} {row['level']}"
         shown[text] = SpecimenPatterns.read(specimen_folder(folder, row["specimen"]))
-    return draw_patterns(shown, name, title)
+    caption = (
+        "The component across the load, in shares of l, on the specimens as they are deformed. v₀ "
+        "is the best fit’s. The colours of the error, below, are finer."
+    )
+    return Card.single(name, title, partial(draw_patterns, shown), caption, wide=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from modeharvest.report.figures.curves import SMALL, WIDE, curve
 from modeharvest.report.figures.style import (
     BLUE,
     EDGE,
@@ -25,9 +27,8 @@ from modeharvest.report.figures.style import (
     SIGNED,
     SIZE,
     figure,
-    style,
 )
-from modeharvest.report.model import Findings, KeyNumber, Plot, short
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.noise import NoiseStudy
 from modeharvest.validation.studies.noise_statistics import (
@@ -74,7 +75,7 @@ def summary_table(
                 "bound, rms [px]": bound.rms_bound / px if name in PARTS else np.nan,
                 "rms error / bound": bound.ratio.value,
                 "± (1)": bound.ratio.error,
-                "rms error / least of least squares": least.ratio.value,
+                "rms error / predicted": least.ratio.value,
                 "± (2)": least.ratio.error,
                 "bias / bound": bound.bias.value,
                 "± (3)": bound.bias.error,
@@ -129,7 +130,7 @@ def unknowns_table(levels: Levels, ours: Levels, pair: VirtualImagePair) -> pd.D
         parts.append(pd.DataFrame({
             "noise": level, "unknown": ansatz.names, "unit": ansatz.units, "bound": bound.bound,
             "rms error / bound": bound.ratios,
-            "rms error / least of least squares": least.ratios, "bias / bound": bound.biases,
+            "rms error / predicted": least.ratios, "bias / bound": bound.biases,
             "share in 95 % intervals": least.covered,
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
@@ -145,7 +146,7 @@ def maps_table(levels: Levels, ours: Levels, points: FieldPoints) -> pd.DataFram
                 "noise": level, "field": name, "x [mm]": points.x, "y [mm]": points.y,
                 "bound [mm]": np.sqrt((bound.bound**2).sum(axis=-1)),
                 "rms error / bound": np.sqrt((bound.ratios**2).mean(axis=-1)),
-                "rms error / least of least squares": np.sqrt((least.ratios**2).mean(axis=-1)),
+                "rms error / predicted": np.sqrt((least.ratios**2).mean(axis=-1)),
                 "bias / bound": np.sqrt((bound.biases**2).mean(axis=-1)),
                 "share in 95 % intervals": least.covered.mean(axis=-1),
             }))  # fmt: skip
@@ -155,8 +156,8 @@ def maps_table(levels: Levels, ours: Levels, points: FieldPoints) -> pd.DataFram
 def _unknown_families(pair: VirtualImagePair) -> dict[str, NDArray[np.bool_]]:
     """Which unknowns are those of v0, of v1 and of phi1."""
     names = np.array(pair.ansatz.names)
-    starts = {"v0": "v0", "v1": "v1[", "phi1": "phi1."}
-    families = {k: np.char.startswith(names, start) for k, start in starts.items()}
+    heads = {"v0": "v0", "v1": "v1[", "phi1": "phi1."}
+    families = {k: np.char.startswith(names, head) for k, head in heads.items()}
     return {name: part for name, part in families.items() if part.any()}
 
 
@@ -169,164 +170,121 @@ SERIES: dict[str, dict[str, Any]] = {
 }
 _FAMILIES = {"v0x": "v₀ along x", "v0y": "v₀ along y", "v1": "v₁", "phi1": "φ₁"}
 _NOTHING = to_rgba(EDGE, 0.25)
-_HOLD = "share in 95 % intervals [-]"
+_COVERAGE = "share in 95 % intervals [-]"
 _LEVELS = {
-    "ratio": ("Scatter", "rms error / least of least squares [-]", 1.0),
+    "ratio": ("Scatter", "rms error / predicted [-]", 1.0),
     "bias": ("Bias", "bias / Cramér–Rao bound [-]", 0.0),
-    "coverage": ("Error bars", _HOLD, 0.95),
+    "coverage": ("Error bars", _COVERAGE, 0.95),
 }
 
 
-def draw_causes(causes: pd.DataFrame, made: str) -> Plot:
+def draw_causes(causes: pd.DataFrame) -> Figure:
     """Draw rms over bound: what one cause after another predicts, and what is measured."""
     place = np.arange(len(causes))
     predicted = causes["what"].str.startswith("measured").argmax()
-    with style():
-        drawn = figure(9.6, 3.0)
-        axes = drawn.add_subplot()
-        axes.axvspan(predicted - 0.5, place[-1] + 0.5, color=MUTED, alpha=0.08, linewidth=0)
-        for n, name in enumerate(PARTS):
-            axes.plot(place + 0.09 * (n - 1.5), causes[name], linestyle="none", markersize=5,
-                      label=LABELS[name], **SERIES[name])  # fmt: skip
-        axes.axhline(1.0, color=MUTED, linestyle=":", linewidth=1)
-        axes.axhline(causes["u"][predicted - 1], color=BLUE, linestyle=":", linewidth=1)
-        axes.set_xticks(place, [_wrapped(what) for what in causes["what"]])
-        axes.set(xlim=(-0.5, place[-1] + 0.5), ylabel="rms / bound [-]")
-        axes.legend(frameon=False, fontsize=7.5, ncols=4, loc="upper left")
-        drawn.tight_layout()
-    caption = (
-        f"Over the Cramér–Rao bound: to the left what is predicted from exact images, one cause "
-        f"after another; shaded, what is measured; {made}. Dotted: the bound, and the least that "
-        "least squares can do for u."
-    )
-    return Plot("causes", "What each cause adds", drawn, caption, wide=True)
+    drawn, axes = curve("", "rms / bound [-]", WIDE, below=0.55)
+    axes.axvspan(predicted - 0.5, place[-1] + 0.5, color=MUTED, alpha=0.08, linewidth=0)
+    for n, name in enumerate(PARTS):
+        axes.plot(place + 0.09 * (n - 1.5), causes[name], linestyle="none", markersize=5,
+                  label=LABELS[name], **SERIES[name])  # fmt: skip
+    axes.axhline(1.0, color=MUTED, linestyle=":", linewidth=1)
+    axes.axhline(causes["u"][predicted - 1], color=BLUE, linestyle=":", linewidth=1)
+    axes.set_xticks(place, [textwrap.fill(what, 15) for what in causes["what"]])
+    axes.set_xlim(-0.5, place[-1] + 0.5)
+    axes.legend(frameon=False, fontsize=7.5, ncols=4, loc="upper left")
+    return drawn
 
 
-def _wrapped(words: str) -> str:
-    """On lines of a few words."""
-    return textwrap.fill(words, 15)
-
-
-def draw_levels(levels: Mapping[float, Mapping[str, PairedErrors]], what: str, made: str) -> Plot:
+def draw_levels(levels: Mapping[float, Mapping[str, PairedErrors]], what: str) -> Figure:
     """Draw one of "ratio", "bias" and "coverage" of the fields over the level of noise."""
     at = np.array(sorted(levels))
-    title, label, target = _LEVELS[what]
-    with style():
-        drawn = figure(4.6, 2.7)
-        axes = drawn.add_subplot()
-        axes.axhline(target, color=MUTED, linestyle=":", linewidth=1)
-        for n, name in enumerate(PARTS):
-            shares: list[Estimate] = [getattr(levels[level][name], what) for level in at]
-            value, error = np.array([(s.value, s.error) for s in shares]).T
-            beside = 1.0 + 0.02 * (n - 1.5)
-            axes.errorbar(100.0 * at * beside, value, error, markersize=4, capsize=2,
-                          linewidth=1, label=LABELS[name], **SERIES[name])  # fmt: skip
-        _over_noise(axes, at, label)
-        drawn.tight_layout()
-    return Plot(what, title, drawn, f"Fields, over all points; {made}. Bars: one "
-                "standard error.")  # fmt: skip
+    _, label, target = _LEVELS[what]
+    drawn, axes = _over_noise(at, label, target)
+    for n, name in enumerate(PARTS):
+        shares: list[Estimate] = [getattr(levels[level][name], what) for level in at]
+        _estimates(axes, at * (1.0 + 0.02 * (n - 1.5)), shares, LABELS[name], SERIES[name])
+    axes.legend(frameon=False, fontsize=7.5)
+    return drawn
 
 
-def draw_bars(kinds: Mapping[str, Mapping[float, Mapping[str, PairedErrors]]], made: str) -> Plot:
-    """Draw how many unknowns are in intervals that know of more and less."""
-    looks = zip(kinds.items(), SERIES.values(), strict=False)
-    with style():
-        drawn = figure(4.6, 2.7)
-        axes = drawn.add_subplot()
-        axes.axhline(0.95, color=MUTED, linestyle=":", linewidth=1)
-        for (label, levels), look in looks:
-            at = np.array(sorted(levels))
-            shares = [levels[level]["unknowns"].standardised.coverage for level in at]
-            value, error = np.array([(s.value, s.error) for s in shares]).T
-            axes.errorbar(100.0 * at, value, error, markersize=4, capsize=2, linewidth=1,
-                          label=label, **look)  # fmt: skip
-        _over_noise(axes, at, _HOLD)
-        drawn.tight_layout()
-    caption = (
-        f"All unknowns; {made}. Blue dots: bars that know of curvature, det F and the noise’s "
-        "gradient in w; green squares: of the curvature only; golden triangles: of neither. Bars: "
-        "one standard error."
-    )
-    return Plot("bars", "What error bars must know", drawn, caption)
+def draw_bars(kinds: Mapping[str, Mapping[float, Mapping[str, PairedErrors]]]) -> Figure:
+    """Draw how many unknowns are in intervals by one covariance and another."""
+    at = np.array(sorted(next(iter(kinds.values()))))
+    drawn, axes = _over_noise(at, _COVERAGE, 0.95)
+    for (label, levels), look in zip(kinds.items(), SERIES.values(), strict=False):
+        shares = [levels[level]["unknowns"].standardised.coverage for level in at]
+        _estimates(axes, at, shares, label, look)
+    axes.legend(frameon=False, fontsize=7.5)
+    return drawn
 
 
-def _over_noise(axes: Axes, at: FloatArray, label: str) -> None:
-    """Finish axes of something over the levels of noise."""
-    axes.set(xscale="log", xlabel="noise [% of full scale]", ylabel=label)
+def _over_noise(at: FloatArray, label: str, target: float) -> tuple[Figure, Axes]:
+    """Empty axes of something over the levels of noise, with its expected value."""
+    drawn, axes = curve("noise [% of full scale]", label, SMALL)
+    axes.axhline(target, color=MUTED, linestyle=":", linewidth=1)
+    axes.set_xscale("log")
     axes.set_xticks(100.0 * at, [f"{100 * level:g}" for level in at])
     axes.minorticks_off()
-    axes.legend(frameon=False, fontsize=7.5)
+    return drawn, axes
 
 
-def draw_unknowns(pairs: PairedErrors, names: Sequence[str], level: float, made: str) -> Plot:
+def _estimates(
+    axes: Axes, at: FloatArray, shares: Sequence[Estimate], label: str, look: Mapping[str, Any]
+) -> None:
+    value, error = np.array([(share.value, share.error) for share in shares]).T
+    axes.errorbar(100.0 * at, value, error, markersize=4, capsize=2, linewidth=1, label=label,
+                  **look)  # fmt: skip
+
+
+def draw_unknowns(pairs: PairedErrors, names: Sequence[str]) -> Figure:
     """Draw each unknown's rms error and coverage."""
     count = pairs.errors.shape[0] * 2
     place = np.arange(len(names))
-    with style():
-        drawn = figure(9.6, 3.4)
-        above, below = drawn.subplots(2, 1, sharex=True)
-        scatter = 1.0 / np.sqrt(2.0 * count)
-        above.axhspan(1 - 2 * scatter, 1 + 2 * scatter, color=BLUE, alpha=0.12, linewidth=0)
-        above.plot(place, pairs.ratios, ".", color=BLUE)
-        above.set_ylabel("rms error / least [-]")
-        spread = np.sqrt(0.95 * 0.05 / count)
-        below.axhspan(0.95 - 2 * spread, min(1.0, 0.95 + 2 * spread), color=GREEN, alpha=0.15,
-                      linewidth=0)  # fmt: skip
-        below.plot(place, pairs.covered, ".", color=GREEN)
-        below.set_ylabel("intervals that hold [-]")
-        _name_families(below, names)
-        drawn.tight_layout()
-    caption = (
-        f"At {100 * level:g} % of noise; {made}. Bands: where 95 % of the points would lie by "
-        "chance, the pairs taken for independent realisations."
-    )
-    return Plot("unknowns", "Each unknown", drawn, caption, wide=True)
+    drawn = figure(9.6, 3.4)
+    above, below = drawn.subplots(2, 1, sharex=True)
+    scatter = 1.0 / np.sqrt(2.0 * count)
+    above.axhspan(1 - 2 * scatter, 1 + 2 * scatter, color=BLUE, alpha=0.12, linewidth=0)
+    above.plot(place, pairs.ratios, ".", color=BLUE)
+    above.set_ylabel("rms error / predicted [-]")
+    spread = np.sqrt(0.95 * 0.05 / count)
+    below.axhspan(0.95 - 2 * spread, min(1.0, 0.95 + 2 * spread), color=GREEN, alpha=0.15,
+                  linewidth=0)  # fmt: skip
+    below.plot(place, pairs.covered, ".", color=GREEN)
+    below.set_ylabel("coverage of 95 % intervals [-]")
+    _name_families(below, names)
+    drawn.tight_layout()
+    return drawn
 
 
-def draw_maps(
-    parts: Mapping[str, PairedErrors], points: FieldPoints, level: float, made: str
-) -> Plot:
+def draw_maps(parts: Mapping[str, PairedErrors], points: FieldPoints) -> Figure:
     """Draw maps of the fields' scatter, of its ratio to the least and of their coverage."""
     grid = points.pair.images.grid
     x, y = grid.x[points.cols], grid.y[points.rows]
     extent = (float(x[0]), float(x[-1]), float(y[-1]), float(y[0]))
-    with style():
-        drawn = figure(9.6, 8.6)
-        boxes = drawn.subplots(3, len(PARTS), gridspec_kw={"hspace": 0.12, "wspace": 0.3})
-        for column, name in enumerate(PARTS):
-            pairs = parts[name]
-            size, unit = (1e3, "µm") if name == "v1" else (1e3 / grid.pixel_size, "10⁻³ px")
-            sd = size * np.sqrt((pairs.errors**2).mean(axis=(0, 1)).sum(axis=-1))
-            sd[~pairs.counted.any(axis=-1)] = np.nan
-            rows = (
-                (sd, SIZE, (0.0, float(np.nanquantile(sd, 0.98))), f"rms error [{unit}]"),
-                (np.sqrt((pairs.ratios**2).mean(axis=-1)), SIGNED, (0.6, 1.4),
-                 "rms error / least [-]"),
-                (pairs.covered.mean(axis=-1), SIGNED, (0.88, 1.02), "intervals that hold [-]"),
-            )  # fmt: skip
-            boxes[0, column].set_title(LABELS[name], fontsize=9)
-            for row, (values, colours, limits, label) in enumerate(rows):
-                axes = boxes[row, column]
-                shown = axes.imshow(
-                    points.map(values),
-                    extent=extent,
-                    cmap=colours,
-                    vmin=limits[0],
-                    vmax=limits[1],
-                    interpolation="nearest",
-                )
-                axes.set_axis_off()
-                shown.set_cmap(colours.with_extremes(bad=_NOTHING))
-                if row == 0 or column == len(PARTS) - 1:
-                    _bar(drawn, shown, axes, label)
-        drawn.subplots_adjust(left=0.01, right=0.91, top=0.96, bottom=0.01)
-    caption = (
-        f"At {100 * level:g} % of noise; {made}. Above: rms length of the error; in the middle: "
-        "over the least that least squares can do, 1 is white; below: share of the 95 % "
-        "intervals that hold, 0.95 is white. Both components of a vector together. Grey: no "
-        "material there, or no φ₁."
-    )
-    return Plot("maps", "Maps over the material", drawn, caption, wide=True)
+    drawn = figure(9.6, 8.6)
+    boxes = drawn.subplots(3, len(PARTS), gridspec_kw={"hspace": 0.12, "wspace": 0.3})
+    for column, name in enumerate(PARTS):
+        pairs = parts[name]
+        size, unit = (1e3, "µm") if name == "v1" else (1e3 / grid.pixel_size, "10⁻³ px")
+        sd = size * np.sqrt((pairs.errors**2).mean(axis=(0, 1)).sum(axis=-1))
+        sd[~pairs.counted.any(axis=-1)] = np.nan
+        rows = (
+            (sd, SIZE, (0.0, float(np.nanquantile(sd, 0.98))), f"rms error [{unit}]"),
+            (np.sqrt((pairs.ratios**2).mean(axis=-1)), SIGNED, (0.6, 1.4),
+             "rms error / predicted [-]"),
+            (pairs.covered.mean(axis=-1), SIGNED, (0.88, 1.02), "coverage of 95 % intervals [-]"),
+        )  # fmt: skip
+        boxes[0, column].set_title(LABELS[name], fontsize=9)
+        for row, (values, colours, limits, label) in enumerate(rows):
+            axes = boxes[row, column]
+            shown = axes.imshow(points.map(values), extent=extent, vmin=limits[0], vmax=limits[1],
+                                cmap=colours.with_extremes(bad=_NOTHING),
+                                interpolation="nearest")  # fmt: skip
+            axes.set_axis_off()
+            if row == 0 or column == len(PARTS) - 1:
+                _bar(drawn, shown, axes, label)
+    drawn.subplots_adjust(left=0.01, right=0.91, top=0.96, bottom=0.01)
+    return drawn
 
 
 def _bar(drawn: Figure, image: AxesImage, axes: Axes, label: str) -> None:
@@ -343,21 +301,56 @@ def _name_families(axes: Axes, names: Sequence[str]) -> None:
     axes.set_xlim(-1, len(names))
 
 
+def _figures(found: NoiseAnalysis, causes: pd.DataFrame, shown: float, seeds: str) -> list[Card]:
+    levels, ours, points = found.by_bound, found.by_least, found.points
+    pairs = max(len(parts["u"].errors) for parts in levels.values())
+    made, at = f"{pairs} pairs of realisations; {seeds}", f"At {100 * shown:g} % of noise"
+    bars = {"curvature, det F, gradient": ours, "curvature": found.by_hessian, "JᵀJ only": levels}
+    names = points.pair.ansatz.names
+    return [
+        Card.single(
+            "causes", "Contribution of each cause", partial(draw_causes, causes),
+            "Over the Cramér–Rao bound: to the left what is predicted from exact images, one cause "
+            f"after another; shaded, what is measured; {made}. Dotted: the bound, and the "
+            "least-squares prediction for u.", wide=True,
+        ),
+        *(
+            Card.single(what, _LEVELS[what][0], partial(draw_levels, by, what),
+                        f"Fields, over all points; {made}. Bars: one standard error.")
+            for what, by in (("ratio", ours), ("bias", levels), ("coverage", ours))
+        ),
+        Card.single(
+            "bars", "Error bars by different covariances", partial(draw_bars, bars),
+            f"All unknowns; {made}. Blue dots: with curvature, det F and the noise’s gradient in "
+            "w; green squares: with curvature only; golden triangles: with neither. Bars: one "
+            "standard error.",
+        ),
+        Card.single(
+            "unknowns", "Each unknown",
+            partial(draw_unknowns, ours[shown]["unknowns"], names),
+            f"{at}; {made}. Bands: where 95 % of the points would lie by chance, the pairs taken "
+            "for independent realisations.", wide=True,
+        ),
+        Card.single(
+            "maps", "Maps over the material", partial(draw_maps, ours[shown], points),
+            f"{at}; {made}. Above: rms length of the error; in the middle: over the least-squares "
+            "prediction, 1 is white; below: coverage of the 95 % intervals, 0.95 is white. Both "
+            "components of a vector together. Grey: no material there, or no φ₁.", wide=True,
+        ),
+    ]  # fmt: skip
+
+
 def report_noise(study: NoiseStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
     return noise_findings(study.analyse(table, folder), study.seeds)
 
 
 def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
-    """What the analysis of a study says; ``seeds`` in words."""
-    levels, ours, soft = found.by_bound, found.by_least, found.by_hessian
+    """The findings of an analysis; ``seeds`` in words."""
+    levels, ours, row = found.by_bound, found.by_least, found.noise_free.row
     shown = sorted(levels)[len(levels) // 2]
-    summary = summary_table(levels, ours, soft, found.pair)
+    summary = summary_table(levels, ours, found.by_hessian, found.pair)
     causes = causes_table(levels, found.noise_free)
-    bars = {"curvature, det F, gradient": ours, "curvature": soft, "JᵀJ only": levels}
-    pairs = max(len(parts["u"].errors) for parts in levels.values())
-    made = f"{pairs} pairs of realisations; {seeds}"
-    row = found.noise_free.row
     parts = ("w_px", "model_error_px", "measurement_error_px")
     return Findings(
         numbers={
@@ -373,24 +366,16 @@ def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
             *_other_sentences(found),
         ),
         keys=_keys(levels, ours, shown),
-        plots=(
-            draw_causes(causes, made),
-            draw_levels(ours, "ratio", made),
-            draw_levels(levels, "bias", made),
-            draw_levels(ours, "coverage", made),
-            draw_bars(bars, made),
-            draw_unknowns(ours[shown]["unknowns"], found.pair.ansatz.names, shown, made),
-            draw_maps(ours[shown], found.points, shown, made),
-        ),
-        tables={
-            "Noise levels": with_errors(summary),
-            "Rms over the bound, by its causes [-]": causes.round(3),
-        },
-        attachments={
-            "Noise levels": summary,
-            "Each unknown": unknowns_table(levels, ours, found.pair),
-            "Maps": maps_table(levels, ours, found.points),
-        },
+        figures=_figures(found, causes, shown, seeds),
+        tables=[
+            ReportTable.of("Noise levels", with_errors(summary)),
+            ReportTable.of("Rms over the bound, by its causes [-]", causes.round(3)),
+        ],
+        attachments=[
+            ReportTable.of("Noise levels", summary),
+            ReportTable.of("Each unknown", unknowns_table(levels, ours, found.pair)),
+            ReportTable.of("Maps", maps_table(levels, ours, found.points)),
+        ],
     )
 
 
@@ -398,11 +383,11 @@ def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
     at = f"at {100 * shown:g} % of noise"
     return (
         KeyNumber("rms error of u", str(ours[shown]["u"].ratio), "",
-                  f"{at}, over the least that least squares can do"),
+                  f"{at}, over the least-squares prediction"),
         KeyNumber("and over the bound", str(levels[shown]["u"].ratio), "",
                   "Cramér–Rao, of an ansatz that describes everything"),
         KeyNumber("bias of u", str(levels[shown]["u"].bias), "", f"{at}, over the bound"),
-        KeyNumber("95 % intervals that hold", str(ours[shown]["unknowns"].standardised.coverage),
+        KeyNumber("coverage of 95 % intervals", str(ours[shown]["unknowns"].standardised.coverage),
                   "", f"{at}; all unknowns"),
     )  # fmt: skip
 
@@ -417,15 +402,16 @@ def _level_sentences(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tu
         )
         for level, parts in levels.items()
     ]  # fmt: skip
-    ratio, over, bias, held, held_u = (
+    ratio, over, bias, covered, covered_u = (
         _listed(map(str, column)) for column in zip(*shares, strict=True)
     )
     bound = levels[min(levels)]["u"].rms_bound / px / (100.0 * min(levels))
     return (
-        f"The displacement's rms error is {ratio} times the least that least squares can do, {at}.",
-        f"It is {over} times the Cramér–Rao bound, which is {short(bound)} px rms for each per "
+        f"The displacement's rms error is {ratio} times the least-squares prediction, {at}.",
+        f"It is {over} times the Cramér–Rao bound, which is {number(bound)} px rms for each per "
         "cent of noise.",
-        f"Of the 95 % intervals {held} hold the unknowns, and {held_u} the displacement.",
+        f"Coverage of the 95 % intervals: {covered} for the unknowns, {covered_u} for the "
+        "displacement.",
         f"The bias of the displacement is {bias} times the bound.",
     )
 
@@ -440,29 +426,29 @@ def _cause_sentence(causes: pd.DataFrame) -> str:
     u = dict(zip(causes["what"], causes["u"], strict=True))
     det, curved, least = (u[CAUSE_LABELS[cause]] for cause in CAUSES[1:])
     return (
-        "Why weak noise scatters the displacement by more than the bound: the bound holds for an "
-        "ansatz that describes everything. Pixels that share the noise of g where the material "
-        f"has shrunk (det F) make it {det:.3f} of it; the cost's own curvature, softer by what "
-        f"the ansatz leaves over, {curved:.3f}; the gradient of g's noise, seen with what is left "
-        f"over, {least:.3f}: the least that least squares can do. What is above it at strong "
-        "noise is of second order: the gradient of the noise against the speckle's, most of which "
-        "correlation.gradient_blur_px keeps out."
+        "Why weak noise scatters the displacement by more than the bound: the bound is that of an "
+        "ansatz without model error. Pixels that share the noise of g where the material has "
+        f"shrunk (det F) make it {det:.3f} of it; the cost's own curvature, reduced by model "
+        f"error, {curved:.3f}; the gradient of g's noise, times the model error, {least:.3f}: the "
+        "least-squares prediction. What is above it at strong noise is of second order: the "
+        "gradient of the noise against the speckle's, most of which correlation.gradient_blur_px "
+        "keeps out."
     )
 
 
 def _other_sentences(found: NoiseAnalysis) -> tuple[str, ...]:
-    noise_free, lost = found.noise_free, found.not_converged
+    row, lost = found.noise_free.row, found.not_converged
     noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
-    said = [
+    text = [
         "Each result's error bars are those of its own covariance given the noise, times what "
-        "exact images say that curvature, det F and the noise's gradient add, which is computed "
-        "once: how far a push moves the displacement by a noisy pair's own curvature is "
+        "exact images predict that curvature, det F and the noise's gradient add, which is "
+        "computed once: the curvature standard deviation of the displacement from a noisy pair is "
         f"{noisy} of noise, over that without.",
-        f"Without noise the measurement is {short(float(noise_free.row['measurement_error_px']))} px rms per "
-        f"component from the best fit of its ansatz, which is "
-        f"{short(float(noise_free.row['model_error_px']))} px from the truth: of that the noise's error bars "
-        "know nothing. All errors above are against the end without noise.",
+        "Without noise the measurement error is "
+        f"{number(float(row['measurement_error_px']))} px rms per component and the model error "
+        f"{number(float(row['model_error_px']))} px: the noise's "
+        "error bars include neither. All errors above are against the noise-free solution.",
     ]
     if lost:
-        said.append(f"{lost} correlations did not converge, and count as they ended.")
-    return tuple(said)
+        text.append(f"{lost} correlations did not converge, and count as they ended.")
+    return tuple(text)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
-from matplotlib.ticker import FuncFormatter
+from matplotlib.figure import Figure
 
-from modeharvest.report.figures.style import BLUE, GREEN, INK, MUTED, RED, figure, style
-from modeharvest.report.model import Findings, KeyNumber, Plot, short
+from modeharvest.report.figures.curves import curve, plain_ticks
+from modeharvest.report.figures.style import BLUE, GREEN, INK, MUTED, RED, figure
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
 from modeharvest.validation.resolution.buckled import ResolutionSpec
 from modeharvest.validation.resolution.star import KEPT
 from modeharvest.validation.resolution.transfer import (
@@ -32,11 +33,12 @@ from modeharvest.validation.studies.resolution import (
     ResolutionStudy,
 )
 
+_SIZE = (4.6, 3.3)  # [in]
 _DEGREES: Colormap = mpl.colormaps["viridis"]
 
 
 def noise_floors(done: pd.DataFrame, spec: ResolutionSpec) -> pd.DataFrame:
-    """Scatter under noise against what each result's covariance predicts, and the least there can be.
+    """Scatter under noise against what each result's covariance predicts, and the bound.
 
     The rms over realisations and material [px], by motion, degree and quantity.
     """
@@ -84,107 +86,66 @@ def measured_waves(
 
 def draw_transfer(
     part: str, curves: TransferCurves, waves: pd.DataFrame, spec: ResolutionSpec
-) -> Plot:
+) -> Figure:
     """Draw T over the period for waves of a part along both axes, degrees in colours."""
     pitch = spec.buckled.specimen.pitch
     degrees = sorted({key[2] for key in curves.own})
-    with style():
-        drawn = figure(9.4, 3.1)
-        both = drawn.subplots(1, 2, sharey=True)
-        for axis, axes in enumerate(both):
-            axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
-            for degree in degrees:
-                colour = _colour(degree, degrees)
-                axes.plot(curves.periods / pitch, curves.own[part, axis, degree], color=colour,
-                          label=str(degree), linewidth=1.3)  # fmt: skip
-            if len(waves):
-                here = waves[(waves["wave of"] == part) & (waves["along"] == AXES[axis])]
-                for degree, points in here.groupby("degree"):
-                    axes.plot(points["period [cells]"], points["images"], "o", ms=4,
-                              color=_colour(int(degree), degrees), mec=INK, mew=0.5)  # fmt: skip
-            axes.set(xscale="log", xlabel=f"period along {AXES[axis]} [cells]", ylim=(-0.03, 1.04))
-            axes.grid(color=MUTED, alpha=0.18, lw=0.6)
-            _plain(axes)
-        both[0].set_ylabel("share that is found [–]")
-        both[1].legend(frameon=False, fontsize=7.5, title="degree", title_fontsize=7.5,
-                       loc="lower right")  # fmt: skip
-        drawn.tight_layout()
-    caption = (
-        f"Waves of {part}, over both phases. Lines: best fits of the ansatz to the displacement; "
-        "dots: correlated images. Dotted: 10 % are lost."
-    )
-    if part == "v1":
-        caption += (
-            " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds "
-            "cos(πx/l) / 2."
-        )
-    return Plot(f"transfer-{part}", f"What is found of a wave of {part}", drawn, caption, wide=True)
-
-
-def draw_indicators(degrees: Sequence[DegreeResolution], local: float, made: str) -> Plot:
-    """Draw noise floors over l10 for all degrees, and the line of an affine subset."""
-    with style():
-        drawn = figure(4.6, 3.3)
-        axes = drawn.add_subplot()
-        ends = []
-        for part, floor, colour in (("v0", "v0", BLUE), ("v1", "v1phi1", RED)):
-            x = [np.sqrt(d.finest_px[f"{part} x"] * d.finest_px[f"{part} y"]) for d in degrees]
-            y = [1e3 * d.floor_px[floor] for d in degrees]
-            ends += x
-            label = "v0" if part == "v0" else "v1 φ1"
-            axes.plot(x, y, color=colour, marker="o", ms=4, linewidth=1, label=label)
-            for d, at, high in zip(degrees, x, y, strict=True):
-                axes.annotate(str(d.degree), (at, high), (4, 3), textcoords="offset points",
-                              fontsize=6.5, color=colour)  # fmt: skip
-        line = np.array([min(ends), max(ends)])
-        axes.plot(line, 1e3 * local / line, color=GREEN, linestyle="--", linewidth=1,
-                  label="affine subset of any size (theory)")  # fmt: skip
-        axes.set(xscale="log", yscale="log", xlabel="l₁₀ % [px]", ylabel="noise floor n [10⁻³ px]")
-        axes.grid(color=MUTED, alpha=0.18, lw=0.6)
-        axes.legend(frameon=False, fontsize=7.5)
-        _plain(axes)
-        axes.yaxis.set_major_formatter(_FORMAT)
-        axes.yaxis.set_minor_formatter(_FORMAT)
-        drawn.tight_layout()
-    caption = (
-        f"Numbers: the degree. l₁₀ %: mean of both axes; n: by the covariance; {made}. Along the "
-        "dashed line, and any parallel to it, the indicator n l₁₀ % is the same."
-    )
-    return Plot("indicators", "Noise against resolution", drawn, caption)
-
-
-def draw_passband(passband: Passband, degree: int) -> Plot:
-    """Draw what is found of patterns of other wavelengths, beside the mode and instead of it."""
-    with style():
-        drawn = figure(4.6, 3.3)
-        axes = drawn.add_subplot()
+    drawn = figure(9.4, 3.1)
+    both = drawn.subplots(1, 2, sharey=True)
+    for axis, axes in enumerate(both):
         axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
-        axes.plot(passband.stretch, passband.added, color=BLUE, label="a small one beside it")
-        known = np.isfinite(passband.itself)
-        axes.plot(passband.stretch[known], passband.itself[known], "o", ms=3.5, color=RED,
-                  label="the pattern itself")  # fmt: skip
-        axes.set(xlabel="wave numbers over the mode's [–]", ylabel="share that is found [–]",
-                 ylim=(-0.03, 1.18))  # fmt: skip
+        for degree in degrees:
+            colour = _colour(degree, degrees)
+            axes.plot(curves.periods / pitch, curves.own[part, axis, degree], color=colour,
+                      label=str(degree), linewidth=1.3)  # fmt: skip
+        if len(waves):
+            here = waves[(waves["wave of"] == part) & (waves["along"] == AXES[axis])]
+            for degree, points in here.groupby("degree"):
+                axes.plot(points["period [cells]"], points["images"], "o", ms=4,
+                          color=_colour(int(degree), degrees), mec=INK, mew=0.5)  # fmt: skip
+        axes.set(xscale="log", xlabel=f"period along {AXES[axis]} [cells]", ylim=(-0.03, 1.04))
         axes.grid(color=MUTED, alpha=0.18, lw=0.6)
-        axes.legend(frameon=False, fontsize=7.5, loc="upper center", ncols=2)
-        drawn.tight_layout()
-    caption = (
-        f"Degree {degree}; best fits. Line: a small pattern with other wave numbers than the "
-        "mode's, added to it: v0 takes the longest, v1 those next to the mode, between them "
-        "nothing passes. Dots: the pattern itself has them, and the fit starts from the mode: "
-        "its wave numbers are unknowns and follow, until the fit ends elsewhere."
-    )
-    return Plot("passband", "Patterns of other wavelengths", drawn, caption)
+        plain_ticks(axes.xaxis)
+    both[0].set_ylabel("amplitude ratio [–]")
+    both[1].legend(frameon=False, fontsize=7.5, title="degree", title_fontsize=7.5,
+                   loc="lower right")  # fmt: skip
+    drawn.tight_layout()
+    return drawn
 
 
-_FORMAT = FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "1235" else "")
+def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure:
+    """Draw noise floors over l10 for all degrees, and the line of an affine subset."""
+    drawn, axes = curve("l₁₀ % [px]", "noise floor n [10⁻³ px]", _SIZE)
+    ends = []
+    for part, floor, colour in (("v0", "v0", BLUE), ("v1", "v1phi1", RED)):
+        x = [np.sqrt(d.finest_px[f"{part} x"] * d.finest_px[f"{part} y"]) for d in degrees]
+        y = [1e3 * d.floor_px[floor] for d in degrees]
+        ends += x
+        label = "v0" if part == "v0" else "v1 φ1"
+        axes.plot(x, y, color=colour, marker="o", ms=4, linewidth=1, label=label)
+        for d, at, high in zip(degrees, x, y, strict=True):
+            axes.annotate(str(d.degree), (at, high), (4, 3), textcoords="offset points",
+                          fontsize=6.5, color=colour)  # fmt: skip
+    line = np.array([min(ends), max(ends)])
+    axes.plot(line, 1e3 * local / line, color=GREEN, linestyle="--", linewidth=1,
+              label="affine subset of any size (theory)")  # fmt: skip
+    axes.set(xscale="log", yscale="log")
+    axes.legend(frameon=False, fontsize=7.5)
+    plain_ticks(axes.xaxis, axes.yaxis)
+    return drawn
 
 
-def _plain(axes: Axes) -> None:
-    """Write 20 rather than 2 x 10^1."""
-    axes.xaxis.set_major_formatter(_FORMAT)
-    axes.xaxis.set_minor_formatter(_FORMAT)
-    axes.tick_params(axis="both", which="minor", labelsize=7, labelcolor=INK)
+def draw_passband(passband: Passband) -> Figure:
+    """Draw what is found of patterns of other wavelengths, beside the mode and instead of it."""
+    drawn, axes = curve("wave numbers over the mode's [–]", "amplitude ratio [–]", _SIZE)
+    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+    axes.plot(passband.stretch, passband.added, color=BLUE, label="a small one beside it")
+    known = np.isfinite(passband.itself)
+    axes.plot(passband.stretch[known], passband.itself[known], "o", ms=3.5, color=RED,
+              label="the pattern itself")  # fmt: skip
+    axes.set_ylim(-0.03, 1.18)
+    axes.legend(frameon=False, fontsize=7.5, loc="upper center", ncols=2)
+    return drawn
 
 
 def _colour(degree: int, degrees: Sequence[int]) -> tuple[float, ...]:
@@ -199,7 +160,7 @@ _KEPT = 0.85
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What a resolution study has found, in words.
+    """The sentences on a resolution study.
 
     Parameters
     ----------
@@ -215,7 +176,7 @@ class Answers:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The same in words, the most important first."""
+        """The findings, the most important first."""
         return (
             self._finest,
             self._trade_off,
@@ -238,8 +199,8 @@ class Answers:
         width = 2.0 * b.specimen.half_size[0] / b.pixel_size
         v0, v1 = (self.found.chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
         return (
-            f"At degree {self.found.chosen.degree} a wave along x keeps 90 % of its amplitude from a "
-            f"period of {v0:.0f} px on if it is of v0 ({v0 / pitch:.1f} cells, "
+            f"At degree {self.found.chosen.degree} a wave along x keeps 90 % of its amplitude from "
+            f"a period of {v0:.0f} px on if it is of v0 ({v0 / pitch:.1f} cells, "
             f"{100 * v0 / width:.0f} % of the specimen's width), and from {v1:.0f} px on "
             f"({v1 / pitch:.1f} cells) if it is of v1, which lives in the cellular part only."
         )
@@ -265,20 +226,22 @@ class Answers:
             f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
             f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
             f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 fixed "
-            f"and without motion from {first.fixed_px2:.2f} to {last.fixed_px2:.2f} px²: the rest is "
-            "mostly the noise of φ1's own parameters. An affine subset on the same speckle under "
+            f"and without motion from {first.fixed_px2:.2f} to {last.fixed_px2:.2f} px²: the rest "
+            "is mostly the noise of φ1's own parameters. An affine subset on the same speckle "
+            "under "
             f"the same noise has {self.found.subset_px2:.2f} px², whatever its size (theory)."
         )
 
     @property
     def _images(self) -> str:
         off, kept = self.waves["difference"].abs(), self.waves["best fit"] >= _KEPT
-        elsewhere = "" if kept.all() else f", elsewhere by {100 * off[~kept].max():.1f} %"
+        elsewhere = "" if kept.all() else f"; otherwise by {100 * off[~kept].max():.1f} %"
         anywhere, resolved = self.found.curves.cross_talk()
         return (
-            f"Correlated images give what the best fits promise: where these keep "
-            f"{100 * _KEPT:.0f} % or more of a wave of {self.found.spec.amplitude_px:g} px, its share "
-            f"differs by {100 * off[kept].max():.1f} % of the amplitude at most{elsewhere}. Of a "
+            f"Correlated images agree with the best fits: where these keep "
+            f"{100 * _KEPT:.0f} % or more of a wave of {self.found.spec.amplitude_px:g} px, its "
+            f"share differs by {100 * off[kept].max():.1f} % of the amplitude at "
+            f"most{elsewhere}. Of a "
             f"wave of one part up to {100 * resolved:.1f} % is found in the other where it is "
             f"resolved, up to {100 * anywhere:.0f} % where it isn't."
         )
@@ -302,8 +265,9 @@ class Answers:
             f"{2 * self._pitch_px:.0f} px, far below those periods, and none of it is lost: it is "
             "one of the functions that are fitted. A small pattern beside it passes as through a "
             f"filter, from {kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
-            f"{self.found.chosen.degree}; but if the pattern itself is up to {100 * band.retuned:.0f} % "
-            "longer or shorter, its wave numbers follow, and all of its amplitude is found: "
+            f"{self.found.chosen.degree}; but if the pattern itself is up to "
+            f"{100 * band.retuned:.0f} % longer or shorter, its wave numbers follow, and all of "
+            f"its amplitude is found: "
             "l₁₀ % is a filter's number, and φ1 isn't filtered but tuned."
         )
 
@@ -314,11 +278,10 @@ def report_resolution(study: ResolutionStudy, table: pd.DataFrame, folder: Path)
 
 
 def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
-    """What the analysis of a study says; ``seeds`` in words."""
-    spec, curves, degrees, chosen = found.spec, found.curves, found.degrees, found.chosen
+    """The findings of an analysis; ``seeds`` in words."""
+    spec, curves, degrees = found.spec, found.curves, found.degrees
     floors = noise_floors(found.rows, spec)
     waves = measured_waves(found.rows, spec, curves)
-    answers = Answers(found, waves, floors)
     return Findings(
         numbers={
             "degrees": [asdict(d) for d in degrees],
@@ -328,23 +291,52 @@ def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
             "cross_talk": dict(zip(("any_period", "resolved"), curves.cross_talk(), strict=True)),
             "longest_retuned": found.passband.retuned,
         },
-        sentences=answers.sentences,
-        keys=_keys(chosen, spec),
-        plots=(
-            *(draw_transfer(part, curves, waves, spec) for part in WAVED),
-            draw_indicators(degrees, found.subset_px2, seeds),
-            draw_passband(found.passband, chosen.degree),
-        ),
-        tables={
-            "By degree": _by_degree(degrees, spec),
-            "Images against best fits": waves,
-            "Noise floors": floors,
-        },
-        attachments={
-            "Finest periods": _finest(degrees, spec),
-            "Transfer": _transfer_table(curves, spec),
-        },
+        sentences=Answers(found, waves, floors).sentences,
+        keys=_keys(found.chosen, spec),
+        figures=_figures(found, waves, seeds),
+        tables=[
+            ReportTable.of("By degree", _by_degree(degrees, spec)),
+            ReportTable.of("Images against best fits", waves),
+            ReportTable.of("Noise floors", floors),
+        ],
+        attachments=[
+            ReportTable.of("Finest periods", _finest(degrees, spec)),
+            ReportTable.of("Transfer", _transfer_table(curves, spec)),
+        ],
     )
+
+
+def _figures(found: ResolutionAnalysis, waves: pd.DataFrame, seeds: str) -> list[Card]:
+    degree = found.chosen.degree
+    again = (
+        " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds cos(πx/l) "
+        "/ 2."
+    )
+    return [
+        *(
+            Card.single(
+                f"transfer-{part}", f"Amplitude ratio of a wave of {part}",
+                partial(draw_transfer, part, found.curves, waves, found.spec),
+                f"Waves of {part}, over both phases. Lines: best fits of the ansatz to the "
+                "displacement; dots: correlated images. Dotted: 10 % are lost."
+                + (again if part == "v1" else ""), wide=True,
+            )
+            for part in WAVED
+        ),
+        Card.single(
+            "indicators", "Noise against resolution",
+            partial(draw_indicators, found.degrees, found.subset_px2),
+            f"Numbers: the degree. l₁₀ %: mean of both axes; n: by the covariance; {seeds}. Along "
+            "the dashed line, and any parallel to it, the indicator n l₁₀ % is the same.",
+        ),
+        Card.single(
+            "passband", "Patterns of other wavelengths", partial(draw_passband, found.passband),
+            f"Degree {degree}; best fits. Line: a small pattern with other wave numbers than the "
+            "mode's, added to it: v0 takes the longest, v1 those next to the mode, between them "
+            "nothing passes. Dots: the pattern itself has them, and the initial guess is the mode: "
+            "its wave numbers are unknowns and follow, until the fit ends in another minimum.",
+        ),
+    ]  # fmt: skip
 
 
 def _by_degree(degrees: list[DegreeResolution], spec: ResolutionSpec) -> pd.DataFrame:
@@ -404,7 +396,7 @@ def _keys(chosen: DegreeResolution, spec: ResolutionSpec) -> tuple[KeyNumber, ..
         for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1"))
     ]
     keys += [
-        KeyNumber(f"n l₁₀ % of {part}", short(chosen.indicator_px2[part]), "px²", at)
+        KeyNumber(f"n l₁₀ % of {part}", number(chosen.indicator_px2[part]), "px²", at)
         for part in WAVED
     ]
     return tuple(keys)

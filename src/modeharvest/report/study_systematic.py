@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from modeharvest.report.figures.style import BLUE, GOLD, GREEN, MUTED, figure, style
-from modeharvest.report.model import Findings, KeyNumber, Plot, short
+from modeharvest.report.figures.style import BLUE, GOLD, GREEN, MUTED, figure
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
 from modeharvest.validation.studies.systematic import (
     BASE,
     FACTORS,
@@ -21,8 +23,8 @@ from modeharvest.validation.studies.systematic import (
 )
 
 ERROR_LABELS = {
-    "measurement_error_px": "IDIC − best fit [px]",
-    "model_error_px": "truth − best fit [px]",
+    "measurement_error_px": "measurement error, IDIC − best fit [px]",
+    "model_error_px": "model error, truth − best fit [px]",
     "w_px": "w = truth − IDIC [px]",
     "v1_percent": "v₁ off the best fit's [%]",
 }
@@ -50,7 +52,9 @@ def by_level(found: SystematicAnalysis) -> pd.DataFrame:
             for key, label in ERROR_LABELS.items():
                 row[label] = part[key].mean()
             row[MOVED] = part["moved"].mean()
-            row["IDIC − best fit, sd over speckles [px]"] = part["measurement_error_px"].std(ddof=0)
+            row["measurement error, sd over speckles [px]"] = part["measurement_error_px"].std(
+                ddof=0
+            )
             row["pixels per ligament"] = part["pixels_per_ligament"].mean()
             row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
             rows.append(row)
@@ -98,91 +102,98 @@ _COLUMNS = 3
 def report_systematic(study: SystematicStudy, table: pd.DataFrame, folder: Path) -> Findings:
     """Errors against each factor, as curves and tables."""
     found = study.analyse(table, folder)
-    levels = by_level(found)
+    bases, seeds, levels = found.bases, study.seeds, by_level(found)
     spans = by_factor(levels)
     return Findings(
         numbers={"base": dict(found.base), "factors": spans.to_dict("records")},
         sentences=_sentences(levels, spans, found.base),
         keys=_keys(spans, found.base),
-        plots=(_curves(levels, found.bases, study.seeds),),
-        tables={"Which factor matters": spans, "Every level": levels.drop(columns="number")},
+        figures=[
+            Card.single(
+                "factors",
+                "Error against each factor",
+                partial(draw_factors, levels, bases),
+                f"Rms per component, in pixels of the base; means over {seeds}. Blue dots: "
+                "measurement error, IDIC − best fit; green squares: model (ansatz) error; golden "
+                "triangles: how far the measurement is from the base’s. Dotted: the base.",
+                wide=True,
+            )
+        ],
+        tables=[
+            ReportTable.of("Which factor matters", spans),
+            ReportTable.of("Every level", levels.drop(columns="number")),
+        ],
     )
 
 
 def _keys(spans: pd.DataFrame, base: Mapping[str, float]) -> tuple[KeyNumber, ...]:
     first = spans.iloc[0]
     return (
-        KeyNumber("IDIC − best fit", short(base["measurement_error_px"]), "px",
-                  "at the base, rms per component: what the measurement adds"),
-        KeyNumber("truth − best fit", short(base["model_error_px"]), "px",
-                  "at the base: what the ansatz can’t describe"),
+        KeyNumber("measurement error", number(base["measurement_error_px"]), "px",
+                  "at the base: rms of IDIC − best fit, per component"),
+        KeyNumber("model (ansatz) error", number(base["model_error_px"]), "px",
+                  "at the base: rms of truth − best fit"),
         KeyNumber("matters most", str(first["factor"]).split(" [")[0], "",
                   f"moves the measurement by up to {first[f'largest, {MOVED}']:.2g} px"),
     )  # fmt: skip
 
 
 _FAR, _NEAR = 0.1, 0.01
-"""Factors that move the measurement by more, or by less, are told apart [px]."""
+"""Factors that move the measurement by more, or by less, are listed apart [px]."""
 
 
 def _sentences(
     levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]
 ) -> tuple[str, ...]:
-    said = [
-        f"At the base the measurement is {short(base['measurement_error_px'])} px rms per "
+    text = [
+        f"At the base the measurement is {number(base['measurement_error_px'])} px rms per "
         f"component from the best fit of its ansatz, which is "
-        f"{short(base['model_error_px'])} px from the truth; v₁ is "
-        f"{short(base['v1_percent'])} % off the best fit's."
+        f"{number(base['model_error_px'])} px from the truth; v₁ is "
+        f"{number(base['v1_percent'])} % off the best fit's."
     ]
     far = spans[f"largest, {MOVED}"]
-    for words, part in (
+    for heading, part in (
         (f"These move the measurement by more than {_FAR:g} px", spans[far > _FAR]),
         (f"These by {_NEAR:g} to {_FAR:g} px", spans[(far >= _NEAR) & (far <= _FAR)]),
         (f"These by less than {_NEAR:g} px", spans[far < _NEAR]),
     ):
         if len(part):
-            told = ", ".join(
-                f"{row['factor'].split(' [')[0]} ({short(float(f'{moved:.2g}'))} px)"
+            named = ", ".join(
+                f"{row['factor'].split(' [')[0]} ({number(float(f'{moved:.2g}'))} px)"
                 for moved, (_, row) in zip(far[part.index], part.iterrows(), strict=True)
             )
-            said.append(f"{words}: {told}.")
+            text.append(f"{heading}: {named}.")
     lost_ones = levels[levels["converged"].map(_not_all_converged)]
     if len(lost_ones):
-        told = ", ".join(f"{r['name']} = {short(r['level'])}" for _, r in lost_ones.iterrows())
-        said.append(f"Not every correlation converged at {told}: left out above.")
-    said.append(
-        "What the ansatz can't describe makes most of the error here, and hides smaller ones: how "
-        "far a factor moves the measurement is told beside, rms per component at the junctions "
+        named = ", ".join(f"{r['name']} = {number(r['level'])}" for _, r in lost_ones.iterrows())
+        text.append(f"Not every correlation converged at {named}: left out above.")
+    text.append(
+        "Model error is most of the error here, and hides smaller ones: how far a factor moves the "
+        "measurement is given beside, rms per component at the junctions "
         "between holes. All are in pixels of the base."
     )
-    return tuple(said)
+    return tuple(text)
 
 
-def _curves(levels: pd.DataFrame, bases: Mapping[str, float | None], seeds: str) -> Plot:
+def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Figure:
     """Draw small curves, one for each factor, on a common scale."""
     rows = -(-len(bases) // _COLUMNS)
-    with style():
-        drawn = figure(9.6, 2.3 * rows)
-        grid = drawn.subplots(rows, _COLUMNS, squeeze=False, sharey=True).ravel()
-        for axes in grid[len(bases) :]:
-            axes.set_visible(False)
-        for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
-            part = levels[levels["name"] == name]
-            for column, look in _CURVES.items():
-                seen = part[part[column] > 0.0]  # the base is not moved from itself
-                axes.plot(seen["number"], seen[column], linewidth=1, markersize=4, label=column,
-                          **look)  # fmt: skip
-            _finish_axes(axes, part, at_base)
-        for axes in grid[::_COLUMNS]:
-            axes.set_ylabel("rms [px of the base]")
-        drawn.legend(*grid[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="upper left")
-        drawn.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.3 / drawn.get_figheight()))
-    caption = (
-        f"Rms per component, in pixels of the base; means over {seeds}. Blue dots: what the "
-        "measurement adds to the best fit of its ansatz; green squares: what the ansatz can’t "
-        "describe; golden triangles: how far the measurement is from the base’s. Dotted: the base."
-    )
-    return Plot("factors", "Error against each factor", drawn, caption, wide=True)
+    drawn = figure(9.6, 2.3 * rows)
+    grid = drawn.subplots(rows, _COLUMNS, squeeze=False, sharey=True).ravel()
+    for axes in grid[len(bases) :]:
+        axes.set_visible(False)
+    for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
+        part = levels[levels["name"] == name]
+        for column, look in _CURVES.items():
+            seen = part[part[column] > 0.0]  # the base is not moved from itself
+            axes.plot(seen["number"], seen[column], linewidth=1, markersize=4, label=column,
+                      **look)  # fmt: skip
+        _finish_axes(axes, part, at_base)
+    for axes in grid[::_COLUMNS]:
+        axes.set_ylabel("rms [px of the base]")
+    drawn.legend(*grid[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="upper left")
+    drawn.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.3 / drawn.get_figheight()))
+    return drawn
 
 
 def _finish_axes(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:

@@ -183,8 +183,9 @@ class Run(StagedRun[Case]):
 
     def _report(self, images: ImageSet, page: Path) -> dict[str, Any]:
         """Compare with the truth and write the report; returns the content of the summary."""
-        from modeharvest.report.experiment import draw, write_experiment_report
-        from modeharvest.report.figures.experiment import ExperimentReportData
+        from modeharvest.report.experiment import experiment_figures, experiment_report
+        from modeharvest.report.figures.experiment import ExperimentData
+        from modeharvest.report.model import draw_figures, write_page
 
         case, solution, results = self.case, self._solution(), self._results(images)
         measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
@@ -199,13 +200,13 @@ class Run(StagedRun[Case]):
             snapshots = _Awaited(
                 [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
             )
-            data = ExperimentReportData(
+            data = ExperimentData(
                 solution, images, strains, [results[strain] for strain in strains],
                 comparisons, spectra, measured.specimen.pitch,
             )  # fmt: skip
-            drawings = draw(data, self.progress)
+            pictures = draw_figures(experiment_figures(data), self.progress)
             summary = experiment_summary(measured, case.plain(), list(snapshots)).plain()
-        write_experiment_report(page, case.plain(), drawings, summary)
+        write_page(experiment_report(summary, data), page, pictures=pictures)
         return summary
 
     def _images(self) -> ImageSet:

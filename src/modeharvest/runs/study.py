@@ -28,7 +28,7 @@ import pandas as pd
 from pydantic import model_validator
 
 from modeharvest.fem.field import Solution
-from modeharvest.report.model import Findings, StudyRun, slug, write_study_report
+from modeharvest.report.model import Findings, study_report, write_page, write_tables
 from modeharvest.report.study_modes import report_modes
 from modeharvest.report.study_noise import report_noise
 from modeharvest.report.study_resolution import report_resolution
@@ -36,9 +36,8 @@ from modeharvest.report.study_robustness import report_robustness
 from modeharvest.report.study_systematic import report_systematic
 from modeharvest.runs.case import Case, of_kind, read_tables, with_kind
 from modeharvest.runs.experiment import Run
-from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic, read_json, require_writable, write_json
+from modeharvest.util.files import read_json, require_writable, write_json
 from modeharvest.util.progress import named
 from modeharvest.util.stages import StagedRun, exclusive, versions
 from modeharvest.util.typed import to_plain
@@ -185,29 +184,15 @@ class StudyAnalysis(StagedRun[StudyCase]):
         self, campaign: Campaign, table: pd.DataFrame, findings: Findings
     ) -> dict[str, Any]:
         """Leave tables, ``summary.json`` and ``report.html``."""
+        tables = [*findings.tables, *findings.attachments]
         files = {"table.csv": "every case: its values, error, result"}
-        for title, part in {**findings.tables, **findings.attachments}.items():
-            name = f"{slug(title)}.csv"
-            files[name] = title
-            with atomic(self.folder / name) as temporary:
-                part.to_csv(temporary, index=False)
+        files |= {table.file: table.title for table in tables}
         files["summary.json"] = "the findings' numbers and text, and the failures"
         files["timings.json"] = "what the stages took [s]"
         summary = self._summary(campaign, table, findings)
+        write_tables(tables, self.folder)
         write_json(self.folder / "summary.json", summary)
-        study: Study[Any] = self.case.study
-        run = StudyRun(
-            title=summary["title"],
-            question=study.question,
-            findings=findings,
-            command=self.command,
-            seeds=study.seeds,
-            case=summary["case"],
-            notes=_notes(summary),
-            files=files,
-            versions=summary["versions"],
-        )
-        write_study_report(self.folder / "report.html", run)
+        write_page(study_report(summary, findings, files), self.folder / "report.html")
         return summary
 
     def _summary(
@@ -220,6 +205,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
             "kind": self.case.kind,
             "command": self.command,
             "seeds": self.case.study.seeds,
+            "question": self.case.study.question,
             "text": list(findings.sentences),
             "numbers": to_plain(findings.numbers),
             "cases": len(table),
@@ -254,22 +240,3 @@ def _kind_in(path: Path, kind: str) -> str:
         return str(read_json(path)["kind"])
     except (InputError, KeyError, TypeError):
         return kind
-
-
-def _notes(summary: dict[str, Any]) -> tuple[str, ...]:
-    """What to keep in mind of how the study went."""
-    notes = []
-    if summary["failed"]:
-        first = summary["failed"][0]
-        notes.append(
-            f"{len(summary['failed'])} of {summary['cases']} cases failed; their tracebacks are "
-            f"in cases/. The first, {first['file']}: {first['error']}"
-        )
-    for other, count in summary["other_results_by_version"].items():
-        of = "other options" if other == __version__ else f"modeharvest {other}"
-        notes.append(f"{count} stored results of {of} were left alone and not mixed in.")
-    notes.append(
-        "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
-        "not plane) is not in it."
-    )
-    return tuple(notes)

@@ -10,7 +10,6 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import Voronoi
@@ -19,11 +18,12 @@ from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap
 from modeharvest.fem.bloch.modes import Branch
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.options import Wave
-from modeharvest.report.figures.curves import annotate, curve
+from modeharvest.report.figures.curves import DASHES, annotate, curve, legend_above
 from modeharvest.report.figures.maps import WIDTH, ColourScale, colour_bar
-from modeharvest.report.figures.outlines import LatticePatch, MeshBoundary
+from modeharvest.report.figures.outlines import LatticePatch, MeshBoundary, triangles
 from modeharvest.report.figures.style import (
     BLUE,
+    COLOURS,
     DENSITY,
     GLOW,
     GOLD,
@@ -36,7 +36,6 @@ from modeharvest.report.figures.style import (
     draw_path,
     figure,
     scale_bar,
-    style,
 )
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.util.arrays import FloatArray
@@ -47,7 +46,6 @@ _MARGIN = 0.24  # below it, for the scale bar [in]
 _EMBER = LinearSegmentedColormap.from_list(  # seen on a dark page from the first value on
     "ember", np.vstack([to_rgba_array("#46506a"), GLOW(np.linspace(0.3, 1.0, 16))])
 )
-_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # triangles of a T6
 
 
 def draw_lattice(
@@ -71,13 +69,12 @@ def draw_lattice(
     """
     moved = None if displacement is None else patch.moved(displacement, gradient)
     F = np.eye(2) if gradient is None else np.asarray(gradient)
-    with style():
-        drawn, axes = _window_axes(patch, pitch)
-        outline = patch.outline.path(moved)
-        draw_path(axes, outline, fc=BLUE, ec="none", alpha=0.28)
-        draw_path(axes, outline, fill=False, ec=BLUE, lw=0.7)
-        corners = (patch.cell_corners - patch.centre) @ F.T + patch.centre
-        axes.add_patch(Polygon(corners, fill=False, ec=RED, lw=1.3, ls=(0, (4, 2)), zorder=3))
+    drawn, axes = _window_axes(patch, pitch)
+    outline = patch.outline.path(moved)
+    draw_path(axes, outline, fc=BLUE, ec="none", alpha=0.28)
+    draw_path(axes, outline, fill=False, ec=BLUE, lw=0.7)
+    corners = (patch.cell_corners - patch.centre) @ F.T + patch.centre
+    axes.add_patch(Polygon(corners, fill=False, ec=RED, lw=1.3, ls=(0, (4, 2)), zorder=3))
     return drawn
 
 
@@ -102,19 +99,17 @@ def draw_growth(patch: LatticePatch, shape: FloatArray, amplitude: float, pitch:
     t = np.clip((patch.mesh.nodes[:, 0] - left) / (right - left) * 1.25 - 0.15, 0.0, 1.0)
     ramp = t**2 * (3.0 - 2.0 * t)
     moved = amplitude / largest * ramp[:, None] * shape[patch.node]
-    with style():
-        drawn, axes = _window_axes(patch, pitch, width=3.6, bar=True)
-        path = patch.outline.path(moved)
-        length = np.linalg.norm(moved, axis=1)
-        scale = ColourScale(_EMBER, 0.0, amplitude / pitch, "l")
-        nodes = patch.mesh.nodes + moved
-        triangles = patch.mesh.cells[:, np.array(_FINER)].reshape(-1, 3)
-        net = Triangulation(nodes[:, 0], nodes[:, 1], triangles)
-        shading = axes.tripcolor(net, length / pitch, shading="gouraud", cmap=scale.colours,
-                                 norm=scale.normalise, rasterized=True)  # fmt: skip
-        edge = draw_path(axes, path, fill=False, ec="none", rasterized=True)
-        shading.set_clip_path(edge)
-        colour_bar(drawn, axes, scale)
+    drawn, axes = _window_axes(patch, pitch, width=3.6, bar=True)
+    path = patch.outline.path(moved)
+    length = np.linalg.norm(moved, axis=1)
+    scale = ColourScale(_EMBER, 0.0, amplitude / pitch, "l")
+    nodes = patch.mesh.nodes + moved
+    shading = axes.tripcolor(triangles(nodes, patch.mesh.cells), length / pitch, rasterized=True,
+                             shading="gouraud", cmap=scale.colours,
+                             norm=scale.normalise)  # fmt: skip
+    edge = draw_path(axes, path, fill=False, ec="none", rasterized=True)
+    shading.set_clip_path(edge)
+    colour_bar(drawn, axes, scale)
     return drawn
 
 
@@ -139,13 +134,12 @@ def draw_overlay(
     grey, black = outline.path(factor * analytic), outline.path(factor * numerical)
     nodes = np.vstack([mesh.nodes + factor * analytic, mesh.nodes + factor * numerical])
     low, high = nodes.min(axis=0), nodes.max(axis=0)
-    with style():
-        drawn, axes = _frame_axes(high - low)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        draw_path(axes, grey, fc=MUTED, ec="none", alpha=0.45, clip_on=False)
-        draw_path(axes, black, fc=INK, ec="none", alpha=0.14, clip_on=False)
-        draw_path(axes, black, fill=False, ec=INK, lw=1.1, clip_on=False)
-        scale_bar(axes, 0.5 * pitch, "l/2")
+    drawn, axes = _frame_axes(high - low)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    draw_path(axes, grey, fc=MUTED, ec="none", alpha=0.45, clip_on=False)
+    draw_path(axes, black, fc=INK, ec="none", alpha=0.14, clip_on=False)
+    draw_path(axes, black, fill=False, ec=INK, lw=1.1, clip_on=False)
+    scale_bar(axes, 0.5 * pitch, "l/2")
     return drawn
 
 
@@ -191,28 +185,26 @@ def draw_dispersion(dispersion: Dispersion, critical: Sequence[Wave] = ()) -> Fi
     """
     distances, values = dispersion.distances, dispersion.eigenvalues
     order = np.argsort(dispersion.loads)
-    with style():
-        drawn, axes = curve("wave vector", "lowest eigenvalue [N/mm⁴]")
-        axes.grid(visible=False)
-        at = [float(distances[k]) for k in dispersion.stops]
-        for x in at:
-            axes.axvline(x, color=MUTED, lw=0.6, alpha=0.5)
-        axes.axhline(0.0, color=MUTED, lw=0.9)
-        colours = _LOADS(np.linspace(0.0, 1.0, max(2, len(order))))
-        for k, colour in zip(order, colours, strict=False):
-            row = values[k]
-            for band in row.T[1:]:
-                axes.plot(distances, band, color=colour, lw=0.7, alpha=0.35)
-            name = f"{100 * dispersion.loads[k]:.3g} %"
-            axes.plot(distances, row[:, 0], color=colour, lw=1.6, label=name)
-        for x in distances[_on_path(dispersion.waves, critical)]:
-            axes.plot([x], [0.0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
-        low, high = float(np.nanmin(values[..., 0])), float(np.nanmax(values[..., 0]))
-        axes.set(xlim=(at[0], at[-1]), ylim=(min(1.15 * low, -0.04 * high), 1.06 * high))
-        axes.set_xticks(at, list(dispersion.labels))
-        axes.tick_params(axis="x", labelsize=9)
-        axes.legend(frameon=False, fontsize=7.5, loc="lower left", bbox_to_anchor=(0.0, 1.0),
-                    ncols=len(order), handlelength=1.4, borderaxespad=0.1)  # fmt: skip
+    drawn, axes = curve("wave vector", "lowest eigenvalue [N/mm⁴]")
+    axes.grid(visible=False)
+    at = [float(distances[k]) for k in dispersion.stops]
+    for x in at:
+        axes.axvline(x, color=MUTED, lw=0.6, alpha=0.5)
+    axes.axhline(0.0, color=MUTED, lw=0.9)
+    colours = _LOADS(np.linspace(0.0, 1.0, max(2, len(order))))
+    for k, colour in zip(order, colours, strict=False):
+        row = values[k]
+        for band in row.T[1:]:
+            axes.plot(distances, band, color=colour, lw=0.7, alpha=0.35)
+        name = f"{100 * dispersion.loads[k]:.3g} %"
+        axes.plot(distances, row[:, 0], color=colour, lw=1.6, label=name)
+    for x in distances[_on_path(dispersion.waves, critical)]:
+        axes.plot([x], [0.0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
+    low, high = float(np.nanmin(values[..., 0])), float(np.nanmax(values[..., 0]))
+    axes.set(xlim=(at[0], at[-1]), ylim=(min(1.15 * low, -0.04 * high), 1.06 * high))
+    axes.set_xticks(at, list(dispersion.labels))
+    axes.tick_params(axis="x", labelsize=9)
+    legend_above(axes, len(order))
     return drawn
 
 
@@ -238,17 +230,16 @@ def draw_zone_map(zone: ZoneMap, pitch: float, critical: Sequence[Wave] = ()) ->
     places = [turns[..., k] * len(values) for k in (0, 1)]
     shown = map_coordinates(values, places, order=3, mode="grid-wrap")
     scale = _zone_scale(values)
-    with style():
-        drawn, axes = _plane(half)
-        axes.imshow(shown, extent=(-half, half, -half, half), origin="lower", cmap=scale.colours,
-                    norm=scale.normalise, interpolation="bilinear", aspect="auto",
-                    rasterized=True)  # fmt: skip
-        axes.add_patch(Polygon(corners, fill=False, ec="#ffffff", lw=1.8, alpha=0.7))
-        axes.add_patch(Polygon(corners, fill=False, ec="#16191d", lw=0.9))
-        for xi_c in _images(critical, reciprocal, half):
-            axes.plot(*xi_c, "o", ms=9, mfc="none", mec="#ffffff", mew=2.2, clip_on=False)
-            axes.plot(*xi_c, "o", ms=9, mfc="none", mec="#16191d", mew=1.0, clip_on=False)
-        colour_bar(drawn, axes, scale)
+    drawn, axes = _plane(half)
+    axes.imshow(shown, extent=(-half, half, -half, half), origin="lower", cmap=scale.colours,
+                norm=scale.normalise, interpolation="bilinear", aspect="auto",
+                rasterized=True)  # fmt: skip
+    axes.add_patch(Polygon(corners, fill=False, ec="#ffffff", lw=1.8, alpha=0.7))
+    axes.add_patch(Polygon(corners, fill=False, ec="#16191d", lw=0.9))
+    for xi_c in _images(critical, reciprocal, half):
+        axes.plot(*xi_c, "o", ms=9, mfc="none", mec="#ffffff", mew=2.2, clip_on=False)
+        axes.plot(*xi_c, "o", ms=9, mfc="none", mec="#16191d", mew=1.0, clip_on=False)
+    colour_bar(drawn, axes, scale)
     return drawn
 
 
@@ -274,14 +265,13 @@ def draw_lattice_spectrum(
     order = np.argsort(level)
     shown = order[level[order] >= _FLOOR]
     scale = ColourScale(DENSITY, _FLOOR, 0.0, "dB")
-    with style():
-        drawn, axes = _plane(reach + 0.2)
-        axes.set_facecolor(DENSITY(0.0))
-        axes.plot(xi[:, 0], xi[:, 1], "o", ms=1.1, color="#ffffff", alpha=0.22, mew=0)
-        size = 3.0 + 105.0 * (1.0 - level[shown] / _FLOOR) ** 3
-        axes.scatter(xi[shown, 0], xi[shown, 1], s=size, c=scale.normalise(level[shown]),
-                     cmap=_bright(), vmin=0.0, vmax=1.0, lw=0)  # fmt: skip
-        colour_bar(drawn, axes, ColourScale(_bright(), _FLOOR, 0.0, "dB"))
+    drawn, axes = _plane(reach + 0.2)
+    axes.set_facecolor(DENSITY(0.0))
+    axes.plot(xi[:, 0], xi[:, 1], "o", ms=1.1, color="#ffffff", alpha=0.22, mew=0)
+    size = 3.0 + 105.0 * (1.0 - level[shown] / _FLOOR) ** 3
+    axes.scatter(xi[shown, 0], xi[shown, 1], s=size, c=scale.normalise(level[shown]),
+                 cmap=_bright(), vmin=0.0, vmax=1.0, lw=0)  # fmt: skip
+    colour_bar(drawn, axes, ColourScale(_bright(), _FLOOR, 0.0, "dB"))
     return drawn
 
 
@@ -344,10 +334,6 @@ def _on_path(waves: FloatArray, critical: Sequence[Wave]) -> NDArray[np.bool_]:
     return on
 
 
-_COLOURS = (BLUE, RED, GREEN, GOLD)
-_DASHES = (0, (3, 2))
-
-
 def draw_energies(branches: Sequence[Branch], critical: float | None) -> Figure:
     """Draw each branch's energy over that of the primary path at the same load.
 
@@ -401,24 +387,23 @@ def _branches(
     value: Callable[[Branch], list[float]],
     zero: bool = False,
 ) -> Figure:
-    with style():
-        drawn, axes = curve("load: nominal strain [%]", label)
-        if zero:
-            axes.axhline(0.0, color=MUTED, lw=0.9)
-        for n, branch in enumerate(b for b in branches if b.states):
-            load = 100.0 * np.array([s.load for s in branch.states])
-            stable = np.array([s.negative_eigenvalues == 0 for s in branch.states])
-            heights, colour = np.array(value(branch)), _COLOURS[n % len(_COLOURS)]
-            name = combination_name(branch.combination)
-            name += "" if stable.all() else ", unstable" if not stable.any() else ", partly stable"
-            start = [] if critical is None else [100.0 * critical]
-            axes.plot([*start, *load], [*np.zeros(len(start)), *heights], color=colour, lw=1.5,
-                      ls="-" if stable.all() else _DASHES, label=name)  # fmt: skip
-            axes.plot(load[stable], heights[stable], "o", color=colour, ms=3.5)
-            axes.plot(load[~stable], heights[~stable], "o", color=colour, ms=3.5, mfc="none")
-        if critical is not None:
-            axes.plot([100.0 * critical], [0.0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
-        _legend(axes)
+    drawn, axes = curve("load: nominal strain [%]", label)
+    if zero:
+        axes.axhline(0.0, color=MUTED, lw=0.9)
+    for n, branch in enumerate(b for b in branches if b.states):
+        load = 100.0 * np.array([s.load for s in branch.states])
+        stable = np.array([s.negative_eigenvalues == 0 for s in branch.states])
+        heights, colour = np.array(value(branch)), COLOURS[n % len(COLOURS)]
+        name = combination_name(branch.combination)
+        name += "" if stable.all() else ", unstable" if not stable.any() else ", partly stable"
+        start = [] if critical is None else [100.0 * critical]
+        axes.plot([*start, *load], [*np.zeros(len(start)), *heights], color=colour, lw=1.5,
+                  ls="-" if stable.all() else DASHES, label=name)  # fmt: skip
+        axes.plot(load[stable], heights[stable], "o", color=colour, ms=3.5)
+        axes.plot(load[~stable], heights[~stable], "o", color=colour, ms=3.5, mfc="none")
+    if critical is not None:
+        axes.plot([100.0 * critical], [0.0], "o", ms=8, mfc="none", mec=INK, mew=1.2)
+    legend_above(axes)
     return drawn
 
 
@@ -430,7 +415,7 @@ def draw_overlaps(rows: Sequence[ModeRow]) -> Figure:
 def draw_captured(rows: Sequence[ModeRow]) -> Figure:
     """Draw the energy that the automatically found family captures against d/l."""
     drawn = _over_ratio(rows, "energy in the automatic family [%]", lambda r: 100.0 * r.captured)
-    for colour, loading in zip(_COLOURS, _loadings(rows), strict=False):
+    for colour, loading in zip(COLOURS, _loadings(rows), strict=False):
         for row in _series(rows, loading):
             if row.waves > 2:
                 annotate(drawn.axes[0], row.ratio, 100.0 * row.captured, str(row.waves), colour,
@@ -440,33 +425,31 @@ def draw_captured(rows: Sequence[ModeRow]) -> Figure:
 
 def draw_critical_strains(rows: Sequence[ModeRow]) -> Figure:
     """Draw the first critical strain, and where it is not the pattern's, that one dashed."""
-    with style():
-        drawn, axes = curve("hole diameter over cell size d/l [–]", "critical strain [%]")
-        for colour, loading in zip(_COLOURS, _loadings(rows), strict=False):
-            series = _series(rows, loading)
-            ratio = np.array([row.ratio for row in series])
-            first = 100.0 * np.array([row.first if row.found else np.nan for row in series])
-            pattern = 100.0 * np.array([row.pattern for row in series])
-            axes.plot(ratio, pattern, color=colour, lw=1.1, ls=_DASHES)
-            axes.plot(ratio, first, color=colour, lw=1.6, label=loading)
-            _dots(axes, series, first, colour)
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        _legend(axes)
+    drawn, axes = curve("hole diameter over cell size d/l [–]", "critical strain [%]")
+    for colour, loading in zip(COLOURS, _loadings(rows), strict=False):
+        series = _series(rows, loading)
+        ratio = np.array([row.ratio for row in series])
+        first = 100.0 * np.array([row.first if row.found else np.nan for row in series])
+        pattern = 100.0 * np.array([row.pattern for row in series])
+        axes.plot(ratio, pattern, color=colour, lw=1.1, ls=DASHES)
+        axes.plot(ratio, first, color=colour, lw=1.6, label=loading)
+        _dots(axes, series, first, colour)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    legend_above(axes)
     return drawn
 
 
 def _over_ratio(rows: Sequence[ModeRow], label: str, value: Callable[[ModeRow], float]) -> Figure:
-    with style():
-        drawn, axes = curve("hole diameter over cell size d/l [–]", label)
-        for colour, loading in zip(_COLOURS, _loadings(rows), strict=False):
-            series = _series(rows, loading)
-            heights = np.array([value(row) for row in series])
-            axes.plot([row.ratio for row in series], heights, color=colour, lw=1.6, label=loading)
-            _dots(axes, series, heights, colour)
-        _legend(axes)
+    drawn, axes = curve("hole diameter over cell size d/l [–]", label)
+    for colour, loading in zip(COLOURS, _loadings(rows), strict=False):
+        series = _series(rows, loading)
+        heights = np.array([value(row) for row in series])
+        axes.plot([row.ratio for row in series], heights, color=colour, lw=1.6, label=loading)
+        _dots(axes, series, heights, colour)
+    legend_above(axes)
     return drawn
 
 
@@ -483,9 +466,3 @@ def _loadings(rows: Sequence[ModeRow]) -> list[str]:
 
 def _series(rows: Sequence[ModeRow], loading: str) -> list[ModeRow]:
     return sorted((row for row in rows if row.loading == loading), key=lambda row: row.ratio)
-
-
-def _legend(axes: Axes) -> None:
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(frameon=False, fontsize=7.5, loc="lower left", bbox_to_anchor=(0.0, 1.0),
-                    ncols=4, handlelength=1.6, columnspacing=1.2, borderaxespad=0.1)  # fmt: skip

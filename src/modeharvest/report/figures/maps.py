@@ -15,7 +15,6 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.report.figures.style import (
@@ -29,7 +28,6 @@ from modeharvest.report.figures.style import (
     draw_path,
     figure,
     scale_bar,
-    style,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray
 
@@ -59,13 +57,13 @@ class MapFrame:
     limits: tuple[float, float, float, float]
 
     @classmethod
-    def of(cls, mesh: Mesh, grid: PixelGrid, cells: int = 360) -> MapFrame:
-        """Make a sheet for a mesh, with about that many cells along the longer side."""
+    def of(cls, outline: MeshBoundary, grid: PixelGrid, cells: int = 360) -> MapFrame:
+        """Make a frame for an outline, with about that many cells along the longer side."""
         factor = max(1, round(max(grid.shape) / cells))
-        (left, bottom), (right, top) = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+        (left, bottom), (right, top) = outline.nodes.min(axis=0), outline.nodes.max(axis=0)
         margin = 0.012 * max(right - left, top - bottom)
         limits = (left - margin, right + margin, bottom - margin, top + margin)
-        return cls(MeshBoundary.of(mesh), grid.binned(factor), factor, limits)
+        return cls(outline, grid.binned(factor), factor, limits)
 
     def average(self, field: FloatArray) -> FloatArray:
         """Average a field (rows, cols) of the images over the cells, NaN left out."""
@@ -170,14 +168,13 @@ def draw_field(
     motion
         The displacement to draw it with; None for the reference configuration.
     """
-    with style():
-        drawn, axes = _empty_map(sheet)
-        edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
-        X, Y = sheet.moved_corners(motion)
-        quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
-                                norm=scale.normalise, rasterized=True)  # fmt: skip
-        quads.set_clip_path(edge)
-        colour_bar(drawn, axes, scale)
+    drawn, axes = _empty_map(sheet)
+    edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
+    X, Y = sheet.moved_corners(motion)
+    quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
+                            norm=scale.normalise, rasterized=True)  # fmt: skip
+    quads.set_clip_path(edge)
+    colour_bar(drawn, axes, scale)
     return drawn
 
 
@@ -201,23 +198,21 @@ def draw_image(
     displacement
         (n, 2) true displacement at the mesh's nodes [mm], for the outline.
     """
-    with style():
-        drawn, axes = _empty_map(sheet)
-        _show_grey(axes, sheet, image, material, grid)
-        _draw_edge(axes, sheet.outline.path(displacement))
-        colour_bar(drawn, axes, ColourScale(GREY, 0.0, 1.0))
+    drawn, axes = _empty_map(sheet)
+    _show_grey(axes, sheet, image, material, grid)
+    _draw_edge(axes, sheet.outline.path(displacement))
+    colour_bar(drawn, axes, ColourScale(GREY, 0.0, 1.0))
     return drawn
 
 
 def draw_shape(sheet: MapFrame, motion: DisplacementFunction) -> Figure:
     """Draw the specimen's outline deformed over the undeformed one; no colour bar."""
-    with style():
-        drawn, axes = _empty_map(sheet)
-        draw_path(axes, sheet.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
-                  clip_on=False)  # fmt: skip
-        deformed = sheet.outline.path(sheet.moved_nodes(motion))
-        draw_path(axes, deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False)
-        draw_path(axes, deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False)
+    drawn, axes = _empty_map(sheet)
+    draw_path(axes, sheet.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
+              clip_on=False)  # fmt: skip
+    deformed = sheet.outline.path(sheet.moved_nodes(motion))
+    draw_path(axes, deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False)
+    draw_path(axes, deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False)
     return drawn
 
 
@@ -247,17 +242,16 @@ def draw_blend(
     motion
         The displacement to draw it with.
     """
-    with style():
-        drawn, axes = _empty_map(sheet, width=3.2)
-        # Gone where the field is opaque, or slivers of it would show along the holes.
-        _show_grey(axes, sheet, image, material, grid, dissolve=True)
-        edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
-        X, Y = sheet.moved_corners(motion)
-        colours = scale.colours(scale.normalise(values))
-        colours[..., 3] *= _ramp(values.shape)
-        quads = axes.pcolormesh(X, Y, colours, rasterized=True)
-        quads.set_clip_path(edge)
-        colour_bar(drawn, axes, scale)
+    drawn, axes = _empty_map(sheet, width=3.2)
+    # Gone where the field is opaque, or slivers of it would show along the holes.
+    _show_grey(axes, sheet, image, material, grid, dissolve=True)
+    edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
+    X, Y = sheet.moved_corners(motion)
+    colours = scale.colours(scale.normalise(values))
+    colours[..., 3] *= _ramp(values.shape)
+    quads = axes.pcolormesh(X, Y, colours, rasterized=True)
+    quads.set_clip_path(edge)
+    colour_bar(drawn, axes, scale)
     return drawn
 
 

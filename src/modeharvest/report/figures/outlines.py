@@ -1,4 +1,4 @@
-"""Boundaries as curves to draw: of a mesh, of a mask, of a piece of an infinite lattice."""
+"""Outlines to draw: of a mesh, of a mask, of a piece of an infinite lattice."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 from matplotlib.path import Path
+from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from skimage.measure import approximate_polygon, find_contours
 
@@ -14,6 +15,9 @@ from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.lattice.periodicity import find_periodicity
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+
+_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+"""Four straight triangles in a T6."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +58,25 @@ class MeshBoundary:
         A quadratic edge is a parabola, which a Bezier curve of second order draws exactly.
         """
         nodes = self.nodes if displacement is None else self.nodes + displacement
-        vertices, codes = [], []
+        vertices: list[FloatArray] = [np.empty((0, 2))]
+        codes: list[np.uint8] = []
         for loop in self.loops:
-            a, middle, b = (nodes[loop[:, k]] for k in range(3))
+            a, middle, b = (np.asarray(nodes[loop[:, k]]) for k in range(3))
             curved = loop[:, 1] != loop[:, 0]
-            control = np.where(curved[:, None], 2.0 * middle - 0.5 * (a + b), 0.5 * (a + b))
-            points = np.stack([control, b], axis=1).reshape(-1, 2)
-            vertices.append(np.vstack([a[:1], points, a[:1]]))
-            codes += [Path.MOVETO, *[Path.CURVE3] * len(points), Path.CLOSEPOLY]
+            if curved.any():
+                control = np.where(curved[:, None], 2.0 * middle - 0.5 * (a + b), 0.5 * (a + b))
+                points: FloatArray = np.stack([control, b], axis=1).reshape(-1, 2)
+                codes += [Path.MOVETO, *[Path.CURVE3] * len(points), Path.CLOSEPOLY]
+            else:
+                points = a[1:]
+                codes += [Path.MOVETO, *[Path.LINETO] * len(points), Path.CLOSEPOLY]
+            vertices += [a[:1], points, a[:1]]
         return Path(np.vstack(vertices), codes)
+
+
+def triangles(nodes: FloatArray, cells: IntArray) -> Triangulation:
+    """T6 elements (m, 6) with nodes (n, 2) as straight triangles, for shading."""
+    return Triangulation(nodes[:, 0], nodes[:, 1], cells[:, np.array(_FINER)].reshape(-1, 3))
 
 
 CELLS = 900
@@ -70,22 +84,7 @@ CELLS = 900
 _TOLERANCE = 0.3  # cells that corners may be off, once straight runs have become one edge
 
 
-@dataclass(frozen=True, eq=False)
-class PolygonBoundary(MeshBoundary):
-    """An outline whose edges are straight."""
-
-    def path(self, displacement: FloatArray | None = None) -> Path:
-        """The outline, displaced by (n, 2) at its corners [mm]; holes stay open when filled."""
-        moved = self.nodes if displacement is None else self.nodes + displacement
-        vertices: list[FloatArray] = [np.empty((0, 2))]
-        codes: list[np.uint8] = []
-        for loop in self.loops:
-            vertices += [moved[loop[:, 0]], moved[loop[:1, 0]]]
-            codes += [Path.MOVETO, *[Path.LINETO] * (len(loop) - 1), Path.CLOSEPOLY]
-        return Path(np.vstack(vertices), codes)
-
-
-def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> PolygonBoundary:
+def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> MeshBoundary:
     """Follow the edge of a mask.
 
     Parameters
@@ -99,7 +98,7 @@ def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> Polyg
 
     Returns
     -------
-    PolygonOutline
+    MeshBoundary
         Off the mask's edge by at most about a third of a cell; none for an empty mask.
     """
     factor = max(1, round(max(grid.shape) / CELLS))
@@ -119,7 +118,7 @@ def mask_boundary(mask: BoolArray, grid: PixelGrid, least: float = 0.0) -> Polyg
         loops.append(np.stack([first, first, np.roll(first, -1)], axis=1))
         nodes.append(np.stack([x, y], axis=1))
         count += len(corners)
-    return PolygonBoundary(np.vstack(nodes), tuple(loops))
+    return MeshBoundary(np.vstack(nodes), tuple(loops))
 
 
 def _material_share(mask: BoolArray, factor: int) -> NDArray[np.float32]:

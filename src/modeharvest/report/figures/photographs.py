@@ -1,276 +1,163 @@
-"""Figures of what was measured in photographs: the paper's Fig. "real", and standard deviations."""
+"""Figures of photographs: the reference and its lens, the measured fields, their uncertainty."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
+from modeharvest.idic.photograph.holes import HoleLattice
+from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.spectra.pattern import WavePattern
+from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.idic.uncertainty.covariance import FieldErrors
+from modeharvest.imaging.distortion.calibration.result import Calibration
+from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.report.figures import maps as fields
-from modeharvest.report.figures.curves import draw_density, pattern_density
-from modeharvest.report.figures.maps import ColourScale, DisplacementFunction, MapFrame
+from modeharvest.report.figures.curves import draw_density
+from modeharvest.report.figures.fits import (
+    COARSE,
+    FINE,
+    SMOOTH,
+    UM,
+    FittedState,
+    SpecimenView,
+    draw_length,
+    largest_density,
+)
+from modeharvest.report.figures.maps import (
+    WIDTH,
+    ColourScale,
+    MapFrame,
+    colour_bar,
+    draw_blend,
+    draw_field,
+    draw_image,
+)
 from modeharvest.report.figures.outlines import MeshBoundary, mask_boundary
-from modeharvest.report.figures.style import GLOW, GOLD, draw_path, style
+from modeharvest.report.figures.style import (
+    BLUE,
+    GLOW,
+    GOLD,
+    GREEN,
+    GREY,
+    INK,
+    RED,
+    SIZE,
+    draw_path,
+    figure,
+)
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import FloatArray
 
 MOST_SHOWN = 6
-"""Photographs with pictures of their own, at most; numbers are told of all."""
-FINE, SMOOTH, COARSE = 640, 320, 160
-"""Cells along a map's longer side: as fine as speckles, as patterns, as error bars."""
-DRAWN_SHAPE = 0.16
-"""Largest displacement that modes are drawn with [l]."""
+"""Photographs with pictures of their own, at most; numbers are given of all."""
+CLOSE = 3
+"""Cells along the side of a closer look."""
+_NO_PATTERN = WavePattern((), None, "none", None, 0.0, ())
 _SPECK = 0.01  # l²: holes and islands smaller than that are not drawn
 _LEVELS = (0.5, 99.5)  # percentiles of the reference's grey levels, drawn black and white
+_REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
+
+Cause = Literal["noise", "model"]
+
+
+def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
+    """The frames with pictures: those around buckling, and evenly spaced ones."""
+    frames, moments = harvest.frames, harvest.timeline
+    if len(frames) <= MOST_SHOWN:
+        return frames
+    has_pattern = [m.has_pattern for m in moments] if len(moments) == len(frames) else []
+    first = has_pattern.index(True) if True in has_pattern else 0
+    chosen = {max(0, first - 1), first, len(frames) - 1}
+    for k in np.linspace(0, len(frames) - 1, MOST_SHOWN).round().astype(int):
+        if len(chosen) < MOST_SHOWN:
+            chosen.add(int(k))
+    return tuple(frames[k] for k in sorted(chosen))
+
+
+def material_outline(harvest: Harvest) -> MeshBoundary:
+    """Of the material in the reference; of the whole image if no material was found."""
+    found = mask_boundary(harvest.mask, harvest.grid, _SPECK * harvest.pitch**2)
+    everything = np.ones_like(harvest.mask)
+    return found if len(found.nodes) else mask_boundary(everything, harvest.grid)
+
+
+def drawn_levels(harvest: Harvest) -> tuple[float, float]:
+    """Grey levels of the reference that are drawn black and white."""
+    step = max(1, max(harvest.grid.shape) // 700)
+    low, high = np.percentile(harvest.reference[::step, ::step], _LEVELS)
+    return float(low), float(max(high, low + 1e-12))
+
+
+def grey_levels(image: NDArray[Any], levels: tuple[float, float]) -> NDArray[np.float32]:
+    """Grey levels of a photograph as 0 (black) to 1 (white)."""
+    low, high = map(np.float32, levels)
+    return np.clip((np.asarray(image, dtype=np.float32) - low) / (high - low), 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class PhotographReportData:
-    """A harvest with the frames that its maps are drawn in.
+class PhotographState(FittedState):
+    """A deformed photograph.
 
     Parameters
     ----------
-    harvest
-        What is shown.
+    harvest, frame
+        The test, and what was found in this photograph.
+    levels
+        Grey levels that are drawn black and white.
     """
 
     harvest: Harvest
-    _sheets: dict[int, MapFrame] = field(default_factory=dict, repr=False)
-
-    @cached_property
-    def shown(self) -> tuple[HarvestedFrame, ...]:
-        """The frames with pictures: those around buckling, and evenly spaced ones."""
-        frames, moments = self.harvest.frames, self.harvest.timeline
-        if len(frames) <= MOST_SHOWN:
-            return frames
-        has_pattern = [m.has_pattern for m in moments] if len(moments) == len(frames) else []
-        first = has_pattern.index(True) if True in has_pattern else 0
-        chosen = {max(0, first - 1), first, len(frames) - 1}
-        for k in np.linspace(0, len(frames) - 1, MOST_SHOWN).round().astype(int):
-            if len(chosen) < MOST_SHOWN:
-                chosen.add(int(k))
-        return tuple(frames[k] for k in sorted(chosen))
-
-    @cached_property
-    def outline(self) -> MeshBoundary:
-        """Of the material in the reference."""
-        harvest = self.harvest
-        found = mask_boundary(harvest.mask, harvest.grid, _SPECK * harvest.pitch**2)
-        return found if len(found.nodes) else mask_boundary(
-            np.ones_like(harvest.mask), harvest.grid)  # fmt: skip
-
-    def sheet(self, cells: int = SMOOTH) -> MapFrame:
-        """The frame of maps with about that many cells along the longer side."""
-        if cells not in self._sheets:
-            grid = self.harvest.grid
-            factor = max(1, round(max(grid.shape) / cells))
-            low, high = self.outline.nodes.min(axis=0), self.outline.nodes.max(axis=0)
-            margin = 0.012 * float((high - low).max())
-            limits = (low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
-            self._sheets[cells] = MapFrame(self.outline, grid.binned(factor), factor, limits)
-        return self._sheets[cells]
-
-    @cached_property
-    def levels(self) -> tuple[float, float]:
-        """Grey levels of the reference that are drawn black and white."""
-        step = max(1, max(self.harvest.grid.shape) // 700)
-        low, high = np.percentile(self.harvest.reference[::step, ::step], _LEVELS)
-        return float(low), float(max(high, low + 1e-12))
-
-    def grey(self, image: NDArray[Any]) -> NDArray[np.float32]:
-        """Grey levels of a photograph as 0 (black) to 1 (white)."""
-        low, high = self.levels
-        return np.clip((np.asarray(image, dtype=np.float32) - np.float32(low))
-                       / np.float32(high - low), 0.0, 1.0)  # fmt: skip
-
-    def seen(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:
-        """Values on a sheet; NaN off the material, where the ansatz means nothing."""
-        return np.where(self.material(cells), values, np.nan)
-
-    def material(self, cells: int = SMOOTH) -> BoolArray:
-        """Which cells of a sheet have material in the reference."""
-        sheet, mask = self.sheet(cells), self.harvest.mask
-        (rows, cols), n = sheet.grid.shape, sheet.factor
-        blocks = mask[: rows * n, : cols * n].reshape(rows, n, cols, n)
-        return np.asarray(blocks.any(axis=(1, 3)))
-
-    @staticmethod
-    def motion(frame: HarvestedFrame) -> DisplacementFunction:
-        """The displacement that was measured in a frame."""
-        result = frame.result
-        return lambda x, y: result.ansatz.displacement(result.unknowns, x, y)
+    frame: HarvestedFrame
+    levels: tuple[float, float]
 
 
-UM = 1e3  # micrometres in a millimetre
-Cause = Literal["noise", "model_error"]
-_NO_PATTERN = WavePattern((), None, "none", None, 0.0, ())
-_REACH = 0.75  # spacings of a local DIC from a point, within which a cell has its value
+def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[PhotographState]:
+    """The photographs that are shown, with their labels by name."""
+    shown = shown_frames(harvest)
+    view = SpecimenView(material_outline(harvest), harvest.grid, harvest.mask, harvest.pitch)
+    levels = drawn_levels(harvest)
+    pairs = [(frame.spectrum, frame.pattern or _NO_PATTERN) for frame in shown]
+    end = largest_density((spectrum, pattern) for spectrum, pattern in pairs if spectrum)
+
+    def densities(k: int) -> tuple[Spectrum, WavePattern, float]:
+        spectrum, pattern = pairs[k]
+        assert spectrum is not None
+        return spectrum, pattern, end
+
+    return [
+        PhotographState(str(k + 1), labels[frame.name], view, frame.result, partial(densities, k),
+                        harvest, frame, levels)
+        for k, frame in enumerate(shown)
+    ]  # fmt: skip
 
 
-def draw_deformed(atlas: PhotographReportData, frame: HarvestedFrame) -> Figure:
-    """Draw a deformed photograph, and over it the reference's outline moved as measured."""
-    sheet, motion = atlas.sheet(), atlas.motion(frame)
-    moved = sheet.moved_nodes(motion)
-    assert moved is not None
-    everywhere = np.ones(frame.image.shape, dtype=np.bool_)
-    drawn = fields.draw_image(sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, moved)
-    with style():
-        path = sheet.outline.path(moved)
-        axes, bar = drawn.axes
-        draw_path(axes, path, fill=False, ec=GOLD, lw=0.7, rasterized=True, zorder=2)
-        bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in atlas.levels])
-        bar.set_title("levels", fontsize=8, pad=6, loc="left")
-    return drawn
-
-
-def draw_spectrum(atlas: PhotographReportData, frame: HarvestedFrame, component: int) -> Figure:
-    """Draw S_xx (component 0) or S_yy (1); the colours end at the strongest pattern shown."""
-    assert frame.spectrum is not None
-    pairs = [(f.spectrum, f.pattern) for f in atlas.shown if f.spectrum and f.pattern]
-    end = max((pattern_density(*pair) for pair in pairs), default=0.0)
-    return draw_density(frame.spectrum, frame.pattern or _NO_PATTERN, component, end)
-
-
-def draw_part_spectrum(
-    atlas: PhotographReportData, frame: HarvestedFrame, part: int, component: int
-) -> Figure:
-    """Draw the same of a part with modes of its own; the colours are that part's."""
-    end = max(pattern_density(f.parts[part].spectrum, f.parts[part].pattern) for f in atlas.shown)
-    own = frame.parts[part]
-    return draw_density(own.spectrum, own.pattern, component, end)
-
-
-def draw_v0(atlas: PhotographReportData, frame: HarvestedFrame, component: int) -> Figure:
-    """Draw a component of the slow field."""
-    v0 = UM * frame.result.v0(atlas.sheet().grid)[..., component]
-    return fields.draw_field(atlas.sheet(), v0, ColourScale.signed(atlas.seen(v0), "µm"))
-
-
-def draw_amplitude(atlas: PhotographReportData, frame: HarvestedFrame, i: int) -> Figure:
-    """Draw v_i where phi_i is not zero; the colours end at the largest value among the holes."""
-    support = _support(atlas, frame, i)
-    v = UM * frame.result.v(i, atlas.sheet().grid)
-    inside = atlas.seen(np.where(support == 1.0, v, np.nan))
-    scale = replace(ColourScale.signed(inside, "µm"), extend="both")
-    return fields.draw_field(atlas.sheet(), np.where(support > 0.0, v, np.nan), scale)
-
-
-def draw_mode(atlas: PhotographReportData, frame: HarvestedFrame, i: int) -> Figure:
-    """Draw phi_i as a deformed outline over the undeformed one."""
-    result, scale = frame.result, mode_scale(atlas, frame, i)
-    return fields.draw_shape(
-        atlas.sheet(), lambda x, y: scale * result.ansatz.phi(i, result.unknowns, x, y)
-    )
-
-
-def mode_scale(atlas: PhotographReportData, frame: HarvestedFrame, i: int) -> float:
-    """By how much phi_i is drawn, for a largest displacement of SHAPE l [mm]."""
-    largest = float(np.linalg.norm(frame.result.phi(i, atlas.sheet().grid), axis=-1).max())
-    return DRAWN_SHAPE * atlas.harvest.pitch / largest if largest > 0 else 1.0
-
-
-def draw_fluctuation(
-    atlas: PhotographReportData, frame: HarvestedFrame, i: int, component: int
-) -> Figure:
-    """Draw a component of v_i phi_i in the deformed configuration of this contribution alone."""
-    result = frame.result
-    field = UM * result.fluctuation(i, atlas.sheet().grid)[..., component]
-    return fields.draw_field(
-        atlas.sheet(), field, ColourScale.signed(atlas.seen(field), "µm"),
-        lambda x, y: result.ansatz.fluctuation(i, result.unknowns, x, y),
-    )  # fmt: skip
-
-
-def draw_residual(atlas: PhotographReportData, frame: HarvestedFrame) -> Figure:
-    """Draw f - g(x + u) in the deformed configuration, single pixels."""
-    full = atlas.harvest.full_scale
-    values = np.asarray(_residual(atlas, frame) / (full or 1.0), dtype=np.float64)
-    scale = ColourScale.signed(values, "" if full else "levels", 0.99)
-    return fields.draw_field(atlas.sheet(FINE), values, scale, atlas.motion(frame))
-
-
-def draw_w(atlas: PhotographReportData, frame: HarvestedFrame) -> Figure:
-    """Draw the length of w = local DIC - IDIC in the deformed configuration."""
-    assert frame.local is not None
-    result = frame.result
-    w = frame.local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
-    cells = min(SMOOTH, max(40, int(max(atlas.harvest.grid.shape) * atlas.harvest.grid.pixel_size
-                                    / w.spacing)))  # fmt: skip
-    sheet = atlas.sheet(cells)
-    points = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
-    near, nearest = cKDTree(np.column_stack([w.x, w.y])[w.good]).query(points)
-    reach = _REACH * max(w.spacing, sheet.grid.pixel_size)
-    length = UM * np.linalg.norm(w.u[w.good], axis=1)[nearest]
-    length = np.where(near <= reach, length, np.nan)
-    scale = ColourScale.size(length, "µm", 0.998)
-    return fields.draw_field(sheet, length, scale, atlas.motion(frame))
-
-
-def draw_error(
-    atlas: PhotographReportData, frame: HarvestedFrame, field: str, cause: Cause
-) -> Figure:
-    """Draw the standard deviation of "v0", "v1", ... or "fluc1", ..., lengths of vector fields.
-
-    That of a vector is the root of the sum of both components' variances.
-    """
-    sheet = atlas.sheet(COARSE)
-    errors = frame.by_noise if cause == "noise" else frame.by_model_error
-    assert errors is not None
-    sd = UM * _resampled(frame, _sd(errors, field), sheet)
-    if field != "v0":
-        i = int(field.removeprefix("fluc").removeprefix("v")) - 1
-        sd = np.where(_support(atlas, frame, i, COARSE) > 0.0, sd, np.nan)
-    return fields.draw_field(sheet, sd, ColourScale.size(atlas.seen(sd, COARSE), "µm", 0.99))
-
-
-def draw_error_against_truth(
-    atlas: PhotographReportData, frame: HarvestedFrame, part: str
-) -> Figure:
-    """Draw a part of the error, in the deformed configuration.
-
-    "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
-    """
-    truth = atlas.harvest.truth
-    assert truth is not None
-    known, sheet = truth.frames[frame.name], atlas.sheet()
-    rows, cols = _pixels(sheet)
-    x, y = atlas.harvest.grid.x[cols], atlas.harvest.grid.y[rows]
-    fields_of = {
-        "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),
-        "best": lambda: known.best.ansatz.displacement(known.best.unknowns, x, y),
-        "idic": lambda: frame.result.ansatz.displacement(frame.result.unknowns, x, y),
-    }
-    first, second = {"true_w": ("truth", "idic"), "best": ("truth", "best"),
-                     "loss": ("best", "idic")}[part]  # fmt: skip
-    length = UM * np.linalg.norm(fields_of[first]() - fields_of[second](), axis=-1)
-    length = np.where(atlas.harvest.mask[np.ix_(rows, cols)], length, np.nan)
-    return fields.draw_field(
-        sheet, length, ColourScale.size(length, "µm", 0.998), atlas.motion(frame)
-    )
-
-
-def draw_hero(atlas: PhotographReportData) -> Figure:
-    """Let the last photograph dissolve into the pattern that was found in it."""
-    frame, sheet = atlas.harvest.frames[-1], atlas.sheet()
-    pattern = frame.result.displacement(sheet.grid)
-    if frame.modes:
-        pattern = pattern - frame.result.v0(sheet.grid)
+def draw_hero(state: PhotographState) -> Figure:
+    """Let a photograph dissolve into the pattern that was found in it."""
+    result, sheet = state.result, state.view.sheet()
+    pattern = result.displacement(sheet.grid)
+    if state.frame.modes:
+        pattern = pattern - result.v0(sheet.grid)
     length = UM * np.linalg.norm(pattern, axis=-1)
-    end = ColourScale.size(atlas.seen(length), "µm")
-    everywhere = np.ones(frame.image.shape, dtype=np.bool_)
-    drawn = fields.draw_blend(
-        sheet, atlas.grey(frame.image), everywhere, atlas.harvest.grid, length,
-        ColourScale(GLOW, 0.0, end.high, "µm"), atlas.motion(frame),
+    end = ColourScale.size(state.view.on_material(length), "µm")
+    everywhere = np.ones(state.frame.image.shape, dtype=np.bool_)
+    drawn = draw_blend(
+        sheet, grey_levels(state.frame.image, state.levels), everywhere, state.view.grid, length,
+        ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
     # The photograph ends where the measured outline does: a mask of it may have ragged edges.
     axes = drawn.axes[0]
@@ -278,12 +165,73 @@ def draw_hero(atlas: PhotographReportData) -> Figure:
     return drawn
 
 
-def _support(
-    atlas: PhotographReportData, frame: HarvestedFrame, i: int, cells: int = SMOOTH
-) -> FloatArray:
-    """Taper of mode i on a sheet [-]."""
-    taper, grid = frame.result.ansatz.modes[i].taper, atlas.sheet(cells).grid
-    return np.asarray(taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :])
+def draw_deformed(state: PhotographState) -> Figure:
+    """Draw a deformed photograph, and over it the reference's outline moved as measured."""
+    sheet = state.view.sheet()
+    moved = sheet.moved_nodes(state.motion)
+    assert moved is not None
+    image, everywhere = state.frame.image, np.ones(state.frame.image.shape, dtype=np.bool_)
+    drawn = draw_image(sheet, grey_levels(image, state.levels), everywhere, state.view.grid, moved)
+    axes, bar = drawn.axes
+    draw_path(axes, sheet.outline.path(moved), fill=False, ec=GOLD, lw=0.7, rasterized=True,
+              zorder=2)  # fmt: skip
+    bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in state.levels])
+    bar.set_title("levels", fontsize=8, pad=6, loc="left")
+    return drawn
+
+
+def draw_closeup(state: PhotographState) -> Figure:
+    """Draw some cells of a deformed photograph, pixel by pixel, with the outline as measured."""
+    grid, middle = state.view.grid, np.array(state.harvest.cellular.centre)
+    x, y = middle + state.motion(*middle[:, None, None])[0, 0]
+    half = 0.5 * CLOSE * state.view.pitch
+    corners = grid.to_px([x - half, x + half], [y + half, y - half])
+    (top, bottom), (left, right) = (
+        np.clip(np.rint(edge).astype(int), 0, size - 1)
+        for edge, size in zip(corners, grid.shape, strict=True)
+    )
+    part = grey_levels(state.frame.image[top : bottom + 1, left : right + 1], state.levels)
+    x0, y0 = map(float, grid.to_mm(top, left))
+    extent = PixelGrid(bottom + 1 - top, right + 1 - left, grid.pixel_size, x0, y0).extent
+    drawn = figure(WIDTH, WIDTH)
+    axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.imshow(part, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, rasterized=True,
+                interpolation="antialiased", aspect="auto")  # fmt: skip
+    path = state.view.outline.path(state.view.sheet().moved_nodes(state.motion))
+    draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    return drawn
+
+
+def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Figure:
+    """S_xx or S_yy of a part with modes of its own; the colours are that part's."""
+    parts = [frame.parts[part] for frame in shown_frames(state.harvest)]
+    end = largest_density([(p.spectrum, p.pattern) for p in parts])
+    own = state.frame.parts[part]
+    return draw_density(own.spectrum, own.pattern, component, end)
+
+
+def draw_residual(state: PhotographState) -> Figure:
+    """Draw f - g(x + u) in the deformed configuration, single pixels."""
+    full, sheet = state.harvest.full_scale, state.view.sheet(FINE)
+    values = np.asarray(_residual(state, sheet) / (full or 1.0), dtype=np.float64)
+    scale = ColourScale.signed(values, "" if full else "levels", 0.99)
+    return draw_field(sheet, values, scale, state.motion)
+
+
+def _residual(state: PhotographState, sheet: MapFrame) -> FloatArray:
+    """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
+    harvest, ansatz, a = state.harvest, state.result.ansatz, state.result.unknowns
+    rows, cols = _pixels(sheet)
+    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
+    u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
+    spline = SplineImage.of(np.asarray(state.frame.image), state.result.order)
+    value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
+    gain, offset = ansatz.gain_and_offset(a, x, y)
+    picked = np.ix_(rows, cols)
+    residual = harvest.reference[picked] - gain * value - offset
+    return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
 
 
 def _pixels(sheet: MapFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -293,18 +241,34 @@ def _pixels(sheet: MapFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows, cols
 
 
-def _residual(atlas: PhotographReportData, frame: HarvestedFrame) -> FloatArray:
-    """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
-    harvest, ansatz, a = atlas.harvest, frame.result.ansatz, frame.result.unknowns
-    rows, cols = _pixels(atlas.sheet(FINE))
-    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
-    u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
-    spline = SplineImage.of(np.asarray(frame.image), frame.result.order)
-    value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
-    gain, offset = ansatz.gain_and_offset(a, x, y)
-    picked = np.ix_(rows, cols)
-    residual = harvest.reference[picked] - gain * value - offset
-    return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
+def draw_w(state: PhotographState) -> Figure:
+    """Draw the length of w = local DIC - IDIC in the deformed configuration."""
+    local, result, grid = state.frame.local, state.result, state.view.grid
+    assert local is not None
+    w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
+    cells = min(SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
+    sheet = state.view.sheet(cells)
+    points = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
+    near, nearest = cKDTree(np.column_stack([w.x, w.y])[w.good]).query(points)
+    reach = _REACH * max(w.spacing, sheet.grid.pixel_size)
+    length = np.linalg.norm(w.u[w.good], axis=1)[nearest]
+    return draw_length(state, np.where(near <= reach, length, np.nan), cells)
+
+
+def draw_error(state: PhotographState, field: str, cause: Cause) -> Figure:
+    """Draw the standard deviation of "v0", "v1", ... or "fluc1", ..., lengths of vector fields.
+
+    That of a vector is the root of the sum of both components' variances.
+    """
+    sheet, frame = state.view.sheet(COARSE), state.frame
+    errors = frame.by_noise if cause == "noise" else frame.by_model_error
+    assert errors is not None
+    sd = UM * _resampled(frame, _sd(errors, field), sheet)
+    if field != "v0":
+        i = int(field.removeprefix("fluc").removeprefix("v")) - 1
+        sd = np.where(state.support(i, COARSE) > 0.0, sd, np.nan)
+    scale = ColourScale.size(state.view.on_material(sd, COARSE), "µm", 0.99)
+    return draw_field(sheet, sd, scale)
 
 
 def _sd(errors: FieldErrors, field: str) -> FloatArray:
@@ -326,3 +290,168 @@ def _resampled(frame: HarvestedFrame, sd: FloatArray, sheet: MapFrame) -> FloatA
     )  # fmt: skip
     y, x = np.meshgrid(sheet.grid.y, sheet.grid.x, indexing="ij")
     return np.asarray(np.maximum(between((y, x)), 0.0))
+
+
+def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
+    """Draw a part of the error, in the deformed configuration.
+
+    "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
+    """
+    harvest, sheet = state.harvest, state.view.sheet()
+    assert harvest.truth is not None
+    known = harvest.truth.frames[state.frame.name]
+    rows, cols = _pixels(sheet)
+    x, y = harvest.grid.x[cols], harvest.grid.y[rows]
+    fields: dict[str, Callable[[], FloatArray]] = {
+        "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),
+        "best": lambda: known.best.ansatz.displacement(known.best.unknowns, x, y),
+        "idic": lambda: state.result.ansatz.displacement(state.result.unknowns, x, y),
+    }
+    first, second = {"true_w": ("truth", "idic"), "best": ("truth", "best"),
+                     "loss": ("best", "idic")}[part]  # fmt: skip
+    length = np.linalg.norm(fields[first]() - fields[second](), axis=-1)
+    return draw_length(state, np.where(harvest.mask[np.ix_(rows, cols)], length, np.nan))
+
+
+WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
+_LEGEND = 0.26  # [in]
+_PIXELS = 1000  # along the longer side
+_CELLS, _ARROWS = 120, 17  # of a distortion's map, along the longer side
+_LENGTH = 0.9  # of the longest arrow, distances between arrows
+
+
+def draw_reference(harvest: Harvest, outline: MeshBoundary, levels: tuple[float, float]) -> Figure:
+    """Draw the reference and all that was found in it, for a look whether that is right."""
+    drawn, axes = _picture(harvest.grid, WIDE, _LEGEND)
+    factor = max(1, round(max(harvest.grid.shape) / _PIXELS))
+    cells = harvest.grid.binned(factor)
+    rows, cols = cells.shape
+    part = grey_levels(harvest.reference, levels)[: rows * factor, : cols * factor]
+    joined = part.reshape(rows, factor, cols, factor).mean(axis=(1, 3))
+    axes.imshow(joined, extent=cells.extent, cmap=GREY, vmin=0.0, vmax=1.0,
+                interpolation="antialiased", rasterized=True, aspect="auto")  # fmt: skip
+    axes.set(xlim=harvest.grid.extent[:2], ylim=harvest.grid.extent[2:])
+    draw_path(axes, outline.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
+    shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
+    if harvest.lattice is not None:
+        shown += _draw_lattice(axes, harvest.lattice, harvest.grid)
+    shown.append(_draw_box(axes, harvest.cellular))
+    axes.legend(handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown),
+                frameon=False, fontsize=7.5, handlelength=1.6, columnspacing=1.4,
+                borderaxespad=0.1)  # fmt: skip
+    return drawn
+
+
+def draw_distortion(distortion: Distortion, grid: PixelGrid) -> Figure:
+    """Draw the length of S in colour and S itself as arrows, enlarged.
+
+    Parameters
+    ----------
+    distortion
+        Of the optics.
+    grid
+        The images' pixels.
+    """
+    rows, cols = _positions(grid, _CELLS)
+    down, right = distortion.shift(rows, cols)
+    drawn, axes, scale = _coloured(grid, np.hypot(down, right))
+    rows, cols = _positions(grid, _ARROWS)
+    down, right = np.broadcast_arrays(*distortion.shift(rows, cols))
+    row, col = np.broadcast_arrays(rows, cols)
+    longest = float(np.hypot(down, right).max())
+    step = max(grid.shape) / _ARROWS
+    enlarged = _LENGTH * step / longest if longest > 0 else 1.0
+    axes.quiver(col, row, enlarged * right, enlarged * down, angles="xy", scale_units="xy",
+                scale=1.0, width=0.0035, color="white", pivot="mid")  # fmt: skip
+    colour_bar(drawn, axes, scale)
+    return drawn
+
+
+def draw_distortion_sd(calibration: Calibration, grid: PixelGrid) -> Figure:
+    """Draw the standard deviation of S by the photographs' noise, both components together."""
+    sd = np.hypot(*calibration.sd(*_positions(grid, _CELLS)))
+    drawn, axes, scale = _coloured(grid, sd)
+    colour_bar(drawn, axes, scale)
+    return drawn
+
+
+def draw_distortion_error(found: Distortion, true: Distortion, grid: PixelGrid) -> Figure:
+    """Draw the length of S_found - S_true without its affine part, which can't be observed."""
+    drawn, axes, scale = _coloured(grid, np.hypot(*unaffine(found, true, grid)))
+    colour_bar(drawn, axes, scale)
+    return drawn
+
+
+def unaffine(found: Distortion, true: Distortion, grid: PixelGrid) -> FloatArray:
+    """(2, n, m) S_found - S_true [px] on a coarse grid over the image, its affine part removed."""
+    rows, cols = _positions(grid, _CELLS)
+    pairs = zip(found.shift(rows, cols), true.shift(rows, cols), strict=True)
+    difference = np.stack([np.broadcast_arrays(a - b, rows + cols)[0] for a, b in pairs])
+    row, col = np.broadcast_arrays(rows, cols)
+    basis = np.stack([np.ones(row.size), row.ravel(), col.ravel()], axis=1)
+    flat = difference.reshape(2, -1).T
+    left = flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]
+    return np.asarray(left.T.reshape(difference.shape))
+
+
+def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
+    """Middles of about ``count`` cells along the image's longer side, as an open grid [px]."""
+    step = max(grid.shape) / count
+    rows, cols = (max(2, round(size / step)) for size in grid.shape)
+    along_row = (np.arange(rows) + 0.5) * grid.rows / rows - 0.5
+    along_col = (np.arange(cols) + 0.5) * grid.cols / cols - 0.5
+    return along_row[:, None], along_col[None, :]
+
+
+def _picture(grid: PixelGrid, width: float, above: float, share: float = 1.0
+             ) -> tuple[Figure, Axes]:  # fmt: skip
+    """An empty picture for the whole image, over this share of its width; room above [in]."""
+    tall = share * width * grid.rows / grid.cols
+    height = tall + above + 0.04
+    drawn = figure(width, height)
+    axes = drawn.add_axes((0.002, 0.02 / height, 0.996 * share, tall / height))
+    axes.set_axis_off()
+    return drawn, axes
+
+
+def _coloured(grid: PixelGrid, length: FloatArray) -> tuple[Figure, Axes, ColourScale]:
+    """A map of lengths [px] over the whole image, in its own frame: columns right, rows down."""
+    drawn, axes = _picture(grid, NARROW, 0.26, 0.77)
+    scale = ColourScale.size(length, "px")
+    axes.imshow(length, extent=(-0.5, grid.cols - 0.5, grid.rows - 0.5, -0.5), cmap=SIZE,
+                norm=scale.normalise, interpolation="bilinear", rasterized=True,
+                aspect="auto")  # fmt: skip
+    axes.set(xlim=(-0.5, grid.cols - 0.5), ylim=(grid.rows - 0.5, -0.5))
+    return drawn, axes, scale
+
+
+def _draw_box(axes: Axes, box: Box) -> Line2D:
+    """The part of the specimen that has holes."""
+    axes.add_patch(Rectangle((box.x_min, box.y_min), box.x_max - box.x_min, box.y_max - box.y_min,
+                             fill=False, ec=RED, lw=1.3, ls=(0, (4, 2))))  # fmt: skip
+    return Line2D([], [], color=RED, lw=1.3, ls=(0, (3, 1.5)), label="part with holes")
+
+
+def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Line2D]:
+    """Holes, the straight lattice through them, and what does not fit."""
+    (i0, j0), (i1, j1) = lattice.index.min(axis=0), lattice.index.max(axis=0)
+    ends = [((i, j0), (i, j1)) for i in range(i0, i1 + 1)]
+    ends += [((i0, j), (i1, j)) for j in range(j0, j1 + 1)]
+    lines = [np.stack(_to_mm(lattice.position(pair), grid), axis=1) for pair in ends]
+    axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.7, alpha=0.9))
+    said = [Line2D([], [], color=BLUE, lw=1.0, label="lattice")]
+    kinds = (
+        (lattice.centres, "o", GREEN, f"{len(lattice)} holes"),
+        (lattice.position(lattice.missing), "x", RED, f"{len(lattice.missing)} missing"),
+        (lattice.extra, "s", INK, f"{len(lattice.extra)} not on it"),
+    )
+    for at, marker, colour, name in kinds:
+        if len(at):
+            dots = axes.plot(*_to_mm(at, grid), marker, color=colour, ms=3.0, mew=1.0, ls="none",
+                             label=name)  # fmt: skip
+            said += dots
+    return said
+
+
+def _to_mm(at: FloatArray, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
+    return grid.to_mm(at[..., 0], at[..., 1])

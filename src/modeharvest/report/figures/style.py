@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_mixed import MixedModeRenderer
 from matplotlib.backends.backend_svg import RendererSVG
-from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
@@ -32,6 +32,8 @@ INK, MUTED = "#010204", "#010305"
 """Stand-ins for the page's colours of text and of secondary text."""
 BLUE, RED, GREEN, GOLD = "#3987e5", "#e0603f", "#2a9d74", "#d99a1f"
 """For curves; of a middle lightness, to be read on light and on dark."""
+COLOURS = (BLUE, RED, GREEN, GOLD)
+"""Of curves side by side, in this order."""
 EDGE = "#70757d"
 """For outlines."""
 DPI = 260
@@ -118,6 +120,12 @@ SIZE = mpl.colormaps["viridis"]
 DENSITY = mpl.colormaps["magma"]
 GLOW = mpl.colormaps["inferno"]
 GREY = mpl.colormaps["gray"]
+_MANY = (*COLOURS, *map(to_hex, mpl.colormaps["tab10"].colors[4:]))  # type: ignore[attr-defined]
+
+
+def colour(n: int) -> str:
+    """Of the n-th curve, "#rrggbb"; the same in all pictures of a page."""
+    return _MANY[n % len(_MANY)]
 
 
 def draw_path(axes: Axes, path: Path, **looks: Any) -> PathPatch:

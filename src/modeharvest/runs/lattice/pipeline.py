@@ -169,12 +169,13 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         done = self._finished()
 
         def work() -> tuple[Path, ...]:
-            from modeharvest.report.lattice import write_lattice_report
+            from modeharvest.report.lattice import lattice_report
+            from modeharvest.report.model import write_page
 
             run = self._run(done)
-            write_lattice_report(page, run, self.progress)
-            found = self._found_patterns() if "families" in done else []
-            write_json(path, summary_of(run, self.case, found))
+            summary = summary_of(run, self._found_patterns() if "families" in done else [])
+            write_page(lattice_report(summary, run), page, self.progress)
+            write_json(path, summary)
             return path, page
 
         key = stage_key([done, self.case.title, self.source])

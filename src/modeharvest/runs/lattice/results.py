@@ -59,7 +59,6 @@ from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
-from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
@@ -299,16 +298,14 @@ def exports_in(folder: Path) -> dict[str, str]:
     return {**known, **{file: f"{_FAMILY}: {of}" for file, of in families.items()}}
 
 
-def summary_of(
-    run: LatticeRun, case: LatticeCase, families: Sequence[FoundPattern]
-) -> dict[str, Any]:
+def summary_of(run: LatticeRun, families: Sequence[FoundPattern]) -> dict[str, Any]:
     """The content of ``summary.json``."""
-    (critical,) = run.critical
+    critical = run.critical[0] if run.critical else None
     return {
         "title": run.title,
-        "case": case.plain(),
-        "outcome": critical.outcome,
-        "critical": _critical(critical),
+        "case": dict(run.case),
+        "outcome": critical.outcome if critical else "",
+        "critical": _critical(critical) if critical else None,
         **_eigenvalues(run.dispersion),
         "modes": None if run.modes is None else _modes(run.modes),
         "branches": [_branch(branch) for branch in run.branches],

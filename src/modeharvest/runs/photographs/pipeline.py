@@ -167,11 +167,13 @@ class HarvestRun(StagedRun[PhotographCase]):
         with exclusive(self.folder):
             require_writable(self.folder)
             self.results()
-            from modeharvest.report.photographs import write_harvest_report
+            from modeharvest.report.model import write_page
+            from modeharvest.report.photographs import photographs_report
 
             harvest = self.harvest(truth)
             summary = harvest_summary(harvest)
-            write_harvest_report(self.folder / "report.html", harvest, summary, self.progress)
+            report = photographs_report(summary, harvest)
+            write_page(report, self.folder / "report.html", self.progress)
             write_json(self.folder / "summary.json", summary)
         return summary
 
