@@ -142,7 +142,7 @@ def _sets(folder: Path) -> dict[str, Subject]:
 
     prepared = {
         "names": ["a", "b"], "skipped": [["c", "blank"]], "noise": {"sd": 1.5, "source": "repeats"},
-        "grid": asdict(GRID),
+        "grid": asdict(GRID), "full_scale": 255.0, "notes": ["cropped"],
     }  # fmt: skip
     (folder / "prepared.json").write_text(json.dumps(prepared, indent=2), "utf-8")
 
