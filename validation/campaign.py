@@ -84,14 +84,7 @@ class Campaign:
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``.
 
-        Lists are left in the cases' files.
-
-        Parameters
-        ----------
-        workers
-            Who; two processes of this machine by default.
-        progress
-            Listener.
+        Lists are left in the cases' files. By default two processes of this machine do the work.
 
         Raises
         ------
@@ -227,12 +220,7 @@ class _Outcome(Enum):
 def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
     """All combinations of some values, each on top of a base case.
 
-    Parameters
-    ----------
-    base
-        The values of all keys.
-    axes
-        The values that keys run through; the last runs fastest.
+    ``axes``: the values that keys of the base run through; the last runs fastest.
 
     Raises
     ------

@@ -19,19 +19,9 @@ _FIT = 3
 class ImageAmplitude:
     """One image of a test.
 
-    Parameters
-    ----------
-    name
-        Of the image.
-    strain
-        Mean nominal compression of the cellular part, from v0 [-].
-    amplitude_px
-        Rms of v1 phi1 per component [px]; of several modes the root of their squares' sum.
-    model_error_px
-        Model error, rms per component [px].
-    noise_px
-        Standard deviation of v1 phi1 by the images' noise, rms per component [px]; of several
-        modes as above.
+    ``strain``: mean nominal compression of the cellular part, from v0 [-]. The others are rms per
+    component [px]: ``amplitude_px`` of v1 phi1 (of several modes the root of their squares' sum),
+    ``model_error_px``, and ``noise_px``, the standard deviation of v1 phi1 by the images' noise.
     """
 
     name: str
@@ -73,13 +63,6 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     """Mean nominal compression along x and y of a part of the specimen [-].
 
     The shortening between its opposite edges by v0, averaged along them, over their distance.
-
-    Parameters
-    ----------
-    result
-        Of a correlation.
-    cellular
-        The part [mm].
     """
     along = np.linspace(0.02, 0.98, 33)
     x = cellular.x_min + along * (cellular.x_max - cellular.x_min)
@@ -95,12 +78,9 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
 
 
 def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
-    """When the pattern appeared in a sequence of images.
+    """When the pattern appeared in a sequence of images, in the order of the test.
 
-    Parameters
-    ----------
-    moments
-        In the order of the test; a sequence that unloads again is read up to its largest strain.
+    A sequence that unloads again is read up to its largest strain.
     """
     nan = float("nan")
     last = int(np.argmax([m.strain for m in moments])) if moments else -1

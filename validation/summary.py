@@ -225,16 +225,8 @@ def _after(snapshot: SnapshotSummary) -> list[Expectation]:
 class MeasuredExperiment:
     """What is to be assessed.
 
-    Parameters
-    ----------
-    experiment
-        What was simulated: geometry, material, strains.
-    options
-        Of the correlation.
-    solution, images
-        Where the truth comes from.
-    results
-        What IDIC found, by nominal strain.
+    ``options`` of the correlation; the truth comes from ``solution`` and ``images``; ``results``: what
+    IDIC found, by nominal strain.
     """
 
     experiment: Experiment

@@ -85,22 +85,10 @@ class ErrorParts:
 class Comparison:
     """Truth, measurement and best possible fit of one snapshot, in the reference frame.
 
-    Parameters
-    ----------
-    strain
-        Nominal strain [-].
-    grid
-        The pixels.
-    mask
-        (rows, cols) True on material of the reference image.
-    displacement
-        (rows, cols, 2) the truth [mm]; NaN outside the mask.
-    result
-        What IDIC found.
-    best
-        The best fit of the same ansatz to the truth.
-    residual
-        (rows, cols) f - g(x + u) [grey levels, fraction of full scale]; NaN where not compared.
+    ``strain``: nominal [-]. ``mask``: (rows, cols) True on material of the reference image.
+    ``displacement``: (rows, cols, 2) the truth [mm]; NaN outside the mask. ``best``: the best fit of
+    the result's ansatz to it. ``residual``: (rows, cols) f - g(x + u) [grey levels, fraction of full
+    scale]; NaN where not compared.
     """
 
     strain: float
@@ -164,17 +152,9 @@ def compare(
 ) -> Comparison:  # fmt: skip
     """Set a result against the truth of its image set.
 
-    Parameters
-    ----------
-    images, strain
-        The set that the result was measured on, and which of its snapshots [-].
-    result
-        The measurement.
-    start
-        (n,) unknowns that the measurement started from: the best fit is searched from there
-        and from the result, and the better of the two is taken.
-    camera
-        Whether the quantised images were measured.
+    ``start``: (n,) unknowns that the measurement started from; the best fit is searched from there
+    and from the result, and the better of the two is taken. ``camera``: whether the quantised
+    images were measured.
     """
     grid, mask, ansatz = images.grid, images.mask(), result.ansatz
     truth = images.truth(strain).displacement

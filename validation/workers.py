@@ -60,10 +60,7 @@ def plain_row(result: Any) -> dict[str, Any]:
 def leave(content: Mapping[str, Any], folder: Path, path: str) -> str:
     """Leave in a campaign's folder what cases read, under its digest; returns that, their name.
 
-    Parameters
-    ----------
-    path
-        Of the file in the folder, with {} for the name.
+    ``path``: of the file in the folder, with {} for the name.
     """
     name = digest(content)[:16]
     write_json(folder / path.format(name), content)
@@ -75,16 +72,8 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
 
     Dask has a case run again whose worker dies before the campaign has heard that it is done.
 
-    Parameters
-    ----------
-    function
-        "package.module:name".
-    case
-        What to run it with.
-    folder
-        The campaign's, absolute: a worker elsewhere has another current one.
-    code
-        Digest of modeharvest's where the campaign was begun.
+    ``folder``: the campaign's, absolute, as a worker elsewhere has another current one; ``code``:
+    digest of modeharvest's where the campaign was begun.
 
     Raises
     ------
@@ -200,13 +189,6 @@ class Workers:
     def require_ready(self, function: str, folder: Path) -> None:
         """Recognise workers elsewhere that can't do the work, before anything is computed for them.
 
-        Parameters
-        ----------
-        function
-            "package.module:name" of what they will run.
-        folder
-            Where its results go.
-
         Raises
         ------
         InputError
@@ -220,11 +202,6 @@ class Workers:
     @contextmanager
     def client(self, function: str, folder: Path) -> Iterator[Any]:
         """A dask client of the workers, which end with it if they are of this machine.
-
-        Parameters
-        ----------
-        function, folder
-            As for :meth:`require_ready`.
 
         Raises
         ------

@@ -72,12 +72,8 @@ class Columns:
 class Attenuation:
     """A field's curve T over the period.
 
-    Parameters
-    ----------
-    columns
-        T at every column, from all rows within half a period of the centre.
-    centre
-        The same from the centre row, or the row next to it, alone.
+    ``columns``: from all rows within half a period of the centre; ``centre``: from the centre row,
+    or the row next to it, alone.
     """
 
     columns: Columns
@@ -85,14 +81,7 @@ class Attenuation:
 
     @classmethod
     def of(cls, star: Star, field: LocalField) -> Attenuation:
-        """Read the curve off a field.
-
-        Parameters
-        ----------
-        star
-            The wave.
-        field
-            In px, on the star's grid.
+        """Read the curve off a field in px, on the star's grid.
 
         Raises
         ------

@@ -38,14 +38,8 @@ _SPARSE = 2
 class ResolutionSpec:
     """What a resolution study measures.
 
-    Parameters
-    ----------
-    buckled
-        The base motion and its images.
-    measured
-        Degrees of v0 and v1 that images are measured with.
-    amplitude_px, noise
-        Of a wave [px], and standard deviation in each image [fraction of full scale].
+    ``measured``: degrees of v0 and v1 that images are measured with; ``amplitude_px``: of a wave [px];
+    ``noise``: standard deviation in each image [fraction of full scale].
     """
 
     buckled: BuckledMotion
@@ -185,20 +179,8 @@ class InverseMotion:
 class BuckledMotion:
     """A base motion and how it is imaged and correlated.
 
-    Parameters
-    ----------
-    specimen
-        The undeformed geometry.
-    how
-        Options of the correlation; its degrees are varied.
-    speckle
-        The pattern on it.
-    pixel_size
-        [mm].
-    strain
-        Nominal compression along x [-].
-    pattern
-        v1, the same everywhere [mm].
+    ``how``: options of the correlation, whose degrees are varied; ``pixel_size`` [mm]; ``strain``:
+    nominal compression along x [-]; ``pattern``: v1, the same everywhere [mm].
     """
 
     specimen: Specimen

@@ -12,7 +12,7 @@ its shape functions rather than the choice of w. Sources: M. Grédiac, B. Blaysa
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.typed import to_plain
 from modeharvest.validation.resolution.attenuation import Attenuation
 from modeharvest.validation.resolution.star import KEPT, Star, StarSet
 
@@ -76,7 +77,7 @@ def grade_numbers(grade: StarGrade) -> dict[str, Any]:
         "shortest_px": float(found.period[0]),
         "longest_px": float(found.period[-1]),
     }
-    return {key: _none_for_nan(value) for key, value in row.items()}
+    return {key: to_plain(value) for key, value in row.items()}
 
 
 def star_summary(grading: StarGrading) -> dict[str, Any]:
@@ -88,8 +89,8 @@ def star_summary(grading: StarGrading) -> dict[str, Any]:
         curve = {"period_px": found.period, "left": share, "standard_error": error}
         codes.append({
             **grade_numbers(grade),
-            "noise": None if grade.noise is None else asdict(grade.noise),
-            "curve": {k: [_none_for_nan(float(v)) for v in values] for k, values in curve.items()},
+            "noise": to_plain(grade.noise),
+            "curve": to_plain(curve),
         })  # fmt: skip
     star_set = grading.star_set
     return {"format": RESOLUTION_FORMAT, "benchmark": star_set.id, "spec": star_set.info["spec"],
@@ -104,11 +105,6 @@ def star_csv_lines(grades: Sequence[StarGrade]) -> Iterator[str]:
         values = [row[key] for key in GRADE_COLUMNS.values()]
         cells = ["" if v is None else f"{v:.6g}" for v in values]
         yield ",".join([f'"{grade.name}"', *cells])
-
-
-def _none_for_nan(value: Any) -> Any:
-    """NaN as None, which JSON knows."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 _PARTS = 10
@@ -180,14 +176,8 @@ class NoiseFloor:
 class StarGrade:
     """A code's grade.
 
-    Parameters
-    ----------
-    star
-        The wave.
-    moved
-        The field of the deformed image, in px on the star's grid.
-    still
-        The field without motion; None if there is none.
+    ``moved`` and ``still``: the fields of the deformed image and without motion, None if there is
+    none, in px on the star's grid.
     """
 
     star: Star

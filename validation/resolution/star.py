@@ -161,15 +161,7 @@ def fine_speckle(seed: int = 0) -> SpeckleSpec:
 
 @dataclass(frozen=True, eq=False)
 class StarImages:
-    """The exact images of a star.
-
-    Parameters
-    ----------
-    star
-        The wave.
-    speckle
-        What moves with it.
-    """
+    """The exact images of a star."""
 
     star: Star = field(default_factory=Star)
     speckle: SpeckleSpec = field(default_factory=fine_speckle)
@@ -271,17 +263,7 @@ class StarSpec:
 
 @dataclass(frozen=True, eq=False)
 class StarSet:
-    """A star set in its folder.
-
-    Parameters
-    ----------
-    folder
-        Where it is.
-    spec
-        What it holds.
-    info
-        The content of its ``star.json``.
-    """
+    """A star set in its folder."""
 
     folder: Path
     spec: StarSpec
@@ -309,17 +291,7 @@ class StarSet:
 
 
 def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silent) -> StarSet:
-    """Write a star set; a whole one of the same spec is left as it is.
-
-    Parameters
-    ----------
-    spec
-        What to make.
-    folder
-        Where; made if it does not exist.
-    progress
-        Listener.
-    """
+    """Write a star set; a whole one of the same spec is left as it is."""
     folder = Path(folder)
     if not _is_whole(folder, spec):
         (folder / SIDECAR).unlink(missing_ok=True)

@@ -86,14 +86,9 @@ def savitzky_golay(width: int, degree: int) -> tuple[FloatArray, FloatArray]:
 
 
 def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high: float) -> float:
-    """The period above which a transfer stays at 0.9 or more.
+    """The period between ``low`` and ``high`` above which a transfer stays at 0.9 or more.
 
-    Parameters
-    ----------
-    transfer
-        From periods (n,) to T (n,).
-    low, high
-        Where to look; in the periods' unit.
+    ``transfer``: from periods (n,) to T (n,).
 
     Raises
     ------
@@ -116,10 +111,7 @@ def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high
 class PartFields:
     """Changes of the displacement in the parts of an ansatz, at points.
 
-    Parameters
-    ----------
-    v0, v1
-        (points, 2, waves): of v0 and of v1 phi1 [mm].
+    ``v0`` and ``v1``: (points, 2, waves) of v0 and of v1 phi1 [mm].
     """
 
     v0: FloatArray
@@ -139,12 +131,7 @@ class PartFields:
 class TangentFit:
     """An ansatz with one mode near some unknowns.
 
-    Parameters
-    ----------
-    ansatz, unknowns
-        The kinematics, and (n,) where.
-    points
-        (m, 2) of the material that the fit counts [mm].
+    ``points``: (m, 2) of the material that the fit counts [mm].
     """
 
     ansatz: Ansatz

@@ -98,12 +98,7 @@ SECRETS = ("solution*", "truth*", "images*", "stages.json", "*.h5", "*.vtu", "*.
 class BenchmarkTruth:
     """The truth behind a set of images.
 
-    Parameters
-    ----------
-    folder
-        Where it is.
-    info
-        The content of its ``benchmark.json``.
+    ``info``: the content of its ``benchmark.json``.
     """
 
     folder: Path
@@ -165,18 +160,10 @@ class BenchmarkTruth:
         return locate(mesh.nodes, mesh.cells, mesh.element, self.grid).mask
 
     def displacement(self, strain: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Displacement at any points of the reference, by the element that each lies in.
+        """(n, 2) displacement at points of the reference, by the element that each lies in [mm].
 
-        Parameters
-        ----------
-        strain
-            Nominal strain of the deformed image [-].
-        x, y
-            (n,) positions [mm].
-
-        Returns
-        -------
-        (n, 2) [mm]; NaN beside the material, and where a position is.
+        NaN beside the material, and where a position is. ``strain``: of the deformed image [-];
+        ``x, y``: (n,) [mm].
 
         Raises
         ------

@@ -125,19 +125,11 @@ def check_conventions(
 ) -> tuple[Reading, tuple[str, ...]]:
     """What a field means: as declared, or with the fewest changes that explain its errors.
 
-    Parameters
-    ----------
-    field
-        As declared.
-    truth
-        The true displacement anywhere.
-    grid
-        The reference image's pixels.
+    ``field`` as declared, ``grid``: the reference image's pixels.
 
     Returns
     -------
-    The reading, and a sentence about it; none if it is the declared one, or if there are too few
-    points to tell.
+    The reading, and a sentence about it; none if it is the declared one, or points are too few.
 
     Raises
     ------
@@ -258,14 +250,8 @@ def _in_deformed_positions(reading: Reading) -> Reading:
 class _FieldSample:
     """Some of a field's points, with the errors of readings of them.
 
-    Parameters
-    ----------
-    x, y, u
-        (n,), (n,), (n, 2) as declared [mm].
-    truth
-        The true displacement anywhere.
-    unit
-        A pixel [mm].
+    ``x``, ``y`` (n,) and ``u`` (n, 2) as declared [mm]; ``truth``: the true displacement anywhere;
+    ``unit``: a pixel [mm].
     """
 
     def __init__(

@@ -60,12 +60,8 @@ def read_measured(
     ----------
     path
         CSV, NPZ, HDF5, MAT; VTK or VTU with a vector named u or displacement at its points.
-    grid
-        The benchmark's pixels.
-    benchmark
-        Its id.
-    declared
-        What the file doesn't say.
+    grid, benchmark
+        The benchmark's pixels, and its id.
 
     Raises
     ------

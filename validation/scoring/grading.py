@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.util.typed import to_plain
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.score import (
     ENOUGH_COVERED,
@@ -28,24 +29,10 @@ EVERYWHERE, COMMON = "everywhere", "where all measure"
 class Grading:
     """Graded fields of one deformed image.
 
-    Parameters
-    ----------
-    truth
-        What they are graded by.
-    strain
-        Of the image [-].
-    edge_px
-        Width of the region of edges [px].
-    labels
-        (rows, cols) of :func:`modeharvest.validation.scoring.score.regions`.
-    scores
-        The best first.
-    spectra
-        Of each field's error, by its name; None where it has none.
-    remarks
-        Probable errors in what was declared.
-    refused
-        By its file's name, why a field was not graded.
+    ``strain`` of the image [-]; ``edge_px``: width of the region of edges [px]; ``labels``:
+    (rows, cols) of :func:`~modeharvest.validation.scoring.score.regions`; ``scores``, the best first;
+    ``spectra`` of each field's error, by its name; ``remarks``: probable errors in what was declared;
+    ``refused``: by its file's name, why a field was not graded.
     """
 
     truth: BenchmarkTruth
@@ -90,7 +77,7 @@ class Grading:
 
 def grading_summary(grading: Grading) -> dict[str, Any]:
     """The grades as plain values: for each field, the best first, all that is known of it."""
-    return {
+    content = {
         "format": SCORES_FORMAT,
         "benchmark": grading.truth.id,
         "nominal_strain": grading.strain,
@@ -101,6 +88,7 @@ def grading_summary(grading: Grading) -> dict[str, Any]:
         "refused": dict(grading.refused),
         "remarks": grading.notes,
     }
+    return {key: to_plain(value) for key, value in content.items()}
 
 
 def _plain_field(grading: Grading, graded: Score) -> dict[str, Any]:
@@ -110,26 +98,9 @@ def _plain_field(grading: Grading, graded: Score) -> dict[str, Any]:
         "points_off_material": graded.off_material,
         "spacing_px": graded.spacing_px,
         "covered": graded.covered,
-        **{name: asdict(part) for name, part in grading.parts(graded).items()},
-        "spectrum": None
-        if spectrum is None
-        else {
-            "wavelength_px": spectrum.wavelength_px.tolist(),
-            "rms_px": spectrum.rms_px.tolist(),
-            "affine_px": spectrum.affine_px,
-        },
+        **grading.parts(graded),
+        "spectrum": spectrum,
     }
-
-
-def without_nan(value: Any) -> Any:
-    """The same without NaN, which JSON doesn't know."""
-    if isinstance(value, dict):
-        return {key: without_nan(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value
 
 
 def csv_lines(grading: Grading) -> Iterator[str]:

@@ -31,16 +31,8 @@ def regions(
 ) -> NDArray[np.int8]:
     """Label every pixel of the undeformed specimen.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material.
-    grid
-        Where the pixels are.
-    specimen
-        The geometry; its scatter, if any, is small against the ligaments.
-    edge_px
-        Width of the edges [px].
+    ``mask``: (rows, cols) True on material; ``specimen``: its scatter, if any, is small against
+    the ligaments; ``edge_px``: width of the edges [px].
 
     Returns
     -------
@@ -87,20 +79,9 @@ ENOUGH_COVERED = 0.5
 class RegionScore:
     """The error over one region.
 
-    Parameters
-    ----------
-    points
-        Points of the field that lie there.
-    returned
-        Share of them with a displacement [-].
-    bias_px
-        (x, y) mean error [px].
-    rms_px
-        Rms error per component [px].
-    percentiles_px
-        Of the error's length, at :data:`PERCENTILES` [px].
-    max_px
-        The largest length [px].
+    Of its ``points`` the share ``returned`` has a displacement [-]; ``bias_px``: (x, y) mean error;
+    ``rms_px`` is per component; ``percentiles_px``, at :data:`PERCENTILES`, and ``max_px`` are of the
+    error's length [px].
     """
 
     points: int

@@ -31,15 +31,8 @@ SHOWN = (0.95, 0.7895, 0.25)
 class FirstModeLimit:
     """Between which d/l the pattern stops being what buckles first under one loading.
 
-    Parameters
-    ----------
-    loading
-        Its name.
-    without, with_
-        The largest d/l found at which something else comes first, and the smallest at which
-        the pattern does [-].
-    instead
-        What comes first below, as in :class:`ModeRow`.
+    ``without``, ``with_``: the largest d/l found at which something else comes first, and the smallest
+    at which the pattern does [-]; ``instead``: what comes first below, as in :class:`ModeRow`.
     """
 
     loading: str
@@ -52,17 +45,10 @@ class FirstModeLimit:
 class LatticeModeStudy:
     """What came out of a study.
 
-    Parameters
-    ----------
-    ratios
-        Every hole size under every loading.
-    scales, materials
-        The reference at other l, and of other materials; each ``likeness`` is the overlap with
-        the reference's own mode.
-    limits
-        Where the pattern stops being the first mode, for each loading where it does.
-    overlays
-        Modes to be laid over the analytic one.
+    ``ratios``: every hole size under every loading. ``scales``, ``materials``: the reference at other
+    l, and of other materials; each ``likeness`` is the overlap with the reference's own mode.
+    ``limits``: where the pattern stops being the first mode, for each loading where it does.
+    ``overlays``: modes to be laid over the analytic one.
     """
 
     ratios: tuple[ModeRow, ...] = ()
@@ -75,10 +61,7 @@ class LatticeModeStudy:
 class ModeTable:
     """A CSV of rows that grows as they are computed; what it has isn't computed again.
 
-    Parameters
-    ----------
-    path
-        The file; None to keep the rows in memory.
+    ``path``: the file; None to keep the rows in memory.
     """
 
     def __init__(self, path: Path | str | None = None) -> None:
@@ -140,20 +123,9 @@ def first_mode_limit(
 ) -> FirstModeLimit | None:
     """Bisect d/l to where the pattern stops being the first mode of a loading.
 
-    Parameters
-    ----------
-    base
-        All else about the lattice.
-    loading
-        Name of the loading.
-    rows
-        Known ones, to begin with.
-    tolerance
-        Of d/l [-].
-
-    Returns
-    -------
-    None if among the rows there is none with the pattern first and one below with something else.
+    ``base``: all else about the lattice; ``rows``: known ones, to begin with; ``tolerance``: of
+    d/l [-]. None if among the rows there is none with the pattern first and one below with
+    something else.
 
     Raises
     ------
@@ -194,8 +166,6 @@ def run_lattice_study(
 
     Parameters
     ----------
-    base
-        The reference.
     table
         CSV that keeps the rows, and that a study which was broken off goes on from.
     ratios, loadings
@@ -206,8 +176,6 @@ def run_lattice_study(
         Names of other materials, among ``STUDIED_MATERIALS``.
     shown
         d/l of the overlays [-], under the reference's loading.
-    progress
-        Listener.
     """
     kept = ModeTable(table)
     rows = study_modes(ratio_lattices(ratios, loadings, base), kept, progress)

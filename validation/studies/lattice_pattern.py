@@ -11,12 +11,13 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import TypeAdapter
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
@@ -28,6 +29,7 @@ from modeharvest.idic.spectra.mode_family import best_amplitude, mode_family, ov
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic
+from modeharvest.util.typed import quantities, quantity
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
@@ -40,55 +42,33 @@ Key = tuple[str, str, float, float, int]
 
 @dataclass(frozen=True)
 class ModeRow:
-    """The pattern of one lattice under one loading.
+    """The pattern of one lattice under one loading; labels and units head the table's columns.
 
-    Parameters
-    ----------
-    material, loading
-        Their names.
-    pitch, ratio
-        Unit cell size l [mm], and hole diameter over it d/l [-].
-    divisions
-        Elements along l.
-    found
-        Whether the lattice has a critical point in the range of loads.
-    first
-        Its first critical load; without one, the largest load at which it was stable [-].
-    kind
-        What is critical first: "pattern" for (π, π) alone, "long waves", "other waves"; "none" up
-        to the largest load asked for; "path ends" where no equilibrium was found beyond.
-    pattern
-        First load at which (π, π) is critical, whatever else is; NaN if none in the range [-].
-    state
-        Load of the state that the mode belongs to: the first critical one, or the last [-].
-    eigenvalue
-        Lowest at (π, π) in that state [N/mm^4].
-    overlap
-        |<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both of unit norm
-        over the material [-].
-    captured, waves
-        Share of its energy that the automatically found family holds [-], and how many waves
-        that has.
-    likeness
-        |<mode, mode of the reference>| of unit norm, on the same mesh but for its size [-]; NaN
-        where it wasn't compared.
+    ``kind``, what is critical first: "pattern" for (π, π) alone, "long waves", "other waves";
+    "none" up to the largest load asked for; "path ends" where no equilibrium was found beyond.
+    ``pattern``: first load at which (π, π) is critical, whatever else is; NaN if none in the
+    range. ``state``: load of the state that the mode belongs to, the first critical one or the
+    last. ``overlap``: |<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both
+    of unit norm over the material. ``captured``: share of its energy that the automatically found
+    family holds. ``likeness``: |<mode, mode of the reference>| of unit norm, on the same mesh but
+    for its size; NaN where it wasn't compared.
     """
 
-    material: str
-    loading: str
-    pitch: float
-    ratio: float
-    divisions: int
-    found: bool
-    first: float
-    kind: str
-    pattern: float
-    state: float
-    eigenvalue: float
-    overlap: float
-    captured: float
-    waves: int
-    likeness: float = math.nan
+    material: str = quantity("material")
+    loading: str = quantity("loading")
+    pitch: float = quantity("l", "mm")
+    ratio: float = quantity("d/l", "-")
+    divisions: int = quantity("elements per l", "-")
+    found: bool = quantity("critical point found")
+    first: float = quantity("first critical or largest strain", "-")
+    kind: str = quantity("first critical waves")
+    pattern: float = quantity("critical strain of (pi, pi)", "-")
+    state: float = quantity("strain of the mode's state", "-")
+    eigenvalue: float = quantity("eigenvalue at (pi, pi)", "N/mm^4")
+    overlap: float = quantity("overlap with Eq. (mode)", "-")
+    captured: float = quantity("energy captured by the automatic family", "-")
+    waves: int = quantity("its waves", "-")
+    likeness: float = quantity("overlap with the reference's mode", "-", default=math.nan)
 
     @property
     def key(self) -> Key:
@@ -101,32 +81,16 @@ class ModeRow:
         return self.kind == "pattern"
 
 
-_HEADS = {
-    "material": "material",
-    "loading": "loading",
-    "pitch": "l [mm]",
-    "ratio": "d/l [-]",
-    "divisions": "elements per l [-]",
-    "found": "critical point found",
-    "first": "first critical or largest strain [-]",
-    "kind": "first critical waves",
-    "pattern": "critical strain of (pi, pi) [-]",
-    "state": "strain of the mode's state [-]",
-    "eigenvalue": "eigenvalue at (pi, pi) [N/mm^4]",
-    "overlap": "overlap with Eq. (mode) [-]",
-    "captured": "energy captured by the automatic family [-]",
-    "waves": "its waves [-]",
-    "likeness": "overlap with the reference's mode [-]",
-}
+_HEADS = {name: f"{label} [{unit}]" if unit else label for label, unit, name in quantities(ModeRow)}
+_ROWS = TypeAdapter(tuple[ModeRow, ...])
 
 
 def write_rows(path: Path | str, rows: Iterable[ModeRow]) -> None:
     """Write the table, atomically; numbers with all their digits."""
-    names = [f.name for f in fields(ModeRow)]
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([_HEADS[name] for name in names])
-        writer.writerows([getattr(row, name) for name in names] for row in rows)
+        writer.writerow(_HEADS.values())
+        writer.writerows([getattr(row, name) for name in _HEADS] for row in rows)
 
 
 def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
@@ -148,22 +112,12 @@ def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
             f"{table[0] if table else 'nothing'}; remove it to begin anew"
         )
     try:
-        return tuple(_parsed(line) for line in table[1:])
-    except (ValueError, KeyError) as error:
+        return _ROWS.validate_python([dict(zip(_HEADS, row, strict=True)) for row in table[1:]])
+    except ValueError as error:
         raise InputError(
-            f"mode study: expected {len(_HEADS)} values in each row of {path}, got: {error}; "
-            "remove it to begin anew"
+            f"mode study: expected {len(_HEADS)} values in each row of {path}, got: "
+            f"{str(error).splitlines()[0]}; remove it to begin anew"
         ) from error
-
-
-def _parsed(line: list[str]) -> ModeRow:
-    a = dict(zip(_HEADS, line, strict=True))
-    return ModeRow(
-        a["material"], a["loading"], float(a["pitch"]), float(a["ratio"]), int(a["divisions"]),
-        {"True": True, "False": False}[a["found"]], float(a["first"]), a["kind"],
-        float(a["pattern"]), float(a["state"]), float(a["eigenvalue"]), float(a["overlap"]),
-        float(a["captured"]), int(a["waves"]), float(a["likeness"]),
-    )  # fmt: skip
 
 
 PATTERN: Wave = (math.pi, math.pi)
@@ -231,7 +185,7 @@ class StudiedLattice:
             )
 
     @property
-    def key(self) -> tuple[str, str, float, float, int]:
+    def key(self) -> Key:
         """As :attr:`ModeRow.key`."""
         names = name_of(self.material, STUDIED_MATERIALS), name_of(self.loading, LOADINGS)
         return (*names, self.pitch, self.ratio, self.divisions)

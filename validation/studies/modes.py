@@ -59,16 +59,8 @@ BASE = "base"
 class SpecimenPatterns:
     """A specimen's fields at the nodes of its mesh.
 
-    Parameters
-    ----------
-    mesh
-        T6 [mm].
-    pitch
-        l [mm].
-    displacement, found
-        (n, 2) the truth and the measurement [mm].
-    pattern, found_pattern
-        (n, 2) the truth less the best fit's v₀, and v₁φ₁ of the measurement [mm].
+    ``mesh`` of T6 and ``pitch`` [mm]; (n, 2) each [mm]: ``displacement`` and ``found``, the truth and
+    the measurement; ``pattern``, the truth less the best fit's v₀; ``found_pattern``, v₁φ₁.
     """
 
     mesh: Mesh
@@ -116,16 +108,8 @@ def standardised_errors(measured: pd.DataFrame) -> NDArray[np.float64]:
 def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Buckle, image, measure and compare.
 
-    Parameters
-    ----------
-    case, folder
-        One of :meth:`MeasuredModesStudy.prepare`, and the study's.
-
-    Returns
-    -------
-    dict
-        Of the specimen :class:`SpecimenRow`; and where it buckles, of the measurement and the best
-        fit what :func:`_measured_row` returns.
+    ``case``: one of :meth:`MeasuredModesStudy.prepare`, ``folder``: the study's. Returns
+    :class:`SpecimenRow` and, where it buckles, what :func:`_measured_row` returns.
     """
     own = specimen_folder(folder, case["specimen"])
     described = SpecimenSpec.read(own / "specimen.json")
@@ -285,14 +269,8 @@ def _units(pitch: float) -> FloatArray:
 class ModesAnalysis:
     """What the table of measured modes says, each part with a row for each specimen.
 
-    Parameters
-    ----------
-    ran
-        All that succeeded.
-    measured
-        Those whose pattern was there to be measured and was: converged on a pattern.
-    sizes
-        Of these the base and those that differ from it in d/l only, by d/l.
+    ``ran``: all that succeeded. ``measured``: those whose pattern was there to be measured and was:
+    converged on a pattern. ``sizes``: of these the base and those that differ from it in d/l only.
     """
 
     ran: pd.DataFrame

@@ -76,15 +76,7 @@ def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
 
 
 class PatternCells:
-    """Projections of a displacement on the square pattern, unit cell by unit cell.
-
-    Parameters
-    ----------
-    mesh
-        Of the displacement.
-    specimen
-        Whose pattern, :meth:`modeharvest.fem.specimen.Specimen.pattern`.
-    """
+    """Projections of a displacement on the square pattern, unit cell by unit cell."""
 
     def __init__(self, mesh: Mesh, specimen: Specimen) -> None:
         self._rule = rule = MeshQuadrature(mesh, _QUADRATURE)
@@ -271,10 +263,7 @@ def specimen_folder(folder: Path, name: str) -> Path:
 class LatticeMode:
     """The numerical (π, π) mode of an infinite lattice, and what a mode family makes of it.
 
-    Parameters
-    ----------
-    mode
-        On one cell about a hole, beside Eq. (mode) with its ideal parameters.
+    ``mode``: on one cell about a hole, beside Eq. (mode) with its ideal parameters.
     """
 
     mode: PatternMode
@@ -284,14 +273,7 @@ class LatticeMode:
         """Of the lattice of a specimen's cells, in uniaxial compression.
 
         In its first critical state, or where it stays stable in the last one looked at. Of a graded
-        specimen: the lattice of the cell at its centre.
-
-        Parameters
-        ----------
-        specimen, material
-            Whose.
-        divisions
-            Elements along l.
+        specimen: the lattice of the cell at its centre. ``divisions``: elements along l.
 
         Raises
         ------

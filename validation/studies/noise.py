@@ -77,17 +77,8 @@ def covariances_by_cause(
 ) -> dict[str, FloatArray]:
     """The (n, n) covariances of the unknowns for noise of 1 in both images, by their causes.
 
-    Parameters
-    ----------
-    pair, result
-        A pair of exact images, and what was found of it.
-    seed
-        Of the examples of noise.
-
-    Returns
-    -------
-    dict
-        For each of ``COVARIANCES``; infinite on the diagonal where the images say nothing.
+    ``result``: of a pair of exact images; ``seed``: of the examples of noise. For each of
+    ``COVARIANCES``; infinite on the diagonal where the images say nothing.
     """
     matched, cell = matched_images(pair, result), pair.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))

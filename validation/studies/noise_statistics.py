@@ -29,14 +29,8 @@ PER_CELL = 3
 class FieldPoints:
     """Where fields are compared.
 
-    Parameters
-    ----------
-    pair
-        Whose fields.
-    rows, cols
-        Axes of the coarse grid, in pixels of the images.
-    inside
-        (rows, cols) True on material; the points are those, row by row.
+    ``rows``, ``cols``: axes of the coarse grid, in pixels of the images; ``inside``: (rows, cols) True
+    on material; the points are those, row by row.
     """
 
     pair: VirtualImagePair
@@ -103,13 +97,7 @@ _NORMAL_95 = 1.959964
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A number and its standard error.
-
-    Parameters
-    ----------
-    value, error
-        Both in the same unit.
-    """
+    """A number and its standard error."""
 
     value: float
     error: float
@@ -223,12 +211,7 @@ Levels = Mapping[float, Mapping[str, PairedErrors]]
 class NoiseErrors:
     """Standard deviations, or errors.
 
-    Parameters
-    ----------
-    unknowns
-        (..., n), each in its own unit.
-    fields
-        (..., points, 7) [mm], see :data:`~modeharvest.validation.studies.noise.PARTS`.
+    ``unknowns``: (..., n), each in its own unit; ``fields``: (..., points, 7) [mm], see ``PARTS``.
     """
 
     unknowns: FloatArray
@@ -248,13 +231,7 @@ class NoiseErrors:
 
 @dataclass(frozen=True, eq=False)
 class NoiseFreeCase:
-    """The solution without noise.
-
-    Parameters
-    ----------
-    row
-        Of the table.
-    """
+    """The solution without noise."""
 
     row: pd.Series
 
@@ -345,19 +322,9 @@ def _read_level(
 class NoiseAnalysis:
     """What the table of a noise study says.
 
-    Parameters
-    ----------
-    pair, points
-        What was measured, and where fields are compared.
-    noise_free
-        The case without noise.
-    by_bound, by_least, by_hessian
-        Errors against the Cramér–Rao bound, against the least of least squares, and against the
-        Hessian-corrected covariance.
-    curvature_sd_ratio
-        By level, u's standard deviation by noisy images' own curvature over that of exact ones.
-    not_converged
-        Number of correlations.
+    ``by_bound``, ``by_least``, ``by_hessian``: errors against the Cramér–Rao bound, the least of least
+    squares and the Hessian-corrected covariance. ``curvature_sd_ratio``: by level, u's standard
+    deviation by noisy images' own curvature over that of exact ones. ``not_converged``: a number.
     """
 
     pair: VirtualImagePair

@@ -172,18 +172,9 @@ def rms(values: FloatArray) -> float:
 class ResolutionAnalysis:
     """What the table of a resolution study says.
 
-    Parameters
-    ----------
-    spec
-        What was measured.
-    rows
-        The table of what succeeded.
-    degrees, chosen
-        All degrees, and the one nearest to the specification's own v0 degree.
-    curves, passband
-        Best fits of waves, and of patterns of other wavelengths.
-    subset_px2
-        The indicator of an affine subset [px^2].
+    ``rows``: the table of what succeeded. ``chosen``: of all degrees the one nearest to the
+    specification's own v0 degree. ``curves``, ``passband``: best fits of waves, and of patterns of
+    other wavelengths. ``subset_px2``: the indicator of an affine subset [px^2].
     """
 
     spec: ResolutionSpec

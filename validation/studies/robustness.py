@@ -118,13 +118,9 @@ class GuessStatistics:
 class RobustnessAnalysis:
     """What the table of a robustness study says.
 
-    Parameters
-    ----------
-    moved, at_radius, strains
-        Rows with perturbed mode parameters, all and of the paper's radius, and with a wrong
-        strain; ``same``: whether each is the reference solution's minimum.
-    statistics
-        Of the paper's radius.
+    ``moved``, ``at_radius``, ``strains``: rows with perturbed mode parameters, all and of the paper's
+    radius, and with a wrong strain; ``same``: whether each is the reference solution's minimum.
+    ``statistics``: of the paper's radius.
     """
 
     moved: pd.DataFrame
@@ -137,15 +133,9 @@ class RobustnessAnalysis:
 class GuessResult:
     """Where an initial guess leads.
 
-    Parameters
-    ----------
-    distance_px, start_distance_px
-        Rms length of the difference of two displacements, the reference solution's and this
-        one's, or the guess' own.
-    epsilon_percent
-        The paper's: the difference of their norms.
-    outcome, iterations, all_iterations, residual
-        Of the correlation.
+    ``distance_px``, ``start_distance_px``: rms length of the difference of two displacements, the
+    reference solution's and this one's, or the guess' own. ``epsilon_percent``: the paper's, the
+    difference of their norms. The others are of the correlation.
     """
 
     distance_px: float

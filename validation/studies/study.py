@@ -46,13 +46,8 @@ PAPERS_TAPER = 0.5
 class ImagePairSpec:
     """A simulated experiment, and how it is imaged and correlated unless a study says otherwise.
 
-    Parameters
-    ----------
-    experiment, imaging, correlation
-        What was simulated, how it is imaged and correlated.
-    load
-        Gives the exact displacements; called when they are first needed, because simulating them
-        takes long and not every study asks for them.
+    ``load`` gives the exact displacements; called when they are first needed, because simulating them
+    takes long and not every study asks for them.
     """
 
     experiment: Experiment
@@ -75,16 +70,8 @@ class ImagePairSpec:
     ) -> str:
         """Leave in a study's folder what a worker needs to open a pair; returns the pair's name.
 
-        Parameters
-        ----------
-        folder
-            Of the study.
-        strain
-            Nominal strain of the deformed image [-].
-        imaging, correlation
-            Instead of the specification's own.
-        taper
-            Width over which the mode fades out [unit cells].
+        ``strain``: of the deformed image [-]; ``imaging``, ``correlation``: instead of the
+        specification's own; ``taper``: width over which the mode fades out [unit cells].
 
         Raises
         ------
@@ -114,18 +101,8 @@ class ImagePairSpec:
 class VirtualImagePair:
     """A pair of images and how to correlate it: what a worker keeps between cases.
 
-    Parameters
-    ----------
-    images
-        The set.
-    strain
-        Its nominal strain [-].
-    specimen
-        Of the images.
-    options
-        Of the correlation.
-    taper
-        Width over which the mode fades out [unit cells].
+    ``strain``: of the deformed image [-]; ``options``: of the correlation; ``taper``: width over which
+    the mode fades out [unit cells].
     """
 
     images: ImageSet

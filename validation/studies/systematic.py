@@ -30,12 +30,7 @@ from modeharvest.validation.workers import Case
 class StudySetting:
     """How a pair is imaged and correlated.
 
-    Parameters
-    ----------
-    imaging, correlation
-        As everywhere.
-    taper
-        Width over which the mode fades out [unit cells].
+    ``taper``: width over which the mode fades out [unit cells].
 
     Raises
     ------
@@ -231,17 +226,9 @@ ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 class LevelResult:
     """What is found at one level of a factor.
 
-    Parameters
-    ----------
-    w_px, model_error_px, measurement_error_px, v1_percent
-        :class:`~modeharvest.validation.truth.ErrorParts` and
-        :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
-    outcome, iterations, residual, pixels
-        Of the correlation.
-    pixels_per_ligament
-        Width of a ligament [px].
-    at_junctions_mm
-        Displacement (x, y) at the junctions between holes, whatever the pixels [mm].
+    The errors are :class:`~modeharvest.validation.truth.ErrorParts` and
+    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`. ``pixels_per_ligament``: its width
+    [px]; ``at_junctions_mm``: displacement (x, y) at the junctions between holes [mm].
     """
 
     w_px: float
@@ -260,15 +247,9 @@ class LevelResult:
 class SystematicAnalysis:
     """What the table of a systematic study says.
 
-    Parameters
-    ----------
-    rows
-        The table of what succeeded, all errors in pixels of the base; ``moved``: rms per
-        component of a measurement's difference from the base's on the same speckle [px].
-    base
-        Mean errors of the base over the speckles, by their names.
-    bases
-        The level of each factor that the base has; None where it has none.
+    ``rows``: what succeeded, errors in pixels of the base; ``moved``: rms per component of a
+    measurement's difference from the base's on the same speckle [px]. ``base``: mean errors over the
+    speckles. ``bases``: each factor's level at the base; None where it has none.
     """
 
     rows: pd.DataFrame

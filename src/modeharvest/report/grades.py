@@ -49,7 +49,6 @@ from modeharvest.validation.scoring.grading import (
     Grading,
     csv_lines,
     grading_summary,
-    without_nan,
 )
 from modeharvest.validation.scoring.score import (
     PERCENTILES,
@@ -221,7 +220,7 @@ def _error_length(graded: Score) -> FloatArray:
 def write_grading(folder: Path | str, grading: Grading) -> None:
     """Write ``scores.json``, ``scores.csv`` and ``report.html``, each whole or not at all."""
     folder = Path(folder)
-    write_json(folder / "scores.json", without_nan(grading_summary(grading)))
+    write_json(folder / "scores.json", grading_summary(grading))
     with atomic(folder / "scores.csv") as part:
         part.write_text("\n".join(csv_lines(grading)) + "\n", "utf-8")
     write_page(grading_report(grading), folder / "report.html")
