@@ -225,8 +225,8 @@ def _after(snapshot: SnapshotSummary) -> list[Expectation]:
 class MeasuredExperiment:
     """What is to be assessed.
 
-    ``options`` of the correlation; the truth comes from ``solution`` and ``images``; ``results``: what
-    IDIC found, by nominal strain.
+    ``options`` of the correlation; the truth comes from ``solution`` and ``images``; ``results``:
+    what IDIC found, by nominal strain.
     """
 
     experiment: Experiment

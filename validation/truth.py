@@ -86,9 +86,9 @@ class Comparison:
     """Truth, measurement and best possible fit of one snapshot, in the reference frame.
 
     ``strain``: nominal [-]. ``mask``: (rows, cols) True on material of the reference image.
-    ``displacement``: (rows, cols, 2) the truth [mm]; NaN outside the mask. ``best``: the best fit of
-    the result's ansatz to it. ``residual``: (rows, cols) f - g(x + u) [grey levels, fraction of full
-    scale]; NaN where not compared.
+    ``displacement``: (rows, cols, 2) the truth [mm]; NaN outside the mask. ``best``: the best fit
+    of the result's ansatz to it. ``residual``: (rows, cols) f - g(x + u) [grey levels, fraction of
+    full scale]; NaN where not compared.
     """
 
     strain: float

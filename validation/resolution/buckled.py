@@ -38,8 +38,8 @@ _SPARSE = 2
 class ResolutionSpec:
     """What a resolution study measures.
 
-    ``measured``: degrees of v0 and v1 that images are measured with; ``amplitude_px``: of a wave [px];
-    ``noise``: standard deviation in each image [fraction of full scale].
+    ``measured``: degrees of v0 and v1 that images are measured with; ``amplitude_px``: of a wave
+    [px]; ``noise``: standard deviation in each image [fraction of full scale].
     """
 
     buckled: BuckledMotion

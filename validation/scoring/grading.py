@@ -29,10 +29,10 @@ EVERYWHERE, COMMON = "everywhere", "where all measure"
 class Grading:
     """Graded fields of one deformed image.
 
-    ``strain`` of the image [-]; ``edge_px``: width of the region of edges [px]; ``labels``:
-    (rows, cols) of :func:`~modeharvest.validation.scoring.score.regions`; ``scores``, the best first;
-    ``spectra`` of each field's error, by its name; ``remarks``: probable errors in what was declared;
-    ``refused``: by its file's name, why a field was not graded.
+    ``strain`` of the image [-]; ``edge_px``: width of the region of edges [px]; ``labels``: (rows,
+    cols) of :func:`~modeharvest.validation.scoring.score.regions`; ``scores``, the best first;
+    ``spectra`` of each field's error, by its name; ``remarks``: probable errors in what was
+    declared; ``refused``: by its file's name, why a field was not graded.
     """
 
     truth: BenchmarkTruth

@@ -80,8 +80,8 @@ class RegionScore:
     """The error over one region.
 
     Of its ``points`` the share ``returned`` has a displacement [-]; ``bias_px``: (x, y) mean error;
-    ``rms_px`` is per component; ``percentiles_px``, at :data:`PERCENTILES`, and ``max_px`` are of the
-    error's length [px].
+    ``rms_px`` is per component; ``percentiles_px``, at :data:`PERCENTILES`, and ``max_px`` are of
+    the error's length [px].
     """
 
     points: int

@@ -31,8 +31,9 @@ SHOWN = (0.95, 0.7895, 0.25)
 class FirstModeLimit:
     """Between which d/l the pattern stops being what buckles first under one loading.
 
-    ``without``, ``with_``: the largest d/l found at which something else comes first, and the smallest
-    at which the pattern does [-]; ``instead``: what comes first below, as in :class:`ModeRow`.
+    ``without``, ``with_``: the largest d/l found at which something else comes first, and the
+    smallest at which the pattern does [-]; ``instead``: what comes first below, as in
+    :class:`ModeRow`.
     """
 
     loading: str
@@ -45,8 +46,8 @@ class FirstModeLimit:
 class LatticeModeStudy:
     """What came out of a study.
 
-    ``ratios``: every hole size under every loading. ``scales``, ``materials``: the reference at other
-    l, and of other materials; each ``likeness`` is the overlap with the reference's own mode.
+    ``ratios``: every hole size under every loading. ``scales``, ``materials``: the reference at
+    other l, and of other materials; each ``likeness`` is the overlap with the reference's own mode.
     ``limits``: where the pattern stops being the first mode, for each loading where it does.
     ``overlays``: modes to be laid over the analytic one.
     """

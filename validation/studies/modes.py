@@ -59,8 +59,8 @@ BASE = "base"
 class SpecimenPatterns:
     """A specimen's fields at the nodes of its mesh.
 
-    ``mesh`` of T6 and ``pitch`` [mm]; (n, 2) each [mm]: ``displacement`` and ``found``, the truth and
-    the measurement; ``pattern``, the truth less the best fit's v₀; ``found_pattern``, v₁φ₁.
+    ``mesh`` of T6 and ``pitch`` [mm]; (n, 2) each [mm]: ``displacement`` and ``found``, the truth
+    and the measurement; ``pattern``, the truth less the best fit's v₀; ``found_pattern``, v₁φ₁.
     """
 
     mesh: Mesh

@@ -29,8 +29,8 @@ PER_CELL = 3
 class FieldPoints:
     """Where fields are compared.
 
-    ``rows``, ``cols``: axes of the coarse grid, in pixels of the images; ``inside``: (rows, cols) True
-    on material; the points are those, row by row.
+    ``rows``, ``cols``: axes of the coarse grid, in pixels of the images; ``inside``: (rows, cols)
+    True on material; the points are those, row by row.
     """
 
     pair: VirtualImagePair
@@ -322,9 +322,10 @@ def _read_level(
 class NoiseAnalysis:
     """What the table of a noise study says.
 
-    ``by_bound``, ``by_least``, ``by_hessian``: errors against the Cramér–Rao bound, the least of least
-    squares and the Hessian-corrected covariance. ``curvature_sd_ratio``: by level, u's standard
-    deviation by noisy images' own curvature over that of exact ones. ``not_converged``: a number.
+    ``by_bound``, ``by_least``, ``by_hessian``: errors against the Cramér–Rao bound, the least of
+    least squares and the Hessian-corrected covariance. ``curvature_sd_ratio``: by level, u's
+    standard deviation by noisy images' own curvature over that of exact ones. ``not_converged``: a
+    number.
     """
 
     pair: VirtualImagePair

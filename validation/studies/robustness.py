@@ -118,9 +118,9 @@ class GuessStatistics:
 class RobustnessAnalysis:
     """What the table of a robustness study says.
 
-    ``moved``, ``at_radius``, ``strains``: rows with perturbed mode parameters, all and of the paper's
-    radius, and with a wrong strain; ``same``: whether each is the reference solution's minimum.
-    ``statistics``: of the paper's radius.
+    ``moved``, ``at_radius``, ``strains``: rows with perturbed mode parameters, all and of the
+    paper's radius, and with a wrong strain; ``same``: whether each is the reference solution's
+    minimum. ``statistics``: of the paper's radius.
     """
 
     moved: pd.DataFrame

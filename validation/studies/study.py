@@ -46,8 +46,8 @@ PAPERS_TAPER = 0.5
 class ImagePairSpec:
     """A simulated experiment, and how it is imaged and correlated unless a study says otherwise.
 
-    ``load`` gives the exact displacements; called when they are first needed, because simulating them
-    takes long and not every study asks for them.
+    ``load`` gives the exact displacements; called when they are first needed, because simulating
+    them takes long and not every study asks for them.
     """
 
     experiment: Experiment
@@ -101,8 +101,8 @@ class ImagePairSpec:
 class VirtualImagePair:
     """A pair of images and how to correlate it: what a worker keeps between cases.
 
-    ``strain``: of the deformed image [-]; ``options``: of the correlation; ``taper``: width over which
-    the mode fades out [unit cells].
+    ``strain``: of the deformed image [-]; ``options``: of the correlation; ``taper``: width over
+    which the mode fades out [unit cells].
     """
 
     images: ImageSet

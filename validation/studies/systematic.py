@@ -248,8 +248,8 @@ class SystematicAnalysis:
     """What the table of a systematic study says.
 
     ``rows``: what succeeded, errors in pixels of the base; ``moved``: rms per component of a
-    measurement's difference from the base's on the same speckle [px]. ``base``: mean errors over the
-    speckles. ``bases``: each factor's level at the base; None where it has none.
+    measurement's difference from the base's on the same speckle [px]. ``base``: mean errors over
+    the speckles. ``bases``: each factor's level at the base; None where it has none.
     """
 
     rows: pd.DataFrame
