@@ -1,1 +1,1 @@
-"""The minimiser: passes over pixels, normal equations, Gauss-Newton, coarse to fine; noise, residual test."""
+"""The minimiser: passes over pixels, Gauss-Newton, coarse to fine; image noise, residual test."""
