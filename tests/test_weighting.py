@@ -26,6 +26,7 @@ from modeharvest.idic.solver.pyramid import FULL, level_pair
 from modeharvest.idic.solver.weighting import Gradient, Weighting, best_blur, instrument, root
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.errors import InputError
 
@@ -347,6 +348,23 @@ def test_small_motions_have_no_bias(
     benchmarks/small_motion.py looks at more of it.
     """
     assert abs(bias_of_a_shift(shift_px, in_f, in_g, FINEST)).max() < 0.2
+
+
+def test_folded_waves_are_kept_out_of_what_weighs_the_residual() -> None:
+    """Speckle of 3 px under little noise: the residual isn't white, though there is no model error.
+
+    What that does to the bias is a row of benchmarks/small_motion.py.
+    """
+    spec = SpeckleSpec(standard_deviation=0.2, blur_px=0.75)
+    pattern, (rows, cols) = Speckle(spec, GRID.shape), GRID.shape
+    col, row = np.meshgrid(np.arange(cols) - 0.25, np.arange(rows) - 0.0)
+    noise = 0.002 * np.random.default_rng(0).normal(size=(2, *GRID.shape))
+    images = ImagePair(pattern.image() + noise[0], pattern.exact(row, col) + noise[1], GRID, MASK)
+    found = correlate(images, SMALL, guess=np.zeros(SMALL.size), options=FINEST)
+    assert not found.residual_test().is_white
+    assert found.weighting.speckle_size_px < 4.0
+    assert found.weighting.gradient is Gradient.REFERENCE
+    assert found.weighting.blur_px > 0.6
 
 
 def test_least_squares_has_one() -> None:
