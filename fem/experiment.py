@@ -106,10 +106,7 @@ class Experiment:
     def __post_init__(self) -> None:
         strains = self.strains
         if not strains or not strains[0] > 0 or any(not b > a for a, b in pairwise(strains)):
-            raise InputError(
-                f"strains: expected ascending positive nominal strains such as 0.078, 0.128, got "
-                f"{list(strains)}"
-            )
+            raise InputError(f"strains: expected ascending positive ones, got {list(strains)}")
         if strains[-1] >= 0.5:
             raise InputError(
                 f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"

@@ -27,6 +27,8 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
 
 FORMAT = "modeharvest-solution-1"
+COMPRESSED = {"compression": 6, "shuffle": True}
+"""Of datasets in HDF5."""
 _CORNERS = {"T3": 3, "T6": 3, "Q4": 4, "Q8": 4, "Q9": 4}
 NODES_PER_CELL = {"T3": 3, "T6": 6, "Q4": 4, "Q8": 8, "Q9": 9}
 _MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8", "Q9": "quad9"}
@@ -34,16 +36,9 @@ _MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8"
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A plane isoparametric mesh of one element type.
+    """A plane isoparametric mesh of one element type: T3, T6, Q4, Q8 or Q9.
 
-    Parameters
-    ----------
-    nodes
-        (n, 2) positions [mm].
-    cells
-        (m, k) node numbers; order of the nodes: see the module's docstring.
-    element
-        One of T3, T6, Q4, Q8, Q9.
+    ``nodes`` (n, 2) are positions [mm], ``cells`` (m, k) node numbers in the module's order.
     """
 
     nodes: FloatArray
@@ -52,18 +47,14 @@ class Mesh:
 
     def __post_init__(self) -> None:
         if self.element not in NODES_PER_CELL:
-            raise InputError(
-                f"expected an element among {list(NODES_PER_CELL)}, got {self.element}"
-            )
+            raise InputError(f"expected one of {list(NODES_PER_CELL)}, got {self.element}")
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(self.cells, dtype=np.int64))
         k = NODES_PER_CELL[self.element]
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 2:
             raise InputError(f"expected nodes of shape (n, 2), got {self.nodes.shape}")
         if self.cells.ndim != 2 or self.cells.shape[1] != k:
-            raise InputError(
-                f"expected {self.element} cells of shape (m, {k}), got {self.cells.shape}"
-            )
+            raise InputError(f"expected {self.element} cells (m, {k}), got {self.cells.shape}")
         if not np.isfinite(self.nodes).all():
             raise InputError("expected finite node positions, got NaN or infinity")
         if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.nodes):
@@ -135,18 +126,15 @@ class Solution:
         if not len(self.mesh.cells):
             raise InputError("expected cells of a mesh, got none: nothing to show")
         for s in self.snapshots:
+            where, shape = f"snapshot at strain {s.nominal_strain}", self.mesh.nodes.shape
             if not np.isfinite(s.nominal_strain):
                 raise InputError(f"expected a finite nominal strain, got {s.nominal_strain}")
-            if s.displacement.shape != self.mesh.nodes.shape:
+            if s.displacement.shape != shape:
                 raise InputError(
-                    f"snapshot at strain {s.nominal_strain}: expected displacements of shape "
-                    f"{self.mesh.nodes.shape}, got {s.displacement.shape}"
+                    f"{where}: expected displacements {shape}, got {s.displacement.shape}"
                 )
             if not np.isfinite(s.displacement).all():
-                raise InputError(
-                    f"snapshot at strain {s.nominal_strain}: expected finite displacements, "
-                    "got NaN or infinity"
-                )
+                raise InputError(f"{where}: expected finite displacements, got NaN or infinity")
 
     def at(self, nominal_strain: float) -> Snapshot:
         """The stable snapshot at a nominal strain (the first one listed, if several).
@@ -166,24 +154,16 @@ class Solution:
         """Write HDF5, atomically; displacements and nodes are stored losslessly."""
         with atomic_hdf5(path) as file:
             file.attrs["format"] = FORMAT
-            file.attrs["element"] = self.mesh.element
             file.attrs["info"] = json.dumps(dict(self.info))
-            file.create_dataset("nodes", data=self.mesh.nodes, compression=6, shuffle=True)
-            cells = self.mesh.cells.astype(np.int32)
-            file.create_dataset("cells", data=cells, compression=6, shuffle=True)
+            write_mesh(file, self.mesh)
             for k, s in enumerate(self.snapshots):
                 group = file.create_group(f"snapshots/{k:04d}")
-                group.create_dataset(
-                    "displacement", data=s.displacement, compression=6, shuffle=True
-                )
-                group.attrs["nominal_strain"] = s.nominal_strain
-                group.attrs["reaction"] = s.reaction
-                group.attrs["energy"] = s.energy
-                group.attrs["negative_pivots"] = (
-                    -1 if s.negative_pivots is None else s.negative_pivots
-                )
+                group.create_dataset("displacement", data=s.displacement, **COMPRESSED)
+                for name in ("nominal_strain", "reaction", "energy", "branch"):
+                    group.attrs[name] = getattr(s, name)
+                pivots = s.negative_pivots
+                group.attrs["negative_pivots"] = -1 if pivots is None else pivots
                 group.attrs["eigenvalues"] = np.asarray(s.eigenvalues, dtype=np.float64)
-                group.attrs["branch"] = s.branch
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:
@@ -196,7 +176,7 @@ class Solution:
         """
         remedy = "make it again with 'modeharvest fem'"
         with open_hdf5(path, "a solution (HDF5)", remedy, FORMAT) as file:
-            mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
+            mesh = read_mesh(file)
             groups = file.get("snapshots", {})
             snapshots = tuple(_read_snapshot(groups[name]) for name in sorted(groups))
             return cls(mesh, snapshots, dict(json.loads(file.attrs["info"])))
@@ -214,6 +194,18 @@ class Solution:
         cells = [(_MESHIO_NAME[self.mesh.element], self.mesh.cells)]
         with atomic(path) as temporary:
             meshio.Mesh(points, cells, point_data=data).write(temporary, file_format="vtu")
+
+
+def write_mesh(file: h5py.File, mesh: Mesh) -> None:
+    """Into an HDF5 file: datasets nodes and cells, attribute element."""
+    file.attrs["element"] = mesh.element
+    file.create_dataset("nodes", data=mesh.nodes, **COMPRESSED)
+    file.create_dataset("cells", data=mesh.cells.astype(np.int32), **COMPRESSED)
+
+
+def read_mesh(file: h5py.File) -> Mesh:
+    """What :func:`write_mesh` wrote."""
+    return Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
 
 
 def _read_snapshot(group: h5py.Group) -> Snapshot:
@@ -249,14 +241,8 @@ def read_any_mesh(path: Path | str) -> meshio.Mesh:
 def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> Solution:
     """Take the mesh and displacement of any solver whose file meshio reads.
 
-    Parameters
-    ----------
-    path
-        File with T3, T6, Q4, Q8 or Q9 cells in the x-y plane [mm].
-    displacement
-        Name of the nodal vector field to read [mm].
-    nominal_strain
-        The strain to label the snapshot with [-].
+    Cells are T3, T6, Q4, Q8 or Q9 in the x-y plane [mm], ``displacement`` is the name of a nodal
+    vector field [mm], ``nominal_strain`` that of the snapshot [-].
 
     Raises
     ------
@@ -267,20 +253,16 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     types = sorted({block.type for block in source.cells})
     found = [e for e, name in _MESHIO_NAME.items() if name in types]
     if not found:
-        raise InputError(
-            f"expected cells among {list(_MESHIO_NAME.values())} in {path}, got {types}"
-        )
+        known = list(_MESHIO_NAME.values())
+        raise InputError(f"expected cells among {known} in {path}, got {types}")
     if len(found) > 1:
         raise InputError(f"expected one type of cells in {path}, got {types}")
     if displacement not in source.point_data:
-        raise InputError(
-            f"expected a nodal field {displacement!r} in {path}, got {list(source.point_data)}"
-        )
+        names = list(source.point_data)
+        raise InputError(f"expected a nodal field {displacement!r} in {path}, got {names}")
     u = np.asarray(source.point_data[displacement], dtype=np.float64)
     if u.ndim != 2 or u.shape[1] not in (2, 3):
-        raise InputError(
-            f"expected {displacement!r} in {path} to have 2 or 3 components, got shape {u.shape}"
-        )
+        raise InputError(f"expected {displacement!r} of 2 or 3 components in {path}, got {u.shape}")
     name = _MESHIO_NAME[found[0]]
     cells = np.vstack([block.data for block in source.cells if block.type == name])
     mesh = Mesh(source.points[:, :2], cells, found[0])

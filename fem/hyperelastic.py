@@ -34,21 +34,8 @@ class Hyperelastic:
     """Space, displacement and compiled forms of a meshed body.
 
     ``V`` is the space and ``u`` the displacement [mm] at which everything is assembled;
-    ``energy``, ``forces``, ``stiffness`` and ``mass`` (of unit density) are dolfinx forms.
-
-    Parameters
-    ----------
-    mesh
-        T6 mesh [mm] (needed on rank 0 only).
-    material
-        Strain energy density [MPa].
-    comm
-        The communicator to distribute over.
-
-    Raises
-    ------
-    InputError
-        If the mesh has other elements.
+    ``energy``, ``forces``, ``stiffness`` and ``mass`` (of unit density) are dolfinx forms. The
+    mesh is needed on rank 0 only; an InputError refuses other elements than T6.
     """
 
     def __init__(self, mesh: Mesh, material: Material, comm: MPI.Comm) -> None:
@@ -82,15 +69,7 @@ class Hyperelastic:
 
 
 class FreeBody:
-    """Total-Lagrangian finite elements of a T6 mesh in plane strain.
-
-    Parameters
-    ----------
-    mesh
-        T6 mesh [mm].
-    material
-        Strain energy density [MPa].
-    """
+    """Total-Lagrangian finite elements of a T6 mesh in plane strain, in the order of its nodes."""
 
     def __init__(self, mesh: Mesh, material: Material) -> None:
         self.mesh = mesh

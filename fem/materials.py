@@ -44,10 +44,8 @@ class Ogden:
 
     def __post_init__(self) -> None:
         if len(self.moduli) != len(self.exponents) or not self.moduli:
-            raise InputError(
-                f"Ogden material: expected as many moduli as exponents, got {len(self.moduli)} "
-                f"and {len(self.exponents)}"
-            )
+            got = f"{len(self.moduli)} and {len(self.exponents)}"
+            raise InputError(f"Ogden material: expected as many moduli as exponents, got {got}")
         if 0.0 in self.exponents or sum(self.moduli) <= 0 or self.kappa <= 0:
             raise InputError(
                 "Ogden material: expected nonzero exponents, a positive sum of moduli and a "

@@ -33,24 +33,10 @@ def simulate(
 ) -> Solution:
     """Run a virtual compression test (collective over ``comm``; every rank gets the result).
 
-    The solution's ``info["outcome"]`` says in words how far the path went; where it ended
-    early, the snapshots reached are there. ``info["warnings"]`` names states that are not stable
-    although their branch is meant to be. ``info["critical"]`` is None where the specimen
-    stays stable, or is imperfect.
-
-    Parameters
-    ----------
-    experiment
-        What is compressed, how, and at which strains to keep its state.
-    progress
-        Listener.
-    comm
-        The processes that share the work.
-
-    Raises
-    ------
-    InputError
-        If the specimen can't be meshed with elements of that size.
+    The solution's ``info["outcome"]`` says how far the path went; where it ended early, the
+    snapshots reached are there. ``info["warnings"]`` names states that are not stable although
+    their branch is meant to be. ``info["critical"]`` is None where the specimen stays stable, or
+    is imperfect. An InputError refuses a size of elements that can't mesh the specimen.
     """
     spec = experiment.specimen
     mesh = perturb(mesh_specimen(spec, experiment.mesh_size), spec, experiment.imperfection)

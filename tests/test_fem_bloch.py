@@ -255,7 +255,7 @@ def test_the_square_lattice_buckles_at_m(loading: str, expected: float) -> None:
     assert 100 * found.load == pytest.approx(expected, rel=0.03)
     assert found.waves == (M,)
     assert (found.below, found.above) == ((0,), (1,))
-    assert found.earlier == ()
+    assert found.unstable_before == ()
 
 
 def test_the_hexagonal_lattice_has_three_modes_at_once() -> None:
@@ -302,7 +302,7 @@ def test_columns_with_slender_ties_sway_together() -> None:
     path = path_of(columns_with_ties(), uniaxial(1))
     found = first_critical(path)
     assert found.waves == ()
-    angle = found.least.angle
+    angle = found.least_stable.angle
     assert angle is not None
     assert abs(math.sin(angle)) == pytest.approx(1.0, abs=1e-4)  # k along the columns
     before, after = path.at(0.99 * found.load), path.at(1.01 * found.load)
@@ -317,7 +317,7 @@ def test_a_stable_lattice_is_an_outcome_not_a_failure() -> None:
     found = first_critical(path_of(cell_of("square", 6), uniaxial()), CriticalSearch(largest=0.01))
     assert not found.found
     assert found.load == 0.01
-    assert found.least.value > 0
+    assert found.least_stable.value > 0
     assert "stable up to 0.01" in found.outcome
 
 
@@ -347,7 +347,7 @@ def test_a_path_that_ends_is_looked_at_up_to_there(end: float) -> None:
     else:
         assert found.load == end
         assert "did not converge beyond 0.02" in found.outcome
-        assert found.least.value > 0
+        assert found.least_stable.value > 0
 
 
 def test_a_lattice_that_is_a_mechanism_is_refused() -> None:

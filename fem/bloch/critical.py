@@ -35,52 +35,39 @@ class LatticeCritical:
     ----------
     load
         Critical load; without one, the last load reached [-].
-    found
-        Whether there is a critical point up to there.
-    outcome
-        In words.
-    least
-        The least stable wave at ``load``.
+    found, outcome
+        Whether there is a critical point up to there; what was found, as a sentence.
+    least_stable, state
+        The least stable wave and the equilibrium at ``load``.
     waves
-        All waves that are critical there, as far as the grid tells: a degenerate set has more
-        than one. k and -k are the same mode and appear once. Empty for long waves.
-    state
-        The equilibrium there.
+        All waves of the grid that are critical there: a degenerate set has more than one. k and -k
+        are the same mode and appear once. Empty for long waves.
     history
         The least stable wave at every load looked at, by load.
     below, above
         Number of negative eigenvalues at each of ``waves`` a millionth of the load below and
         above the critical one: the proof.
-    earlier
-        Waves of the grid that are unstable already a millionth below: the proof that this is the
-        first critical point, if there are none. Not looked for where one wave was asked for.
+    unstable_before
+        Waves of the grid that are unstable already a millionth below: this is the first critical
+        point if there are none. Not looked for where one wave was given.
     """
 
     load: float
     found: bool
     outcome: str
-    least: LeastStable
+    least_stable: LeastStable
     waves: tuple[Wave, ...]
     state: CellState
     history: tuple[LeastStable, ...]
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
-    earlier: tuple[Wave, ...] = ()
+    unstable_before: tuple[Wave, ...] = ()
 
 
 def first_critical(
     path: CellPath, search: CriticalSearch | None = None, progress: Progress = silent
 ) -> LatticeCritical:
     """The first critical load over all wave vectors, along the path of a primitive cell.
-
-    Parameters
-    ----------
-    path
-        The primary path, a cell and its loading.
-    search
-        Up to which load, how finely.
-    progress
-        A listener.
 
     Raises
     ------
@@ -101,7 +88,7 @@ def critical_at(
     """The first load at which the given wave is critical, whatever the others do.
 
     (0, 0) stands for the modes with the period of the cell, which may be an enlarged one. F̄ is
-    held while a mode grows.
+    fixed while a mode grows.
     """
     search = search or CriticalSearch()
     zone = Zone(path.cell, search.divisions)
@@ -123,7 +110,7 @@ class _LoadSearch:
     history: dict[float, LeastStable] = field(default_factory=dict)
 
     def run(self) -> LatticeCritical:
-        """March until something is unstable, then find the root."""
+        """Raise the load until a wave is unstable, then find the root."""
         largest, load, step = self.search.largest, 0.0, self.search.first_step
         previous = self._at_rest()
         while load < largest:

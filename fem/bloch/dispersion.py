@@ -1,25 +1,23 @@
 """The dispersion of a lattice under load: lowest eigenvalues against the wave vector.
 
 Along a path through the zone at several loads, and over the whole zone at one. What is found is
-plain numpy, held, written and read without dolfinx.
+plain numpy, written and read without dolfinx.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import h5py
 import numpy as np
 
 from modeharvest.fem.lattice.options import CENTRE, Wave, wave_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
+from modeharvest.util.files import atomic_hdf5, open_hdf5
 from modeharvest.util.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -47,6 +45,10 @@ ZONES: dict[str, tuple[tuple[str, Wave], ...]] = {
 lattice under its load as it is. "rhombic": the hexagonal lattice under a load that doesn't, K at
 0 and K′ at 60 degrees from x, M₁ at 30 and M₂ at 90. "oblique": anything else; with k and -k the
 same, the edges X-M and Y-M are all of the boundary."""
+
+
+_ARRAYS = ("waves", "distances", "loads", "eigenvalues")
+_MAP_ARRAYS = ("phases", "eigenvalues", "lattice")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ class Dispersion:
     eigenvalues
         (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
     zone
-        Maps of the zone, one for each load that was asked for.
+        Maps of the zone, one for each requested load.
     """
 
     labels: tuple[str, ...]
@@ -133,26 +135,13 @@ class Dispersion:
         with atomic_hdf5(path) as file:
             file.attrs["labels"] = list(self.labels)
             file["stops"] = np.array(self.stops)
-            for name in ("waves", "distances", "loads", "eigenvalues"):
+            for name in _ARRAYS:
                 file[name] = getattr(self, name)
             for k, part in enumerate(self.zone):
                 group = file.create_group(f"zone/{k}")
                 group.attrs["load"] = part.load
-                for name in ("phases", "eigenvalues", "lattice"):
+                for name in _MAP_ARRAYS:
                     group[name] = getattr(part, name)
-
-    def write_csv(self, path: Path | str) -> None:
-        """Write the path as a table for own plots: a row for each load and wave vector."""
-        at = dict(zip(self.stops, self.labels, strict=True))
-        bands = [f"eigenvalue_{k + 1}_N_per_mm4" for k in range(self.bands)]
-        head = ["load", "corner", "phase_1_rad", "phase_2_rad", "distance_rad_per_mm", *bands]
-        with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow(head)
-            for load, values in zip(self.loads, self.eigenvalues, strict=True):
-                for k, (wave, row) in enumerate(zip(self.waves, values, strict=True)):
-                    numbers = [*wave, self.distances[k], *row]
-                    table.writerow([f"{load:.9g}", at.get(k, ""), *(f"{x:.9g}" for x in numbers)])
 
     @classmethod
     def read(cls, path: Path | str) -> Dispersion:
@@ -164,17 +153,14 @@ class Dispersion:
             If there is no such file, or it is none of these.
         """
         with open_hdf5(path, "a dispersion file (HDF5)") as file:
-            arrays = {n: file[n][()] for n in ("waves", "distances", "loads", "eigenvalues")}
+            arrays = {name: file[name][()] for name in _ARRAYS}
             labels = tuple(str(label) for label in file.attrs["labels"])
             stops = tuple(int(k) for k in file["stops"])
-            groups = file.get("zone", {}).values()
-            zone = tuple(_read_map(group) for group in groups)
+            zone = tuple(
+                ZoneMap(float(group.attrs["load"]), *(group[name][()] for name in _MAP_ARRAYS))
+                for group in file.get("zone", {}).values()
+            )
             return cls(labels, stops, **arrays, zone=zone)
-
-
-def _read_map(group: h5py.Group) -> ZoneMap:
-    names = ("phases", "eigenvalues", "lattice")
-    return ZoneMap(float(group.attrs["load"]), *(group[name][()] for name in names))
 
 
 def dispersion(
@@ -185,22 +171,16 @@ def dispersion(
     bands: int = 3,
     progress: Progress = silent,
 ) -> Dispersion:
-    """The lowest eigenvalues along a zone path, at several loads of a cell's primary path.
+    """The lowest eigenvalues along a zone path, at several loads of a primitive cell's path.
 
     Parameters
     ----------
-    path
-        The primary path of a primitive cell.
     corners
         Names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
     loads
         [-].
-    count
-        Number of wave vectors, corners included.
-    bands
-        Number of eigenvalues at each.
-    progress
-        Listener.
+    count, bands
+        Number of wave vectors, corners included, and of eigenvalues at each.
 
     Raises
     ------
@@ -230,23 +210,10 @@ def dispersion(
 def zone_map(
     path: CellPath, load: float, divisions: int = 24, progress: Progress = silent
 ) -> ZoneMap:
-    """The lowest eigenvalue over a grid of the zone at one load.
+    """The lowest eigenvalue over a grid of the zone at one load [-] of a primitive cell's path.
 
-    Parameters
-    ----------
-    path
-        The primary path of a primitive cell.
-    load
-        [-].
-    divisions
-        Of each axis; an even number has Γ, X and M on the grid.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If the load can't be reached.
+    An even number of ``divisions`` of each axis has Γ, X and M on the grid; an InputError refuses
+    an odd one, and a load that can't be reached.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
 

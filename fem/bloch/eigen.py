@@ -40,14 +40,8 @@ _DIRECTIONS = 36  # over half a turn
 class BlochModes:
     """The lowest eigenpairs at one wave vector.
 
-    Parameters
-    ----------
-    wave
-        Phases (k . a1, k . a2) [rad].
-    eigenvalues
-        (m,) ascending [N/mm^4].
-    vectors
-        (size, m) x with x^H M x = 1, in the order of ``Reduction``.
+    ``eigenvalues`` (m,) ascend [N/mm^4]; ``vectors`` (size, m) have x^H M x = 1, in the order of
+    ``Reduction``.
     """
 
     wave: Wave
@@ -56,16 +50,9 @@ class BlochModes:
 
 
 class BlochWaves:
-    """All Bloch waves on one state of a cell; the stiffness is assembled and sorted once.
+    """All Bloch waves on one state of a primitive cell; the stiffness is sorted once.
 
     ``factorisations`` counts those of reduced matrices.
-
-    Parameters
-    ----------
-    cell
-        The cell, primitive for all wave vectors to mean what they say.
-    state
-        An equilibrium of it.
     """
 
     def __init__(self, cell: PeriodicCell, state: CellState) -> None:
@@ -89,16 +76,8 @@ class BlochWaves:
         Lanczos with the inverse of K + s M; s is so large that this is positive definite, which
         its factors prove, so the eigenvalues nearest to -s are the lowest.
 
-        Parameters
-        ----------
-        wave
-            Phases (k . a1, k . a2) [rad].
-        count
-            Number of eigenpairs.
-        near
-            Those of a wave vector nearby, as a start.
-        tolerance
-            About the relative error of lambda + s that is allowed.
+        ``near`` are those of a wave vector nearby, as a start; ``tolerance`` is about the relative
+        error of lambda + s that is allowed.
         """
         values, vectors = self.iterated(phases_of([wave]), count, near, tolerance)
         return BlochModes(wave, values[0], vectors[:, 0])
@@ -106,19 +85,9 @@ class BlochWaves:
     def iterated(
         self, waves: FloatArray, count: int, near: BlochModes | None, tolerance: float
     ) -> tuple[FloatArray, Batch]:
-        """What ``lowest`` does, for several waves that are alike: see ``scan``.
+        """Values (w, count) and vectors (size, w, count) of ``lowest`` for several waves.
 
-        Parameters
-        ----------
-        waves
-            (w, 2) phases [rad]: all of them Γ, all where T(k) is real, or all elsewhere.
-        count, near, tolerance
-            As in ``lowest``.
-
-        Returns
-        -------
-        values, vectors
-            (w, count) and (size, w, count).
+        Their phases (w, 2) [rad] are all Γ, all where T(k) is real, or all elsewhere.
         """
         solver, below = self._solver_below(waves)
         T = self.cell.reduction.bloch_map.at(waves)
@@ -262,10 +231,8 @@ def largest(
     ----------
     solve, weigh
         A^-1 and M, both positive definite, applied to batches (size, w, m).
-    start
-        (size, w, m) to begin with.
-    fixed
-        (size, w, f) M-orthonormal vectors to be left out of the space.
+    start, fixed
+        (size, w, m) to begin with; (size, w, f) M-orthonormal, to be left out of the space.
     tolerance
         About the relative error of the eigenvalues that is allowed.
 

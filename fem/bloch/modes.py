@@ -15,8 +15,8 @@ m modes on a cell of n nodes::
                               amplitudes (m,) [mm]      @load @energy @primary_energy [MPa]
                               @negative_eigenvalues
 
-VTU and XDMF (one file each) have the same fields as point data whose names tell what they are and
-in which unit, and the rest as JSON in a comment at the top.
+VTU and XDMF (one file each) have the same fields as point data, named by meaning and unit, and the
+rest as JSON in a comment at the top.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import h5py
 import meshio
 import numpy as np
 
-from modeharvest.fem.field import Mesh
+from modeharvest.fem.field import COMPRESSED, Mesh, read_mesh, write_mesh
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -141,7 +141,7 @@ class Branch:
         By load; empty if it could not be followed. A load that the branch meets twice is there
         twice.
     outcome
-        In words.
+        How far it was followed, and why no farther.
     curve
         (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
         the critical one first.
@@ -154,30 +154,22 @@ class Branch:
 
 
 FORMAT = "modeharvest-modes-1"
-_SQUEEZED = {"compression": 6, "shuffle": True}
+_OF_SET = ("lattice", "primitive", "eigenvalues", "gradient")
 _NUMBERS = ("load", "energy", "primary_energy", "negative_eigenvalues")
 _ARRAYS = ("displacement", "gradient", "stress", "amplitudes")
 
 
 def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
-    """Write HDF5, atomically and without loss; the layout is in the module's docstring.
-
-    Raises
-    ------
-    InputError
-        If the file can't be written.
-    """
+    """Write HDF5, atomically and without loss; the layout is in the module's docstring."""
     with atomic_hdf5(path) as file:
         file.attrs["format"] = FORMAT
-        file.attrs["element"] = modes.mesh.element
         file.attrs["normalisation"] = NORMALISATION
         file.attrs["load"] = modes.load
         file.attrs["info"] = json.dumps(dict(modes.info))
-        file.create_dataset("nodes", data=modes.mesh.nodes, **_SQUEEZED)
-        file.create_dataset("cells", data=modes.mesh.cells.astype(np.int32), **_SQUEEZED)
-        file.create_dataset("shapes", data=modes.shapes, **_SQUEEZED)
+        write_mesh(file, modes.mesh)
+        file.create_dataset("shapes", data=modes.shapes, **COMPRESSED)
         file["waves"] = np.asarray(modes.waves, dtype=np.float64)
-        for name in ("lattice", "primitive", "eigenvalues", "gradient"):
+        for name in _OF_SET:
             file[name] = getattr(modes, name)
         for k, branch in enumerate(branches):
             _write_branch(file.create_group(f"branches/{k:04d}"), branch)
@@ -209,17 +201,12 @@ def write_xdmf(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()
 
 
 def _read_set(file: h5py.File) -> ModeSet:
-    mesh = Mesh(file["nodes"][:], file["cells"][:], str(file.attrs["element"]))
     return ModeSet(
-        mesh=mesh,
-        lattice=file["lattice"][:],
-        primitive=file["primitive"][:],
+        mesh=read_mesh(file),
         waves=tuple((float(p), float(q)) for p, q in file["waves"][:]),
-        eigenvalues=file["eigenvalues"][:],
-        shapes=file["shapes"][:],
         load=float(file.attrs["load"]),
-        gradient=file["gradient"][:],
         info=json.loads(file.attrs["info"]),
+        **{name: file[name][:] for name in ("shapes", *_OF_SET)},
     )
 
 
@@ -232,7 +219,7 @@ def _write_branch(group: h5py.Group, branch: Branch) -> None:
         for name in _NUMBERS:
             place.attrs[name] = getattr(state, name)
         for name in _ARRAYS:
-            place.create_dataset(name, data=getattr(state, name), **_SQUEEZED)
+            place.create_dataset(name, data=getattr(state, name), **COMPRESSED)
 
 
 def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
@@ -240,10 +227,8 @@ def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
     states = tuple(_read_state(groups[name]) for name in sorted(groups))
     for state in states:
         if state.displacement.shape != modes.mesh.nodes.shape:
-            raise InputError(
-                f"displacements of shape {state.displacement.shape} on {len(modes.mesh.nodes)} "
-                "nodes"
-            )
+            shape, count = state.displacement.shape, len(modes.mesh.nodes)
+            raise InputError(f"displacements of shape {shape} on {count} nodes")
     combination = tuple(float(c) for c in group["combination"][:])
     return Branch(combination, states, str(group.attrs["outcome"]), group["curve"][:])
 
@@ -266,7 +251,7 @@ def _write_meshio(
 
 
 def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, FloatArray]:
-    """Nodal vectors by names that tell what they are."""
+    """Nodal vectors by names with their meaning and unit."""
     named = {}
     for k, (wave, shape) in enumerate(zip(modes.waves, modes.shapes, strict=True), start=1):
         phases = "_".join(f"{phase / np.pi:.4g}pi" for phase in wave)

@@ -51,12 +51,8 @@ def real_modes(
 
     Parameters
     ----------
-    cell
-        The primitive cell.
-    state
-        Its equilibrium, usually ``LatticeCritical.state``.
-    waves
-        Phases (k . a1, k . a2) [rad], usually ``LatticeCritical.waves``.
+    cell, state, waves
+        Primitive; its equilibrium and phases [rad], usually those of a ``LatticeCritical``.
     info
         Plain JSON values to be kept with the modes.
     largest

@@ -49,12 +49,7 @@ class LeastStable:
 class Zone:
     """The measure of stability over all wave vectors of a cell.
 
-    Parameters
-    ----------
-    cell
-        The cell.
-    divisions
-        Of each axis; an even number has the points M and X on the grid.
+    An even number of ``divisions`` of each axis has the points M and X on the grid.
     """
 
     def __init__(self, cell: PeriodicCell, divisions: int) -> None:
@@ -115,9 +110,8 @@ class Zone:
             near[:] = [modes]
             squared, slope_of_squared = self._squared(wave)
             slope = waves.slope(modes) - modes.eigenvalues[0] * slope_of_squared / squared
-            return self._value(
-                wave, float(modes.eigenvalues[0])
-            ), self.cell.filling * slope / squared
+            value = self._value(wave, float(modes.eigenvalues[0]))
+            return value, self.cell.filling * slope / squared
 
         # Off the grid, where symmetry may make a saddle look like a minimum; not as far as the
         # next points, one of which may be Γ.
@@ -137,24 +131,9 @@ def zone_path(
 ) -> tuple[list[Wave], list[int]]:
     """``count`` wave vectors through the corners of a zone, about evenly spaced.
 
-    Parameters
-    ----------
-    corners
-        Names and phases [rad], such as ``ZONES["square"]``.
-    lattice
-        (2, 2) lattice vectors as rows [mm].
-    count
-        Number of points, corners included.
-
-    Returns
-    -------
-    points, stops
-        Phases [rad], and the places of the corners among them.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two corners, or fewer points than corners.
+    ``corners`` are names and phases [rad], such as ``ZONES["square"]``, ``lattice`` (2, 2) the
+    vectors as rows [mm]. Returns phases [rad], and the places of the corners among them. An
+    InputError refuses fewer than two corners, or fewer points than corners.
     """
     if len(corners) < 2 or count < len(corners):
         raise InputError(

@@ -38,12 +38,8 @@ Batch = NDArray[Any]  # of real or complex numbers
 class BlochMap:
     """Components of displacement that are copies of others, some in other cells.
 
-    Parameters
-    ----------
-    places
-        (n,) which unknown, 0 ... size - 1, each component follows.
-    shift
-        (n, 2) integers R: it lies R1 a1 + R2 a2 from there.
+    ``places`` (n,) say which unknown, 0 ... size - 1, each component follows, and ``shift`` (n, 2),
+    integers R, that it lies R1 a1 + R2 a2 from there.
     """
 
     def __init__(self, places: IntArray, shift: IntArray) -> None:
@@ -102,14 +98,8 @@ def applied(operator: Callable[[FloatArray], FloatArray], vectors: Batch) -> Bat
 class ShiftedEntries:
     """The entries of unreduced matrices summed by their place in T^H A T and by R' - R.
 
-    Parameters
-    ----------
-    differences
-        (e, 2) R' - R of each unreduced entry.
-    entries
-        (e,) its number, 0 ... count - 1, among those of the reduced matrix.
-    count
-        Number of reduced entries.
+    ``differences`` (e, 2) are R' - R of the unreduced entries, ``entries`` (e,) their numbers among
+    the ``count`` entries of the reduced matrix.
     """
 
     def __init__(self, differences: IntArray, entries: IntArray, count: int) -> None:
@@ -137,13 +127,8 @@ class BoundaryDofs:
     """The components of displacement with copies in other cells, and how their matrices reduce.
 
     ``interior`` and ``boundary`` are the components without and with copies, ``interior_places``
-    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is that of the
-    boundary alone.
-
-    Parameters
-    ----------
-    bloch_map
-        Of all components of the mesh's nodes.
+    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is made from that of
+    all components, and has the boundary alone.
     """
 
     def __init__(self, bloch_map: BlochMap) -> None:
@@ -174,15 +159,8 @@ class Reduction:
     """The pattern of reduced matrices; the same for every matrix of one mesh.
 
     Reduced unknowns are the masters' displacements, permuted so that factors have little
-    fill-in: ``order[j]`` is the component (2 * master + axis) at place j.
-
-    Parameters
-    ----------
-    pattern
-        (2 n, 2 n) any matrix with the mesh's sparsity, the two components of a node side by
-        side.
-    periodicity
-        Of the mesh's nodes.
+    fill-in: ``order[j]`` is the component (2 * master + axis) at place j. ``pattern`` (2 n, 2 n) is
+    any matrix with the mesh's sparsity, the two components of a node side by side.
     """
 
     def __init__(self, pattern: csr_array, periodicity: Periodicity) -> None:
@@ -278,15 +256,7 @@ def negative_pivots(factor: Any) -> int:
 
 
 class Condensation:
-    """A symmetric matrix of a mesh's nodes, condensed onto the nodes that have copies.
-
-    Parameters
-    ----------
-    matrix
-        (2 n, 2 n), the two components of a node side by side.
-    dofs
-        Which nodes have copies.
-    """
+    """A symmetric matrix (2 n, 2 n) of a mesh's nodes, condensed onto those that have copies."""
 
     def __init__(self, matrix: csr_array, dofs: BoundaryDofs) -> None:
         self.dofs = dofs

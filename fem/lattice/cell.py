@@ -31,12 +31,12 @@ _AMPLITUDE_TOLERANCE = 1e-11  # relative
 
 @dataclass(frozen=True, eq=False)
 class CellState:
-    """An equilibrium of a cell on its primary path.
+    """An equilibrium of a cell.
 
     Parameters
     ----------
     load
-        The load parameter e: for compressions the nominal strain [-].
+        e: for compressions the nominal strain [-].
     gradient, gradient_rate
         (2, 2) F̄ and dF̄/de [-].
     fluctuation, fluctuation_rate
@@ -61,14 +61,9 @@ class CellState:
 
 @dataclass(frozen=True, eq=False)
 class Amplitude:
-    """A linear measure of the fluctuation w that is prescribed, while the load is found.
+    """``weights . w = value`` [mm] is prescribed, while the load is found.
 
-    Parameters
-    ----------
-    weights
-        (2 count,) in the order of ``Reduction``; not those of a translation.
-    value
-        What ``weights . w`` must be [mm].
+    Weights (2 count,) are in the order of ``Reduction``, and not those of a translation.
     """
 
     weights: FloatArray
@@ -76,18 +71,9 @@ class Amplitude:
 
 
 class LinearisedCell:
-    """The equations of a cell at a trial state.
+    """The equations of a cell at a trial state of load [-], F̄ (4,) and w (2 count,) [mm].
 
-    Parameters
-    ----------
-    cell, loading
-        What is loaded, and how.
-    load
-        Of the trial state [-].
-    gradient, fluctuation
-        (4,) F̄ and (2 count,) w of the trial state [-, mm].
-    amplitude
-        If prescribed, the load is an unknown.
+    With a prescribed amplitude the load is an unknown.
     """
 
     def __init__(
@@ -140,25 +126,25 @@ class LinearisedCell:
 
     @property
     def is_solved(self) -> bool:
-        """Whether no force, inner or macroscopic, is left."""
+        """Whether all forces, internal and macroscopic, are in equilibrium."""
         inner = _LOAD_TOLERANCE * np.linalg.norm(self.on_affine @ self.rate)
         outer = _LOAD_TOLERANCE * np.linalg.norm(self.condensed) * np.linalg.norm(self.rate)
         return bool(
             np.linalg.norm(self.forces) <= inner
             and np.linalg.norm(self._unbalanced) <= outer
-            and abs(self._excess) <= _AMPLITUDE_TOLERANCE * abs(self._wanted)
+            and self._has_amplitude
         )
 
     @property
-    def _wanted(self) -> float:
-        return 0.0 if self.amplitude is None else self.amplitude.value
+    def _has_amplitude(self) -> bool:
+        amplitude = self.amplitude
+        return amplitude is None or (
+            abs(self._excess(amplitude)) <= _AMPLITUDE_TOLERANCE * abs(amplitude.value)
+        )
 
-    @property
-    def _excess(self) -> float:
+    def _excess(self, prescribed: Amplitude) -> float:
         """The amplitude in excess of what is prescribed [mm]."""
-        if self.amplitude is None:
-            return 0.0
-        return float(self.amplitude.weights @ self.fluctuation) - self._wanted
+        return float(prescribed.weights @ self.fluctuation) - prescribed.value
 
     def step(self) -> tuple[float, FloatArray, FloatArray]:
         """Newton's changes of the load, of F̄ (4,) and of the fluctuation."""
@@ -175,7 +161,7 @@ class LinearisedCell:
         else:
             weights = self.amplitude.weights[self.cell.free_dofs]
             stiffness = np.vstack([stiffness, weights @ self.response @ along])
-            rest = np.append(rest, self._excess + weights @ relaxed)
+            rest = np.append(rest, self._excess(self.amplitude) + weights @ relaxed)
         unknown = np.linalg.solve(stiffness, -rest)
         dF = along @ unknown
         change = 0.0 if self.amplitude is None else float(unknown[-1])
@@ -218,13 +204,6 @@ class PeriodicCell:
     ``filling`` is the share of the cell that is material [-]; ``factorisations`` counts every
     factorisation of an equilibrium. ``affine`` (2 n, 4) are the displacements of F̄_11, F̄_12,
     F̄_21 and F̄_22 [mm]; ``free_dofs`` says which reduced unknowns are not fixed.
-
-    Parameters
-    ----------
-    cell
-        Mesh and lattice vectors [mm]; primitive or enlarged.
-    material
-        Strain energy density [MPa].
     """
 
     def __init__(self, cell: UnitCell, material: Material) -> None:
@@ -249,7 +228,7 @@ class PeriodicCell:
     ) -> CellState | None:
         """The equilibrium at a load, by Newton's method along the tangent of a state nearby.
 
-        None where Newton's method does not arrive, or arrives at a reversed element.
+        None where it does not converge, or does with a reversed element.
         """
         F: FloatArray = np.eye(2)
         w: FloatArray = np.zeros(self.reduction.size)
@@ -269,8 +248,7 @@ class PeriodicCell:
     ) -> CellState | Failure:
         """The equilibrium that Newton's method finds from a guess of F̄ (2, 2) and w.
 
-        With an ``amplitude`` prescribed the load is a guess, too. A reversed element is a
-        failure.
+        With an ``amplitude`` prescribed the load is a guess, too.
         """
         F: FloatArray = gradient.ravel()
         w = fluctuation

@@ -46,17 +46,8 @@ _MIRRORED = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 class UnitCell:
     """A piece of a lattice whose copies, moved by the lattice vectors, make up all of it.
 
-    Parameters
-    ----------
-    mesh
-        T6 mesh [mm].
-    lattice
-        (2, 2) lattice vectors a1 and a2 as rows [mm].
-
-    Raises
-    ------
-    InputError
-        If the mesh is not periodic; the message names the nodes without a partner.
+    A T6 mesh [mm] and the lattice vectors a1 and a2 as rows (2, 2) [mm]. An InputError refuses a
+    mesh that is not periodic, and names the nodes without a partner.
     """
 
     mesh: Mesh
@@ -77,13 +68,7 @@ class UnitCell:
         return float(abs(np.linalg.det(self.lattice)))
 
     def enlarged(self, m: int, n: int) -> UnitCell:
-        """The cell of m x n copies along a1 and a2.
-
-        Raises
-        ------
-        InputError
-            If there is less than one copy along either.
-        """
+        """The cell of m x n copies along a1 and a2, at least one along either."""
         if m < 1 or n < 1:
             raise InputError(f"enlarged cell: expected at least 1 x 1 copies, got {m} x {n}")
         blocks = [
@@ -97,12 +82,7 @@ class UnitCell:
 def square(pitch: float, diameter: float, size: float) -> UnitCell:
     """The primitive cell of circular holes in square stacking, a hole's centre at the origin.
 
-    Parameters
-    ----------
-    pitch, diameter
-        Distance of the holes' centres l and diameter d [mm]; 0 < d < l.
-    size
-        Target edge length of the elements [mm].
+    Distance of the holes' centres l and diameter d, 0 < d < l, and size of the elements [mm].
     """
     _check(pitch, diameter, size)
     quarter = quarter_cell(pitch, diameter, size)
@@ -114,14 +94,7 @@ def hexagonal(pitch: float, diameter: float, size: float) -> UnitCell:
     """The primitive cell of circular holes in hexagonal stacking: a hexagon about one hole.
 
     a1 points along x, a2 stands 60 degrees from it. ``hexagonal(...).enlarged(2, 2)`` is the
-    4-hole cell, which has room for the modes of all three M points.
-
-    Parameters
-    ----------
-    pitch, diameter
-        Distance of the holes' centres and their diameter [mm]; 0 < d < pitch.
-    size
-        Target edge length of the elements [mm].
+    4-hole cell, which has room for the modes of all three M points. Lengths as in :func:`square`.
     """
     _check(pitch, diameter, size)
     wedge = _wedge(pitch, diameter, size)
@@ -183,12 +156,8 @@ def chiral(
         are as long as the wall is thick. Half of that thickness is a good choice.
     ligaments
         Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
-    ring_radius
-        Outer radius of the rings [mm]; 0.25 pitch unless given.
-    ring_thickness
-        Of the rings' walls [mm]; 0.1 pitch unless given.
-    ligament_thickness
-        [mm]; 0.05 pitch unless given.
+    ring_radius, ring_thickness, ligament_thickness
+        Outer radius, 0.25 pitch unless given; thickness of the walls, 0.1 and 0.05 pitch [mm].
     handedness
         The sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
         leaves its ring. One lattice is the mirror image of the other.
@@ -199,13 +168,10 @@ def chiral(
         If rings touch, or ligaments are too thick to leave their ring apart from each other or
         to have a free length.
     """
-    shape = _RingAndLigaments(
-        pitch,
-        RING_RADIUS * pitch if ring_radius is None else ring_radius,
-        RING_THICKNESS * pitch if ring_thickness is None else ring_thickness,
-        LIGAMENT_THICKNESS * pitch if ligament_thickness is None else ligament_thickness,
-        ligaments,
-    )
+    usual = (RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS)
+    given = (ring_radius, ring_thickness, ligament_thickness)
+    lengths = (s * pitch if g is None else g for s, g in zip(usual, given, strict=True))
+    shape = _RingAndLigaments(pitch, *lengths, ligaments)
     require_size(size, pitch**2)
     if handedness not in HANDEDNESS:
         raise InputError(
@@ -236,34 +202,25 @@ class _RingAndLigaments:
     ligaments: int
 
     def __post_init__(self) -> None:
+        radius, wall, ligament = self.ring_radius, self.ring_thickness, self.ligament_thickness
+        fault = ""
         if self.ligaments not in (4, 6):
-            raise InputError(
-                "chiral cell: expected 4 (tetrachiral) or 6 (hexachiral) ligaments, got "
-                f"{self.ligaments}"
-            )
-        if not 0 < 2 * self.ring_radius < self.pitch < math.inf:
-            raise InputError(
-                "chiral cell: expected 0 < 2 ring_radius < pitch (rings must not touch), got "
-                f"ring_radius = {self.ring_radius} mm, pitch = {self.pitch} mm"
-            )
-        if not 0 < self.ring_thickness < self.ring_radius:
-            raise InputError(
-                "chiral cell: expected 0 < ring_thickness < ring_radius, got "
-                f"ring_thickness = {self.ring_thickness} mm, ring_radius = {self.ring_radius} mm"
-            )
-        thickest = self.ring_radius * (1.0 - math.cos(2 * math.pi / self.ligaments))
-        if not 0 < self.ligament_thickness < thickest:
-            raise InputError(
-                f"chiral cell: expected 0 < ligament_thickness < {thickest:.4g} mm (the ligaments "
-                f"of a ring must not touch), got {self.ligament_thickness} mm; make ligaments "
-                "thinner or rings larger"
-            )
-        if not self.middle > self.foot:
-            raise InputError(
-                "chiral cell: expected ligaments with a free length, got rings "
-                f"{self.pitch - 2 * self.ring_radius:.4g} mm apart with ligaments "
-                f"{self.ligament_thickness} mm thick; make rings smaller or ligaments thinner"
-            )
+            fault = f"4 (tetrachiral) or 6 (hexachiral) ligaments, got {self.ligaments}"
+        elif not 0 < 2 * radius < self.pitch < math.inf:
+            fault = "0 < 2 ring_radius < pitch (rings must not touch), got "
+            fault += f"ring_radius = {radius} mm, pitch = {self.pitch} mm"
+        elif not 0 < wall < radius:
+            fault = "0 < ring_thickness < ring_radius, got "
+            fault += f"ring_thickness = {wall} mm, ring_radius = {radius} mm"
+        elif not 0 < ligament < (most := radius * (1.0 - math.cos(2 * math.pi / self.ligaments))):
+            fault = f"0 < ligament_thickness < {most:.4g} mm (the ligaments of a ring must not "
+            fault += f"touch), got {ligament} mm; make ligaments thinner or rings larger"
+        elif not self.middle > self.foot:
+            fault = f"ligaments with a free length, got rings {self.pitch - 2 * radius:.4g} mm "
+            fault += f"apart with ligaments {ligament} mm thick; make rings smaller or ligaments "
+            fault += "thinner"
+        if fault:
+            raise InputError(f"chiral cell: expected {fault}")
 
     @property
     def middle(self) -> float:
@@ -287,28 +244,18 @@ class _RingAndLigaments:
         leaves, touches = math.atan2(y, self.foot), 0.5 * math.pi
         free = 2 * math.pi / self.ligaments - (touches - leaves)
         low, high = leaves - 0.5 * free, touches + 0.5 * free
-        corners = [
-            _polar(inner, low),
-            _polar(outer, low),
-            (self.foot, y),
-            (self.middle, y),
-            (self.middle, outer),
-            (0.0, outer),
-            _polar(outer, high),
-            _polar(inner, high),
+        sides = [  # from a corner on, and how long
+            (_polar(inner, low), self.ring_thickness),
+            (_polar(outer, low), 0.5 * free * outer),
+            ((self.foot, y), self.middle - self.foot),
+            ((self.middle, y), self.ligament_thickness),
+            ((self.middle, outer), self.middle),
+            ((0.0, outer), 0.5 * free * outer),
+            (_polar(outer, high), self.ring_thickness),
+            (_polar(inner, high), 2 * math.pi / self.ligaments * inner),
         ]
-        lengths = [
-            self.ring_thickness,
-            0.5 * free * outer,
-            self.middle - self.foot,
-            self.ligament_thickness,
-            self.middle,
-            0.5 * free * outer,
-            self.ring_thickness,
-            2 * math.pi / self.ligaments * inner,
-        ]
-        divisions = [divisions_of(length, size) for length in lengths]
-        block = mesh_block(corners, divisions, arcs=[1, 5, 7])
+        divisions = [divisions_of(length, size) for _, length in sides]
+        block = mesh_block([corner for corner, _ in sides], divisions, arcs=[1, 5, 7])
         return block.turned(-math.atan2(outer - 0.5 * self.ligament_thickness, self.middle))
 
 

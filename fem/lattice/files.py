@@ -1,4 +1,4 @@
-"""Unit cells of one's own: from a mesh that meshio reads, or from a gmsh model.
+"""Unit cells from files: a mesh that meshio reads, a geometry or a model of gmsh.
 
 Lengths are millimetres. Triangles become a plane T6 mesh, counter-clockwise, neither flat nor
 folded. What the copies of a cell must do to fit together is checked by ``periodicity``, which
@@ -48,40 +48,36 @@ def read_cell(
     Parameters
     ----------
     path
-        A mesh of six-node triangles in the x-y plane, in any format of meshio or gmsh; three-node
+        A plane mesh [mm] of six-node triangles, in any format of meshio or gmsh; three-node
         triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
-        (suffixes ``GEOMETRY``), whose opposite sides are divided alike. [mm] If a gmsh
-        file names physical surfaces, these are the material.
+        (suffixes ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
     lattice
         (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x and
         y, as wide and as high as its material.
     size
-        Largest edge length of the elements that gmsh makes of a geometry [mm]; None: what the
-        geometry itself says.
+        Largest edge length [mm] of the elements of a geometry; None: what it says itself.
 
     Raises
     ------
     InputError
-        If there is no such file, or it can't be read; has no triangles, or other elements as
-        well; isn't plane; has elements inside out, or is not periodic.
+        If there is no such file or it can't be read, is no plane mesh of sound triangles, or is
+        not periodic.
     """
     path = Path(path)
     require_file(path, "a cell (mesh or geometry)", "draw or export one")
     is_geometry = path.suffix.lower() in GEOMETRY
     if size is not None and not is_geometry:
-        raise InputError(
-            f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not for meshes"
-        )
+        raise InputError(f"{path}: a size is for geometries ({', '.join(GEOMETRY)}), not meshes")
     if is_geometry or path.suffix.lower() == ".msh":
         _require_readable(path)
         with quiet_gmsh():
             _merge(path)
             return _from_model(lattice, size, is_geometry, str(path))
     source = read_any_mesh(path)
-    cells: Cells = {}
+    blocks: dict[str, list[IntArray]] = {}
     for block in source.cells:
-        rows = [cells[block.type]] if block.type in cells else []
-        cells[block.type] = np.vstack([*rows, np.asarray(block.data, dtype=np.int64)])
+        blocks.setdefault(block.type, []).append(np.asarray(block.data, dtype=np.int64))
+    cells = {name: np.vstack(parts) for name, parts in blocks.items()}
     return _unit_cell(np.asarray(source.points, dtype=np.float64), cells, lattice, str(path))
 
 
@@ -90,11 +86,6 @@ def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) 
 
     If the model has a mesh, that is taken as it is; if not, it is meshed with sides that are
     divided alike. Parameters and errors are those of :func:`read_cell`.
-
-    Raises
-    ------
-    InputError
-        If there is no model; and as :func:`read_cell` does.
     """
     if not gmsh.isInitialized():
         raise InputError("expected a gmsh model, got none: call gmsh.initialize() and build one")
@@ -250,9 +241,9 @@ def _unit_cell(
     """Check a mesh as files hold it, put it in order, and find its periodicity."""
     kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
     if kinds not in (["triangle"], ["triangle6"]):
+        got = " and ".join(kinds) or "no elements"
         raise InputError(
-            f"{source}: expected triangles of three or of six nodes and nothing else, got "
-            f"{' and '.join(kinds) or 'no elements'}"
+            f"{source}: expected triangles of three or of six nodes and nothing else, got {got}"
         )
     if not np.abs(points).max(initial=0.0) < _FARTHEST:
         raise InputError(f"{source}: expected finite nodes less than {_FARTHEST:g} mm from 0")
@@ -297,18 +288,9 @@ _SIDES = ((0, 1), (1, 2), (2, 0))
 def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:
     """A plane T6 mesh, counter-clockwise, without unused nodes.
 
-    Parameters
-    ----------
-    points
-        (n, 2) or (n, 3) with z = const [mm].
-    cells
-        (m, 3) or (m, 6) node numbers, corners first; sides of three-node triangles get a node in
-        their middle.
-
-    Raises
-    ------
-    InputError
-        If the mesh isn't plane, elements lie upon each other, or one is flat or folded.
+    From points (n, 2), or (n, 3) with z = const [mm], and cells (m, 3) or (m, 6), corners first;
+    sides of three-node triangles get a node in their middle. An InputError refuses a mesh that
+    isn't plane, has elements upon each other, or a flat or folded one.
     """
     used, numbers = np.unique(cells, return_inverse=True)
     nodes, cells = _in_plane(points[used]), numbers.reshape(cells.shape).astype(np.int64)

@@ -22,14 +22,10 @@ class CriticalSearch:
 
     Parameters
     ----------
-    largest
-        Load up to which to look [-].
     divisions
         Of each axis of the zone; an even number has the points M and X on the grid.
-    first_step, largest_step
-        Steps of the load [-].
-    tolerance
-        To which the critical load is located [-].
+    largest, first_step, largest_step, tolerance
+        Load up to which to look, its steps, and to which it is located [-].
     """
 
     largest: float = 0.3

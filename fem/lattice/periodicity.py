@@ -3,7 +3,7 @@
 The copies of a cell, moved by all integer combinations of two lattice vectors, must fit
 together: nodes upon nodes wherever material meets material. The cell may have any boundary (a
 parallelogram, a hexagon, one that cuts through holes), as long as its copies tile the lattice.
-Of a deformed cell :func:`overlaps` tells whether it has run into itself: contact isn't modelled.
+Whether a deformed cell has run into itself :func:`overlaps` finds: contact isn't modelled.
 """
 
 from __future__ import annotations
@@ -28,14 +28,8 @@ _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 class Periodicity:
     """The nodes of a cell as translates of independent ones ("masters").
 
-    Parameters
-    ----------
-    lattice
-        (2, 2) lattice vectors a1 and a2 as rows [mm].
-    master
-        (n,) number of each node's master, 0 ... count - 1.
-    shift
-        (n, 2) integers R: a node is at its master's position + R1 a1 + R2 a2.
+    Node i is at the position of ``master[i]``, 0 ... count - 1, plus R1 a1 + R2 a2 with the
+    integers R = ``shift[i]``; a1 and a2 are the rows of ``lattice`` (2, 2) [mm].
     """
 
     lattice: FloatArray
@@ -51,14 +45,8 @@ class Periodicity:
 def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -> Periodicity:
     """Pair the nodes of a T6 mesh that a lattice translation carries into each other.
 
-    Parameters
-    ----------
-    mesh
-        One cell [mm].
-    lattice
-        (2, 2) lattice vectors a1 and a2 as rows [mm].
-    tolerance
-        Largest distance of partners, as a share of the shorter lattice vector [-].
+    ``lattice`` are its vectors a1 and a2 as rows (2, 2) [mm], ``tolerance`` is the largest distance
+    of partners as a share of the shorter one [-].
 
     Raises
     ------
@@ -212,14 +200,8 @@ def overlaps(
 ) -> bool:
     """Whether material of a periodic cell lies upon itself or upon its copies.
 
-    Parameters
-    ----------
-    mesh, lattice
-        T6 mesh of the cell, and its lattice vectors as rows, undeformed [mm].
-    gradient
-        (2, 2) F̄, which carries the copies along.
-    displacement
-        (n, 2) of the nodes [mm].
+    T6 mesh and lattice vectors (rows) are undeformed [mm]; F̄ (2, 2) carries the copies along; the
+    displacement is (n, 2) of the nodes [mm].
     """
     nodes, vectors = mesh.nodes + displacement, lattice @ gradient.T
     triangles = nodes[mesh.cells[:, _PARTS].reshape(-1, 3)]

@@ -23,12 +23,10 @@ class Critical:
 
     Parameters
     ----------
-    strain
-        Critical nominal strain [-].
-    u
-        Displacement there.
+    strain, u
+        Critical nominal strain [-], and the displacement there.
     modes
-        The modes whose eigenvalues are nearest to zero, the critical one(s) first.
+        Those whose eigenvalues are nearest to zero, the critical one(s) first.
     eigenvalues
         (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.
     below, above
@@ -148,14 +146,8 @@ class _CriticalBracket:
             return None
         if beyond < 0:
             strain = last + 2 * tolerance * final / (final - beyond)
-        return Critical(
-            strain,
-            displacement_at([below], strain),
-            modes,
-            values,
-            below.negative_pivots,
-            above.negative_pivots,
-        )
+        pivots = below.negative_pivots, above.negative_pivots
+        return Critical(strain, displacement_at([below], strain), modes, values, *pivots)
 
 
 def _most_similar(mode: Mode, modes: Sequence[Mode]) -> Mode:

@@ -46,7 +46,7 @@ class EdgeCompression:
         Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
         strain [rad]: -e tilt y is added to its u_x.
     pins
-        Points (x, y) whose u_y is held [mm]; nodes have to be there.
+        Points (x, y) whose u_y is fixed [mm]; nodes have to be there.
     """
 
     half_width: float
@@ -65,12 +65,7 @@ class EdgeCompression:
 class SymmetricFactor:
     """The LDL^T factorisation of a symmetric matrix by MUMPS: solutions and inertia.
 
-    The order of elimination is found once; ``update`` factorises what the matrix is now.
-
-    Parameters
-    ----------
-    matrix
-        Assembled, symmetric; its pattern must stay.
+    The order of elimination is found once, so the matrix' pattern must stay.
     """
 
     def __init__(self, matrix: PETSc.Mat) -> None:
@@ -119,18 +114,8 @@ class Structure:
     """A meshed hyperelastic body under one loading: what its equilibrium equations need.
 
     Vectors are PETSc vectors over all displacement components; ``u`` includes the
-    constrained ones. ``factorisations`` counts every numerical factorisation.
-
-    Parameters
-    ----------
-    mesh
-        T6 mesh [mm] (needed on rank 0 only).
-    material
-        Strain energy density [MPa].
-    loading
-        What is prescribed where.
-    comm
-        The communicator to distribute over.
+    constrained ones. ``factorisations`` counts every numerical factorisation. The mesh (T6) is
+    needed on rank 0 only.
     """
 
     def __init__(
@@ -164,13 +149,13 @@ class Structure:
                 (np.abs(x[0] + loading.half_width) < tolerance) & (np.abs(x[1]) < tolerance)
             )
 
-        def held_y(x: FloatArray) -> NDArray[np.bool_]:
-            held = on_edge(x) if loading.edges == "clamped" else anchor(x)
+        def fixed_y(x: FloatArray) -> NDArray[np.bool_]:
+            fixed = on_edge(x) if loading.edges == "clamped" else anchor(x)
             for pin in loading.pins:
-                held |= np.hypot(x[0] - pin[0], x[1] - pin[1]) < tolerance
-            return held
+                fixed |= np.hypot(x[0] - pin[0], x[1] - pin[1]) < tolerance
+            return fixed
 
-        dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, held_y)
+        dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, fixed_y)
         if self.comm.allreduce(len(dofs_x)) == 0 or self.comm.allreduce(len(dofs_y)) == 0:
             raise InputError(
                 f"loading: expected nodes on the edges x = +-{loading.half_width} mm"
@@ -179,19 +164,19 @@ class Structure:
         x = self.V.tabulate_dof_coordinates()
         target = self._direction.x.array.reshape(-1, 2)
         target[dofs_x // 2, 0] = -0.5 * loading.length * np.sign(x[dofs_x // 2, 0])
-        self._stroke = self._direction.x.array.copy()
+        self._shortening = self._direction.x.array.copy()
         if loading.tilt != 0.0:
             turning = dofs_x[x[dofs_x // 2, 0] > 0.0] // 2
             target[turning, 0] -= loading.tilt * x[turning, 1]
         self._direction.x.scatter_forward()
-        self._held = np.union1d(dofs_x, dofs_y)
+        self._fixed = np.union1d(dofs_x, dofs_y)
         # Only the matrices use these, and there the value is of no account.
         self._bcs = [
             dolfinx.fem.dirichletbc(PETSc.ScalarType(0), dofs.astype(np.int32), self.V.sub(i))
             for i, dofs in enumerate((dofs_x, dofs_y))
         ]
         owned = self.V.dofmap.index_map.size_local * 2
-        self._held_owned = self._held[self._held < owned]
+        self._fixed_owned = self._fixed[self._fixed < owned]
 
     def _component_dofs(
         self, component: int, where: Callable[[FloatArray], NDArray[np.bool_]]
@@ -210,7 +195,7 @@ class Structure:
 
     def prescribe(self, u: PETSc.Vec, strain: float) -> None:
         """Set the constrained components of ``u`` to what the strain demands."""
-        u.array[self._held_owned] = strain * self._direction.x.array[self._held_owned]
+        u.array[self._fixed_owned] = strain * self._direction.x.array[self._fixed_owned]
 
     def nodal(self, u: PETSc.Vec) -> FloatArray:
         """(n, 2) displacement at the mesh's nodes, in their order [mm]; on every rank."""
@@ -224,7 +209,7 @@ class Structure:
         count = self.V.dofmap.index_map.size_local
         points = self.V.tabulate_dof_coordinates()[:count, :2]
         vector.array[:] = field(points).ravel()
-        vector.array[self._held_owned] = 0.0
+        vector.array[self._fixed_owned] = 0.0
         return vector
 
     def largest(self, u: PETSc.Vec) -> float:
@@ -237,13 +222,13 @@ class Structure:
     def residual(self, u: PETSc.Vec) -> PETSc.Vec:
         """Internal forces [N/mm], zero at the constrained components."""
         vector = self._assemble(self._forms.forces, u)
-        vector.array[self._held_owned] = 0.0
+        vector.array[self._fixed_owned] = 0.0
         return vector
 
     def load(self, u: PETSc.Vec) -> PETSc.Vec:
         """d(internal forces)/d(strain) at fixed free components [N/mm]."""
         vector = self._assemble(self._load_form, u)
-        vector.array[self._held_owned] = 0.0
+        vector.array[self._fixed_owned] = 0.0
         return vector
 
     def curvature(self, u: PETSc.Vec, direction: PETSc.Vec) -> float:
@@ -284,8 +269,8 @@ class Structure:
         By virtual work: d(energy)/d(strain) = force * length (+ moment * tilt) at equilibrium.
         """
         forces = self._assemble(self._forms.forces, u)
-        held = self._held_owned
-        work = float(forces.array[held] @ self._stroke[held])
+        fixed = self._fixed_owned
+        work = float(forces.array[fixed] @ self._shortening[fixed])
         return float(self.comm.allreduce(work)) / length
 
     def smallest_jacobian(self, u: PETSc.Vec) -> float:

@@ -50,14 +50,8 @@ class Constraint:
 class Linearisation:
     """How the structure answers to small changes of an equilibrium: serves states nearby, too.
 
-    Parameters
-    ----------
-    factor
-        Of the tangent stiffness there.
-    tangent
-        du/d(strain) along the path [mm].
-    load_size
-        The norm of the load there [N/mm]: see ``Structure.load``.
+    The factor of its tangent stiffness, ``tangent`` du/d(strain) along the path [mm], and the norm
+    of ``Structure.load`` [N/mm].
     """
 
     factor: SymmetricFactor
@@ -86,8 +80,6 @@ def correct(
 
     Parameters
     ----------
-    structure
-        What is to be in equilibrium.
     guess
         Start (left as it is); its constrained components are set from ``strain``.
     strain
@@ -113,7 +105,7 @@ def correct(
 class _Iterate:
     """A Newton iteration under way: where it is, and the step that led there.
 
-    A step is judged by the next one that the same factor would make from there, which is
+    A step is assessed by the next one that the same factor would make from there, which is
     a measure of the error in millimetres (natural monotonicity: Deuflhard, Newton Methods for
     Nonlinear Problems, Springer 2011, section 2.1); residuals are governed by what is stiff.
     """

@@ -28,14 +28,8 @@ _LITTLE, _DEPENDENT = 1e-4, 1e-12  # left of a vector's squared length: little, 
 class Mode:
     """An eigenpair K x = lambda M x, with x normalised to x . M x = 1.
 
-    Parameters
-    ----------
-    eigenvalue
-        lambda [N/mm^4] (stiffness per unit thickness over area).
-    vector
-        x, zero at the constrained components.
-    weighted
-        M x, so that overlaps with other vectors are plain dot products.
+    lambda [N/mm^4] is stiffness per unit thickness over area; x is zero at the constrained
+    components; ``weighted`` is M x, so that overlaps with other vectors are dot products.
     """
 
     eigenvalue: float
@@ -66,12 +60,10 @@ def lowest_modes(
 
     Parameters
     ----------
-    factor
-        Of the tangent stiffness.
-    mass
-        Mass matrix with zero rows at the constrained components.
+    factor, mass
+        Of the tangent stiffness; the mass matrix with zero rows at the constrained components.
     count
-        Number of modes wanted; more are returned if more are negative.
+        Requested number of modes; more are returned if more are negative.
     near
         Modes of a state nearby, as a start.
     tolerance

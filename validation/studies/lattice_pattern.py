@@ -326,7 +326,7 @@ def kind_of(found: LatticeCritical, largest: float) -> str:
 
     if not found.found:
         return "none" if found.load >= largest else "path ends"
-    if found.least.angle is not None:
+    if found.least_stable.angle is not None:
         return "long waves"
     alone = len(found.waves) == 1 and is_same(found.waves[0], PATTERN)
     return "pattern" if alone else "other waves"

@@ -46,6 +46,7 @@ from modeharvest.runs.lattice.results import (
     PeriodicField,
     exports_in,
     summary_of,
+    write_dispersion_table,
 )
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
@@ -101,7 +102,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
                 divisions = plan.map_divisions
                 zone.append(zone_map(cell_path, critical.load, divisions, self.progress))
             replace(found, zone=tuple(zone)).write(path)
-            found.write_csv(table)
+            write_dispersion_table(found, table)
             return path, table
 
         return self.do("dispersion", self._keys["dispersion"], work, lambda: Dispersion.read(path))

@@ -46,6 +46,7 @@ of unit density [N/mm^4]:
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -61,7 +62,7 @@ from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_s
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json
+from modeharvest.util.files import atomic, read_json
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 
 if TYPE_CHECKING:
@@ -126,9 +127,9 @@ class CriticalPoint:
     @classmethod
     def of(cls, loading: str, found: LatticeCritical) -> CriticalPoint:
         """Take the plain values of a search's result."""
-        least = found.least
+        least = found.least_stable
         return cls(loading, found.load, found.found, found.outcome, found.waves, found.below,
-                   found.above, found.earlier, least.value, least.angle)  # fmt: skip
+                   found.above, found.unstable_before, least.value, least.angle)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -376,3 +377,17 @@ def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
         for part in found.zone
     ]
     return {"dispersion": along, "zone": zone}
+
+
+def write_dispersion_table(found: Dispersion, path: Path | str) -> None:
+    """Write the path as a table for own plots: a row for each load and wave vector."""
+    at = dict(zip(found.stops, found.labels, strict=True))
+    bands = [f"eigenvalue_{k + 1}_N_per_mm4" for k in range(found.bands)]
+    head = ["load", "corner", "phase_1_rad", "phase_2_rad", "distance_rad_per_mm", *bands]
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(head)
+        for load, values in zip(found.loads, found.eigenvalues, strict=True):
+            for k, (wave, row) in enumerate(zip(found.waves, values, strict=True)):
+                numbers = [*wave, found.distances[k], *row]
+                table.writerow([f"{load:.9g}", at.get(k, ""), *(f"{x:.9g}" for x in numbers)])
