@@ -7,6 +7,6 @@ dolfinx. The whole of it for a specimen::
     from modeharvest.fem.simulate import simulate
     solution = simulate(Experiment(strains=(0.078, 0.128)))
 
-``path`` follows a specimen through buckling, ``lattice`` holds periodic cells of infinite
+``path`` follows a specimen through buckling, ``lattice`` has periodic cells of infinite
 lattices, ``bloch`` their waves of any length.
 """

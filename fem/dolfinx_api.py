@@ -28,7 +28,7 @@ _T6_FROM_VTK = [0, 1, 2, 4, 5, 3]
 
 
 def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
-    """Distribute a T6 mesh (held by rank 0, ignored elsewhere) over the communicator."""
+    """Distribute a T6 mesh (of rank 0, ignored elsewhere) over the communicator."""
     if comm.rank == 0:
         nodes, cells = mesh.nodes, mesh.cells[:, _T6_FROM_VTK]
     else:

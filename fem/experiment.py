@@ -52,9 +52,9 @@ class PathOptions:
                 f"growth above 1 and at most 100, got {self}"
             )
         if not 1e-12 <= self.critical_tolerance < 1:
+            got = self.critical_tolerance
             raise InputError(
-                "path options: expected a critical_tolerance from 1e-12 to 1, got "
-                f"{self.critical_tolerance}"
+                f"path options: expected a critical_tolerance of 1e-12 to 1, got {got}"
             )
 
 
@@ -64,10 +64,8 @@ class Experiment:
 
     Parameters
     ----------
-    specimen
-        Geometry [mm].
-    material
-        Strain energy density [MPa].
+    specimen, material
+        Geometry [mm] and strain energy density [MPa].
     strains
         Nominal strains of the snapshots, ascending, compression positive [-].
     mesh_size
@@ -80,14 +78,12 @@ class Experiment:
     imperfection
         Scatter of the holes; with any, there is no bifurcation to find and the one natural
         path is followed.
-    path
-        How the path is followed.
     tilt
         By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
         about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is
         not quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
     guided
-        Hold u_y at the solid junctions on the line of mid-height, as pins in a straight rail
+        Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail
         would; ``holes_y`` has to be even, rows not staggered. Keeps a long specimen from bowing
         sideways.
     """
@@ -109,7 +105,7 @@ class Experiment:
             raise InputError(f"strains: expected ascending positive ones, got {list(strains)}")
         if strains[-1] >= 0.5:
             raise InputError(
-                f"strains: expected nominal strains below 0.5 (0.128 is 12.8 %), got {strains[-1]}"
+                f"strains: expected less than 0.5 (0.128 is 12.8 %), got {strains[-1]}"
             )
         if not 0.0 < self.mesh_size < float("inf"):
             raise InputError(f"mesh_size: expected a positive length in mm, got {self.mesh_size}")

@@ -2,7 +2,7 @@
 
 UFL differentiates the energy W(F) to the first Piola-Kirchhoff stress P and the tangent, so
 a new material is one frozen dataclass with one method. F is the 2 x 2 in-plane deformation
-gradient; the stretch out of the plane is 1. UFL is imported where an energy is asked for, so
+gradient; the stretch out of the plane is 1. UFL is imported where an energy is computed, so
 that constants can be stated and checked without it.
 """
 
@@ -112,7 +112,7 @@ MATERIALS: dict[str, type[Any]] = {"ogden": Ogden, "two-term-I1": TwoTermI1}
 
 
 def material_table(material: Any) -> dict[str, Any]:
-    """Kind (the class' name) and constants, as solutions hold them."""
+    """Kind (the class' name) and constants, as in solutions."""
     return {"kind": type(material).__name__, **vars(material)}
 
 

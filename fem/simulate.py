@@ -158,8 +158,11 @@ class _Run:
         targets = [e for e in self.experiment.strains if e > critical.strain]
         pitch = self.experiment.specimen.pitch
         signs = {"buckled+": 1, "buckled-": -1}
-        wanted = [b for b in self.experiment.branches if b in signs]
-        return {b: follow_branch(self.follower, critical, targets, signs[b], pitch) for b in wanted}
+        return {
+            name: follow_branch(self.follower, critical, targets, signs[name], pitch)
+            for name in self.experiment.branches
+            if name in signs
+        }
 
     def _snapshots(
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
@@ -216,7 +219,7 @@ class _Run:
         }
 
     def _curve(self, states: list[State]) -> dict[str, Any]:
-        """What happened along a path, for plots: one entry for each state."""
+        """Quantities along a path, for plots: one entry for each state."""
         structure, length = self.follower.structure, self.experiment.specimen.length
         return {
             "nominal_strain": [s.strain for s in states],
@@ -227,7 +230,7 @@ class _Run:
         }
 
     def _warnings(self, snapshots: list[Snapshot]) -> list[str]:
-        """What is met but not stable although its branch is meant to be."""
+        """Snapshots that are not stable although their branch is meant to be."""
         return [
             f"{s.branch} at {100 * s.nominal_strain:g} % is not stable ({s.negative_pivots} "
             "negative pivots): the secondary bifurcation before it is not followed"

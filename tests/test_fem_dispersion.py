@@ -73,7 +73,7 @@ def test_the_map_holds_the_path_and_is_its_own_opposite(path: CellPath, found: D
 def test_the_softest_wave_of_the_square_s_grid_is_the_pattern(path: CellPath) -> None:
     """Whose eigenvalue is not the lowest of the grid: long waves' are, but not over |k|^2."""
     part = zone_map(path, LOADS[1], divisions=24)
-    value, wave = part.softest
+    value, wave = part.least_stable
     assert wave == (math.pi, math.pi)
     assert 0 < np.partition(part.eigenvalues.ravel(), 1)[1] < value
 

@@ -118,7 +118,7 @@ class _LoadSearch:
             target = min(load + step, largest)
             least = self._measured(self.path.at(target))
             path_ends = least is None
-            if least is None:  # somewhere between: what of the path is before its end?
+            if least is None:  # somewhere between: the path ends before it
                 target = max(state.load for state in self.path.states)
                 least = self._measured(self.path.at(target))
             assert least is not None, "a state that is known"

@@ -73,7 +73,7 @@ class ZoneMap:
     lattice: FloatArray
 
     @property
-    def softest(self) -> tuple[float, Wave]:
+    def least_stable(self) -> tuple[float, Wave]:
         """The eigenvalue [N/mm^4] and phases [rad] where lambda / |k|^2 is lowest, Γ left out.
 
         |k| is that of the shortest of the equivalent wave vectors.

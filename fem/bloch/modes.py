@@ -1,9 +1,9 @@
 """Modes and branches of a lattice as plain numpy, and their files (HDF5, VTU, XDMF).
 
-Neither dolfinx nor gmsh is needed to hold, read or use these. HDF5, to be read with h5py alone;
+Neither dolfinx nor gmsh is needed to read or use these. HDF5, to be read with h5py alone;
 m modes on a cell of n nodes::
 
-    @format "modeharvest-modes-1"   @element "T6"   @normalisation (in words)
+    @format "modeharvest-modes-1"   @element "T6"   @normalisation (a sentence)
     @load  load parameter of the state whose tangent the modes belong to [-]
     @info  JSON: material, loading, whether and where it is critical, versions ...
     nodes (n, 2) [mm], undeformed      cells (e, 6), nodes as in VTK, from 0

@@ -41,15 +41,13 @@ def follow(
     """Follow the branch that starts along a combination of critical modes.
 
     Only the amplitude of the combination is prescribed; all else, other modes included, is free
-    to follow, and ``BranchState.amplitudes`` tell what became of it.
+    to follow, and ``BranchState.amplitudes`` have the result.
 
     Parameters
     ----------
-    path
-        Primary path of the commensurate cell: that of ``modes.mesh``, such as
-        ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``.
-    modes
-        Modes of a critical state.
+    path, modes
+        Primary path of the commensurate cell, that of ``modes.mesh``, such as
+        ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``; its critical modes.
     combination
         (m,) coefficients; only their ratios and signs count. The opposite is the other half of
         the branch.
@@ -106,9 +104,9 @@ class _Tracing:
         states.sort(key=lambda state: state.load)
         curve = np.array([(p.amplitude, p.load) for p in self.points]).reshape(-1, 2)
         mix = tuple(float(c) for c in self.mix)
-        return Branch(mix, tuple(states), self._in_words(states, loads), curve)
+        return Branch(mix, tuple(states), self._outcome(states, loads), curve)
 
-    def _in_words(self, states: list[BranchState], loads: list[float]) -> str:
+    def _outcome(self, states: list[BranchState], loads: list[float]) -> str:
         if not self.points:
             return f"not followed: {self.stopped}"
         start, last = self.points[0], self.points[-1]
@@ -175,7 +173,7 @@ class _Tracing:
         return _stacked(np.zeros((2, 2)), (at_masters - at_masters[0]).ravel()[order])
 
     def _reoriented(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
-        """The start with the direction in which the branch really leaves, to judge by a point."""
+        """The start with the direction in which the branch leaves, by its first point."""
         amplitudes = self.weights @ (first.value[4:] - self.origin)
         return replace(start, rate=self._direction(amplitudes) * (1.0 / first.amplitude))
 

@@ -99,10 +99,10 @@ class LinearisedCell:
 
     def _eliminate(self, stiffness: csr_array) -> None:
         """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
-        cell, moving = self.cell, np.flatnonzero(self.cell.free_dofs)
+        cell, dofs = self.cell, np.flatnonzero(self.cell.free_dofs)
         self.stiffness, self.on_affine = stiffness, stiffness @ cell.affine
-        self.coupling = cell.reduction.restricted(self.on_affine)[moving]
-        inner = cell.reduction.reduced(stiffness).at(CENTRE)[moving][:, moving]
+        self.coupling = cell.reduction.restricted(self.on_affine)[dofs]
+        inner = cell.reduction.reduced(stiffness).at(CENTRE)[dofs][:, dofs]
         cell.factorisations += 1
         try:
             self._factor: Any = factorise(csc_array(inner))
@@ -180,9 +180,9 @@ class LinearisedCell:
             moduli=self.condensed.reshape(2, 2, 2, 2) / self.area,
         )
 
-    def _full(self, moving: FloatArray) -> FloatArray:
+    def _full(self, values: FloatArray) -> FloatArray:
         every = np.zeros(self.cell.reduction.size)
-        every[self.cell.free_dofs] = moving
+        every[self.cell.free_dofs] = values
         return every
 
 
@@ -191,7 +191,7 @@ _SMALLEST_STEP = 1e-6  # of the load
 
 
 class Failure(Enum):
-    """Why there is no equilibrium, in words."""
+    """Why there is no equilibrium, as a sentence."""
 
     NOT_CONVERGED = "Newton's method did not converge"
     REVERSED = "an element would be turned inside out (det F <= 0)"
@@ -274,8 +274,8 @@ class PeriodicCell:
         Those of w with F̄ fixed, and of the moduli of the free components (Haynsworth, Linear
         Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
         """
-        moving = np.flatnonzero(self.free_dofs)
-        inner = self.reduction.reduced(state.stiffness).at(CENTRE)[moving][:, moving]
+        dofs = np.flatnonzero(self.free_dofs)
+        inner = self.reduction.reduced(state.stiffness).at(CENTRE)[dofs][:, dofs]
         self.factorisations += 1
         free = loading.free
         moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]

@@ -55,7 +55,7 @@ class UnitCell:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lattice", np.array(self.lattice, dtype=np.float64))
-        _ = self.periodicity  # finds out, and says, what is wrong with the mesh
+        _ = self.periodicity  # or an InputError
 
     @cached_property
     def periodicity(self) -> Periodicity:
@@ -170,8 +170,11 @@ def chiral(
     """
     usual = (RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS)
     given = (ring_radius, ring_thickness, ligament_thickness)
-    lengths = (s * pitch if g is None else g for s, g in zip(usual, given, strict=True))
-    shape = _RingAndLigaments(pitch, *lengths, ligaments)
+    radius, wall, ligament = (
+        share * pitch if length is None else length
+        for share, length in zip(usual, given, strict=True)
+    )
+    shape = _RingAndLigaments(pitch, radius, wall, ligament, ligaments)
     require_size(size, pitch**2)
     if handedness not in HANDEDNESS:
         raise InputError(

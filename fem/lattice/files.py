@@ -149,7 +149,7 @@ def _mesh_periodically(lattice: ArrayLike | None) -> None:
     surfaces = gmsh.model.getEntities(2)
     _refuse_crossing({tag for _, tag in gmsh.model.getBoundary(surfaces, False, False)})
     curves = [tag for _, tag in gmsh.model.getBoundary(surfaces, combined=True, oriented=False)]
-    outline = [_marks(tag) for tag in curves]
+    outline = [_ends_and_middle(tag) for tag in curves]
     if outline:
         vectors = _lattice(lattice, mesh.getNodes()[1].reshape(-1, 3)[:, :2])
         for a, b, shift in _translates(outline, vectors):
@@ -190,7 +190,7 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def _marks(curve: int) -> FloatArray:
+def _ends_and_middle(curve: int) -> FloatArray:
     """(3, 2) ends, in the order of x and y, and middle of a curve of the current model [mm]."""
     low, high = (float(bound[0]) for bound in gmsh.model.getParametrizationBounds(1, curve))
     at = [low, high, 0.5 * (low + high)]
@@ -238,7 +238,7 @@ def _current_mesh() -> tuple[FloatArray, Cells]:
 def _unit_cell(
     points: FloatArray, cells: Mapping[str, IntArray], lattice: ArrayLike | None, source: str
 ) -> UnitCell:
-    """Check a mesh as files hold it, put it in order, and find its periodicity."""
+    """Check a mesh as it is in files, put it in order, and find its periodicity."""
     kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
     if kinds not in (["triangle"], ["triangle6"]):
         got = " and ".join(kinds) or "no elements"

@@ -95,7 +95,7 @@ class PathFollower:
             found.outcome is not NewtonOutcome.CONVERGED
             or self.structure.smallest_jacobian(found.u) <= 0.0
         ):
-            self.linearisation = None  # it may be that of a state astray
+            self.linearisation = None  # it may be that of a wrong state
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)
 
@@ -132,7 +132,7 @@ class PathFollower:
         until_unstable
             Stop after the first state with negative pivots.
         refuse_unstable
-            Take a step that lands on an unstable state, or far from where it was expected, for a
+            Take a step that arrives at an unstable state, or far from where it was expected, for a
             slip off a stable path (that of an imperfect specimen) and shorten it.
 
         Returns

@@ -23,7 +23,7 @@ STRAIN_TOLERANCE = 1e-11
 
 
 class NewtonOutcome(Enum):
-    """Why a Newton iteration ended; the value says it in words."""
+    """Why a Newton iteration ended; the value is a sentence."""
 
     CONVERGED = "the residual is below the tolerance"
     DIVERGED = "the residual kept growing or is not a number"

@@ -21,7 +21,7 @@ _NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
 _MOST_NEGATIVE = 24  # of the modes that are computed
 _LARGEST_SPACE = 60  # in blocks
 _ROOM = 48  # in vectors, at first
-_LITTLE, _DEPENDENT = 1e-4, 1e-12  # left of a vector's squared length: little, nothing
+_LITTLE, _DEPENDENT = 1e-4, 1e-12  # of a vector's squared length: little, nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def lowest_modes(
     """The lowest modes, by ascending eigenvalue: all negative ones, and at least one positive.
 
     Lanczos' method in blocks with the inverse of the stiffness, whose factor is there already. The
-    inertia says how many negative eigenvalues there are to be found; of more than 24 only those
+    inertia is the number of negative eigenvalues to be found; of more than 24 only those
     nearest to zero are. Deterministic.
 
     Parameters
@@ -77,17 +77,17 @@ def lowest_modes(
         krylov.grow()
         inverse, mix = np.linalg.eigh(krylov.projected)
         place = np.arange(len(inverse))
-        wanted = np.where(inverse < 0, place < negative, place >= len(place) - positive)
+        is_chosen = np.where(inverse < 0, place < negative, place >= len(place) - positive)
         residual = np.linalg.norm(krylov.rest @ mix[-krylov.rest.shape[1] :], axis=0)
-        are_there = np.sum(wanted) == negative + positive
+        are_there = np.sum(is_chosen) == negative + positive
         if krylov.is_exhausted or (
-            are_there and residual[wanted].max() <= tolerance * np.abs(inverse[wanted]).min()
+            are_there and residual[is_chosen].max() <= tolerance * np.abs(inverse[is_chosen]).min()
         ):
             break
-    vectors, weighted = mix[:, wanted].T @ krylov.vectors, mix[:, wanted].T @ krylov.images
+    vectors, weighted = mix[:, is_chosen].T @ krylov.vectors, mix[:, is_chosen].T @ krylov.images
     modes = [
         Mode(1.0 / float(value), _distributed(mass, x), _distributed(mass, y))
-        for value, x, y in zip(inverse[wanted], vectors, weighted, strict=True)
+        for value, x, y in zip(inverse[is_chosen], vectors, weighted, strict=True)
     ]
     return sorted(modes, key=lambda mode: mode.eigenvalue)
 
@@ -137,12 +137,12 @@ class _Krylov:
     def _orthonormal(self, block: FloatArray) -> tuple[FloatArray, FloatArray]:
         """An M-orthonormal basis of a block that the space lacks, and M times it.
 
-        Where little was left of some vectors it is mostly rounding: what it has of the space is
+        Where little of some vectors remains it is mostly rounding: what it has of the space is
         taken out, and the basis made anew (Stathopoulos & Wu, SIAM J. Sci. Comput. 23 (2002)
         2165-2182).
         """
-        block, image, left = self._normalised(block, self._applied(self._mass.matMult, block))
-        if left < _LITTLE:
+        block, image, kept = self._normalised(block, self._applied(self._mass.matMult, block))
+        if kept < _LITTLE:
             known = self._products(block, self.images)
             block, image = block - known @ self.vectors, image - known @ self.images
             block, image, _ = self._normalised(block, image)
@@ -153,7 +153,7 @@ class _Krylov:
     ) -> tuple[FloatArray, FloatArray, float]:
         """Orthonormal combinations of vectors; those that depend on others are left out.
 
-        And what was least left of a vector's squared length.
+        And the smallest part of a vector's squared length that was kept.
         """
         gram = self._products(block, image)
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))

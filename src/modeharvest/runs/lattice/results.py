@@ -373,7 +373,7 @@ def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
         corners = [[label, float(values[stop])] for label, stop in pairs]
         along.append({"load": float(load), "corners": corners})
     zone = [
-        {"load": part.load, "wave": list(part.softest[1]), "eigenvalue": part.softest[0]}
+        {"load": part.load, "wave": list(part.least_stable[1]), "eigenvalue": part.least_stable[0]}
         for part in found.zone
     ]
     return {"dispersion": along, "zone": zone}
