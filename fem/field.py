@@ -47,14 +47,16 @@ class Mesh:
 
     def __post_init__(self) -> None:
         if self.element not in NODES_PER_CELL:
-            raise InputError(f"expected one of {list(NODES_PER_CELL)}, got {self.element}")
+            known = list(NODES_PER_CELL)
+            raise InputError(f"expected an element among {known}, got {self.element}")
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(self.cells, dtype=np.int64))
         k = NODES_PER_CELL[self.element]
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 2:
             raise InputError(f"expected nodes of shape (n, 2), got {self.nodes.shape}")
         if self.cells.ndim != 2 or self.cells.shape[1] != k:
-            raise InputError(f"expected {self.element} cells (m, {k}), got {self.cells.shape}")
+            kind, shape = self.element, self.cells.shape
+            raise InputError(f"expected {kind} cells of shape (m, {k}), got {shape}")
         if not np.isfinite(self.nodes).all():
             raise InputError("expected finite node positions, got NaN or infinity")
         if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.nodes):

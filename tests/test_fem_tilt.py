@@ -85,7 +85,7 @@ def test_no_tilt_is_what_was_before_and_keeps_its_key() -> None:
         plate(WIDTH, HEIGHT, 3, 2), Ogden(), EdgeCompression(0.5 * WIDTH, WIDTH, tilt=0.0)
     )
     for structure in (plain, zero):
-        assert structure._stroke.tobytes() == structure._direction.x.array.tobytes()
+        assert structure._shortening.tobytes() == structure._direction.x.array.tobytes()
     assert "tilt" not in Case().plain()["experiment"]
     assert Case(experiment=Experiment(tilt=0.01)).plain()["experiment"]["tilt"] == 0.01
 

@@ -29,8 +29,6 @@ class LeastStable:
 
     Parameters
     ----------
-    load
-        [-].
     value
         filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves
         its limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable.

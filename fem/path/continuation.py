@@ -35,18 +35,10 @@ _RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """An equilibrium state: strain, displacement, its rate along the path, stability.
+    """An equilibrium state: nominal strain [-], displacement and du/d(strain) [mm], stability.
 
-    Parameters
-    ----------
-    strain
-        Nominal strain [-].
-    u, tangent
-        Displacement and du/d(strain) [mm].
-    negative_pivots
-        Of the tangent stiffness there.
-    eigenvalues
-        The lowest ones [N/mm^4], ascending; empty where none were computed.
+    ``eigenvalues`` are the lowest ones of the tangent stiffness [N/mm^4], ascending; empty where
+    none were computed.
     """
 
     strain: float
@@ -91,10 +83,8 @@ class PathFollower:
         None if Newton does not get there, or gets to a state with a reversed element.
         """
         found = correct(self.structure, guess, strain, self.linearisation, constraint)
-        if (
-            found.outcome is not NewtonOutcome.CONVERGED
-            or self.structure.smallest_jacobian(found.u) <= 0.0
-        ):
+        is_there = found.outcome is NewtonOutcome.CONVERGED
+        if not is_there or self.structure.smallest_jacobian(found.u) <= 0.0:
             self.linearisation = None  # it may be that of a wrong state
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)

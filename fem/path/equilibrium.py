@@ -14,7 +14,6 @@ from typing import Any
 import dolfinx
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from modeharvest.fem import dolfinx_api
@@ -139,51 +138,35 @@ class Structure:
         self._factor: SymmetricFactor | None = None
 
     def _constrain(self, loading: EdgeCompression) -> None:
-        tolerance = 1e-8 * loading.half_width
-
-        def on_edge(x: FloatArray) -> NDArray[np.bool_]:
-            return np.asarray(np.abs(np.abs(x[0]) - loading.half_width) < tolerance)
-
-        def anchor(x: FloatArray) -> NDArray[np.bool_]:
-            return np.asarray(
-                (np.abs(x[0] + loading.half_width) < tolerance) & (np.abs(x[1]) < tolerance)
-            )
-
-        def fixed_y(x: FloatArray) -> NDArray[np.bool_]:
-            fixed = on_edge(x) if loading.edges == "clamped" else anchor(x)
-            for pin in loading.pins:
-                fixed |= np.hypot(x[0] - pin[0], x[1] - pin[1]) < tolerance
-            return fixed
-
-        dofs_x, dofs_y = self._component_dofs(0, on_edge), self._component_dofs(1, fixed_y)
-        if self.comm.allreduce(len(dofs_x)) == 0 or self.comm.allreduce(len(dofs_y)) == 0:
+        x = self.V.tabulate_dof_coordinates()  # ghosts included
+        half, tolerance = loading.half_width, 1e-8 * loading.half_width
+        on_edge = np.abs(np.abs(x[:, 0]) - half) < tolerance
+        fixed_y = on_edge.copy()
+        if loading.edges != "clamped":
+            fixed_y = (np.abs(x[:, 0] + half) < tolerance) & (np.abs(x[:, 1]) < tolerance)
+        for pin in loading.pins:
+            fixed_y |= np.hypot(x[:, 0] - pin[0], x[:, 1] - pin[1]) < tolerance
+        along, across = np.flatnonzero(on_edge), np.flatnonzero(fixed_y)
+        if self.comm.allreduce(len(along)) == 0 or self.comm.allreduce(len(across)) == 0:
             raise InputError(
-                f"loading: expected nodes on the edges x = +-{loading.half_width} mm"
-                " (and one at mid-height for sliding edges), found none"
+                f"loading: expected nodes on the edges x = +-{half} mm (and one at mid-height for "
+                "sliding edges), found none"
             )
-        x = self.V.tabulate_dof_coordinates()
         target = self._direction.x.array.reshape(-1, 2)
-        target[dofs_x // 2, 0] = -0.5 * loading.length * np.sign(x[dofs_x // 2, 0])
+        target[along, 0] = -0.5 * loading.length * np.sign(x[along, 0])
         self._shortening = self._direction.x.array.copy()
         if loading.tilt != 0.0:
-            turning = dofs_x[x[dofs_x // 2, 0] > 0.0] // 2
+            turning = along[x[along, 0] > 0.0]
             target[turning, 0] -= loading.tilt * x[turning, 1]
         self._direction.x.scatter_forward()
-        self._fixed = np.union1d(dofs_x, dofs_y)
+        dofs = 2 * along, 2 * across + 1
         # Only the matrices use these, and there the value is of no account.
         self._bcs = [
-            dolfinx.fem.dirichletbc(PETSc.ScalarType(0), dofs.astype(np.int32), self.V.sub(i))
-            for i, dofs in enumerate((dofs_x, dofs_y))
+            dolfinx.fem.dirichletbc(PETSc.ScalarType(0), d.astype(np.int32), self.V.sub(axis))
+            for axis, d in enumerate(dofs)
         ]
-        owned = self.V.dofmap.index_map.size_local * 2
-        self._fixed_owned = self._fixed[self._fixed < owned]
-
-    def _component_dofs(
-        self, component: int, where: Callable[[FloatArray], NDArray[np.bool_]]
-    ) -> NDArray[np.int64]:
-        """Local numbers of the constrained displacement components, ghosts included."""
-        x = self.V.tabulate_dof_coordinates()
-        return 2 * np.flatnonzero(where(x.T)).astype(np.int64) + component
+        fixed = np.union1d(*dofs)
+        self._fixed_owned = fixed[fixed < 2 * self.V.dofmap.index_map.size_local]
 
     # -- states -------------------------------------------------------------------------
 
