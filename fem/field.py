@@ -82,18 +82,14 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """One equilibrium state.
+    """One equilibrium state, with the displacement (n, 2) at the mesh's nodes [mm].
 
     Parameters
     ----------
     nominal_strain
         Applied shortening over L, the length of the cellular part [-]; compression positive.
-    displacement
-        (n, 2) at the mesh's nodes [mm].
-    reaction
-        Compressive force on the loaded edge per unit thickness [N/mm].
-    energy
-        Stored energy per unit thickness [N].
+    reaction, energy
+        Compressive force on the loaded edge [N/mm] and stored energy [N], per unit thickness.
     negative_pivots
         Number of negative eigenvalues of the tangent stiffness; 0 means stable, None unknown.
     eigenvalues
@@ -141,10 +137,7 @@ class Solution:
     def at(self, nominal_strain: float) -> Snapshot:
         """The stable snapshot at a nominal strain (the first one listed, if several).
 
-        Raises
-        ------
-        InputError
-            If there is none at that strain.
+        An InputError names the strains there are if there is none.
         """
         found = [s for s in self.snapshots if abs(s.nominal_strain - nominal_strain) < 1e-9]
         if not found:
@@ -169,13 +162,7 @@ class Solution:
 
     @classmethod
     def read(cls, path: Path | str) -> Solution:
-        """Read what :meth:`write` wrote.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, cut short or of another format.
-        """
+        """Read what :meth:`write` wrote; an InputError refuses any other file."""
         remedy = "make it again with 'modeharvest fem'"
         with open_hdf5(path, "a solution (HDF5)", remedy, FORMAT) as file:
             mesh = read_mesh(file)
@@ -224,13 +211,7 @@ def _read_snapshot(group: h5py.Group) -> Snapshot:
 
 
 def read_any_mesh(path: Path | str) -> meshio.Mesh:
-    """Points, cells and nodal fields of a file of any format that meshio knows.
-
-    Raises
-    ------
-    InputError
-        If it can't be read, in one line.
-    """
+    """Points, cells and nodal fields of a file of any format that meshio knows."""
     what, remedy = "a mesh that meshio reads", "export it again"
     found = read_in_child("mesh", path, what, remedy)
     with reading(path, what, remedy):

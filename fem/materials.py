@@ -22,20 +22,11 @@ class Ogden:
 
     W = sum_i c_i/m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3 - m_i ln J) + kappa/2 (J - 1)^2
 
-    with the principal stretches l1, l2 and l3 = 1. Small strain: shear modulus
-    mu = sum(c_i)/2, Lame's lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)).
-    The form is that of van Bree et al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333;
-    the default constants are this project's choice (mu = 0.60 MPa, nu = 0.45), because the
-    paper's own are not public.
-
-    Parameters
-    ----------
-    moduli
-        c_i [MPa].
-    exponents
-        m_i [-], any real number but 0.
-    kappa
-        Volumetric modulus [MPa].
+    with the principal stretches l1, l2 and l3 = 1, ``moduli`` c_i [MPa], ``exponents`` m_i [-]
+    other than 0, and ``kappa`` [MPa]. Small strain: shear modulus mu = sum(c_i)/2, Lame's
+    lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)). The form is that of van Bree et
+    al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333; the default constants are this
+    project's choice (mu = 0.60 MPa, nu = 0.45), because the paper's own are not public.
     """
 
     moduli: tuple[float, ...] = (1.2,)
@@ -66,15 +57,10 @@ class Ogden:
 
 @dataclass(frozen=True)
 class TwoTermI1:
-    """W = c1 (I1 - 3) + c2 (I1 - 3)^2 - 2 c1 ln J + K/2 (J - 1)^2, with I1 = tr C + 1.
+    """W = c1 (I1 - 3) + c2 (I1 - 3)^2 - 2 c1 ln J + K/2 (J - 1)^2 [MPa], with I1 = tr C + 1.
 
-    Bertoldi, Boyce, Deschanel, Prange & Mullin, J. Mech. Phys. Solids 56 (2008) 2642-2668,
-    doi 10.1016/j.jmps.2008.03.006; defaults are theirs (nu = 0.490).
-
-    Parameters
-    ----------
-    c1, c2, bulk
-        c1, c2 and K [MPa].
+    ``bulk`` is K. Bertoldi, Boyce, Deschanel, Prange & Mullin, J. Mech. Phys. Solids 56 (2008)
+    2642-2668, doi 10.1016/j.jmps.2008.03.006; defaults are theirs (nu = 0.490).
     """
 
     c1: float = 0.55

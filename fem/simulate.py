@@ -176,9 +176,7 @@ class _Run:
         kept += [(state, name) for name, states in branches.items() for state in states]
         kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
         structure, length = self.follower.structure, self.experiment.specimen.length
-        found = [_snapshot(structure, length, state, name) for state, name in kept]
-        strains = self.experiment.strains
-        return [replace(s, nominal_strain=_exact(s.nominal_strain, strains)) for s in found]
+        return [_snapshot(structure, length, state, name) for state, name in kept]
 
     def _info(
         self, path: list[State], critical: Critical | None, branches: dict[str, list[State]]
@@ -188,9 +186,8 @@ class _Run:
             **e.described(),
             "mesh_size_mm": e.mesh_size,
             "critical": None if critical is None else self._critical_info(critical),
-            "path": {
-                name: self._curve(states) for name, states in {"primary": path, **branches}.items()
-            },
+            "path": {"primary": self._curve(path)}
+            | {name: self._curve(states) for name, states in branches.items()},
             "factorisations": self.follower.structure.factorisations,
             "unknowns": 2 * len(self.mesh.nodes),
             "versions": {
@@ -283,10 +280,6 @@ def _is_among(strain: float, strains: Sequence[float]) -> bool:
     return any(abs(strain - e) < 1e-12 for e in strains)
 
 
-def _exact(strain: float, strains: Sequence[float]) -> float:
-    return min(strains, key=lambda e: abs(strain - e))
-
-
 _ATTEMPTS = 3  # with shorter and shorter steps
 
 
@@ -313,14 +306,10 @@ def simulate_pattern(
 
     Parameters
     ----------
-    experiment
-        Specimen, material, edges and path options; strains and branches are not used.
-    mesh
-        Of the specimen.
-    pattern
-        What is measured.
-    target
-        The pattern's amplitude to be reached [mm].
+    experiment, mesh
+        Its strains and branches are not used; the mesh of its specimen.
+    pattern, target
+        What is measured, and the amplitude to be reached [mm].
     largest_strain
         Up to which to look for the first critical point [-].
 

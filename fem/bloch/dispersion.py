@@ -53,12 +53,10 @@ _MAP_ARRAYS = ("phases", "eigenvalues", "lattice")
 
 @dataclass(frozen=True, eq=False)
 class ZoneMap:
-    """The lowest eigenvalue over all of the zone at one load.
+    """The lowest eigenvalue over all of the zone at one load [-].
 
     Parameters
     ----------
-    load
-        [-].
     phases
         (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
     eigenvalues
@@ -145,13 +143,7 @@ class Dispersion:
 
     @classmethod
     def read(cls, path: Path | str) -> Dispersion:
-        """Read what ``write`` wrote.
-
-        Raises
-        ------
-        InputError
-            If there is no such file, or it is none of these.
-        """
+        """Read what ``write`` wrote; an InputError refuses any other file."""
         with open_hdf5(path, "a dispersion file (HDF5)") as file:
             arrays = {name: file[name][()] for name in _ARRAYS}
             labels = tuple(str(label) for label in file.attrs["labels"])

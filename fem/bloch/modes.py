@@ -46,10 +46,9 @@ class ModeSet:
 
     Parameters
     ----------
-    mesh
-        T6 mesh of the commensurate cell, undeformed [mm].
-    lattice, primitive
-        (2, 2) lattice vectors of that cell and of the primitive one, as rows [mm].
+    mesh, lattice, primitive
+        T6 mesh of the commensurate cell, undeformed, and lattice vectors of that cell and of the
+        primitive one as rows (2, 2) [mm].
     waves
         (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
     eigenvalues
@@ -58,10 +57,8 @@ class ModeSet:
         (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
         delta_ij. The sign is such that the first large component is positive. Waves with phases
         other than 0 and pi have their modes in pairs, which are the real and imaginary part.
-    load
-        Load parameter of the state whose tangent they belong to [-].
-    gradient
-        (2, 2) F̄ of that state [-].
+    load, gradient
+        Load parameter and F̄ (2, 2) of the state whose tangent they belong to [-].
     info
         Plain JSON values: lattice, material, loading, whether and where it is critical, versions.
     """
@@ -78,13 +75,8 @@ class ModeSet:
 
     def __post_init__(self) -> None:
         count = len(self.waves)
-        expected = {
-            "shapes": (count, len(self.mesh.nodes), 2),
-            "eigenvalues": (count,),
-            "lattice": (2, 2),
-            "primitive": (2, 2),
-            "gradient": (2, 2),
-        }
+        expected = {"shapes": (count, len(self.mesh.nodes), 2), "eigenvalues": (count,)}
+        expected |= dict.fromkeys(("lattice", "primitive", "gradient"), (2, 2))
         for name, shape in expected.items():
             values = getattr(self, name)
             if values.shape != shape or not np.isfinite(values).all():
@@ -99,8 +91,6 @@ class BranchState:
 
     Parameters
     ----------
-    load
-        [-].
     gradient, stress
         (2, 2) F̄ [-] and P̄ [MPa].
     energy, primary_energy
@@ -176,13 +166,7 @@ def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = (
 
 
 def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
-    """Read what :func:`write_modes` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cut short, of another format or inconsistent.
-    """
+    """Read what :func:`write_modes` wrote; an InputError refuses any other file."""
     with open_hdf5(path, "modes (HDF5)", "make it again with 'modeharvest modes'", FORMAT) as file:
         modes = _read_set(file)
         groups = file.get("branches", {})

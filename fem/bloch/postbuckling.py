@@ -231,16 +231,13 @@ class _Tracing:
         cell, primary = self.cell, self.primary.at(state.load)
         before = self.origin if primary is None else primary.fluctuation
         u = cell.displacement(state)
+        on_path = None if primary is None else cell.body.energy(cell.displacement(primary))
         return BranchState(
             load=state.load,
             gradient=state.gradient,
             stress=state.stress,
             energy=cell.body.energy(u) / cell.cell.area,
-            primary_energy=(
-                math.nan
-                if primary is None
-                else cell.body.energy(cell.displacement(primary)) / cell.cell.area
-            ),
+            primary_energy=math.nan if on_path is None else on_path / cell.cell.area,
             negative_eigenvalues=cell.negative_eigenvalues(self.loading, state),
             displacement=u,
             amplitudes=self.weights @ (state.fluctuation - before),

@@ -61,8 +61,8 @@ def real_modes(
     Raises
     ------
     InputError
-        If there is no wave (long waves are modes of no finite cell), one that isn't in the plane,
-        or one that doesn't repeat within ``largest`` cells.
+        If there is no wave (long waves are modes of no finite cell), or one doesn't repeat within
+        ``largest`` cells.
     """
     turns = _distinct([_commensurate(wave, largest) for wave in waves])
     if not turns:

@@ -3,10 +3,8 @@
 Each is made of one small block that gmsh meshes and numpy reflects, turns and places, so
 that partner nodes agree to rounding and the mesh has the lattice's own symmetries.
 
-Chiral lattices are rings joined by ligaments that touch them tangentially. The paper shows a
-chiral metamaterial without its measures, so that geometry is this project's own choice, never the
-authors'. It is the one of Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2 (six ligaments),
-and its tetrachiral sister with four:
+The paper shows a chiral metamaterial without its measures, so that geometry is this project's own
+choice: that of Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2, with six ligaments or four:
 
 - Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest
   neighbours by straight ligaments of constant thickness.
@@ -206,6 +204,7 @@ class _RingAndLigaments:
 
     def __post_init__(self) -> None:
         radius, wall, ligament = self.ring_radius, self.ring_thickness, self.ligament_thickness
+        most = radius * (1.0 - math.cos(2 * math.pi / max(self.ligaments, 1)))
         fault = ""
         if self.ligaments not in (4, 6):
             fault = f"4 (tetrachiral) or 6 (hexachiral) ligaments, got {self.ligaments}"
@@ -215,7 +214,7 @@ class _RingAndLigaments:
         elif not 0 < wall < radius:
             fault = "0 < ring_thickness < ring_radius, got "
             fault += f"ring_thickness = {wall} mm, ring_radius = {radius} mm"
-        elif not 0 < ligament < (most := radius * (1.0 - math.cos(2 * math.pi / self.ligaments))):
+        elif not 0 < ligament < most:
             fault = f"0 < ligament_thickness < {most:.4g} mm (the ligaments of a ring must not "
             fault += f"touch), got {ligament} mm; make ligaments thinner or rings larger"
         elif not self.middle > self.foot:

@@ -109,9 +109,8 @@ def _merge(path: Path) -> None:
     try:
         gmsh.merge(str(path))
     except Exception as error:  # gmsh raises nothing else
-        raise InputError(
-            f"expected a file that gmsh reads at {path}, got: {_message(error)}"
-        ) from error
+        got = _message(error)
+        raise InputError(f"expected a file that gmsh reads at {path}, got: {got}") from error
     finally:
         gmsh.option.setString("Geometry.OCCTargetUnit", unit)
 

@@ -49,12 +49,11 @@ class BranchOptions:
 
     Parameters
     ----------
-    first, longest
-        First and largest step of the amplitude, the rms displacement in the mode [-].
+    first, longest, farthest
+        First and largest step of the amplitude, the rms displacement in the mode, and the
+        amplitude where to stop [-].
     growth
         Of the step from one point to the next.
-    farthest
-        The amplitude where to give up [-].
     """
 
     # At small amplitudes the directions of a degenerate set are all but equivalent.
@@ -103,15 +102,9 @@ Rates = tuple[tuple[float | None, float | None], tuple[float | None, float | Non
 class MacroLoading:
     """For each component either of F̄ or of P̄ a value proportional to the load e.
 
-    F̄_ij = δ_ij + e · gradient_ij where that is given; where it is None, P̄_ij = e · stress_ij
-    (first Piola-Kirchhoff, over the whole cell, holes included) and F̄_ij is found.
-
-    Parameters
-    ----------
-    gradient
-        dF̄/de, row by row [-]; None where the stress is prescribed.
-    stress
-        dP̄/de [MPa]; 0 (a free side) unless given. Of no account where ``gradient`` is given.
+    F̄_ij = δ_ij + e · gradient_ij [-] where that is given; where it is None, P̄_ij = e · stress_ij
+    [MPa] (first Piola-Kirchhoff, over the whole cell, holes included; 0, a free side, unless
+    given) and F̄_ij is found.
     """
 
     gradient: Rates
@@ -119,10 +112,8 @@ class MacroLoading:
 
     def __post_init__(self) -> None:
         if not all(len(x) == 2 == len(x[0]) == len(x[1]) for x in (self.gradient, self.stress)):
-            raise InputError(
-                "macroscopic loading: expected gradient and stress as two rows of two, got "
-                f"{self.gradient} and {self.stress}"
-            )
+            got = f"{self.gradient} and {self.stress}"
+            raise InputError(f"macroscopic loading: expected two rows of two each, got {got}")
         given = [g for row in self.gradient for g in row if g is not None]
         if not np.isfinite([*given, *np.ravel(self.stress)]).all():
             raise InputError(f"macroscopic loading: expected finite rates, got {self}")

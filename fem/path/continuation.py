@@ -64,8 +64,6 @@ class PathFollower:
     def __post_init__(self) -> None:
         self.mass = self.structure.mass()
 
-    # -- one equilibrium ----------------------------------------------------------------
-
     def start(self) -> State:
         """The undeformed state."""
         u = self.structure.zero()
@@ -102,8 +100,6 @@ class PathFollower:
         self.linearisation = Linearisation(factor, tangent, float(load.norm()))
         return State(strain, u, tangent, factor.negative_pivots, eigenvalues)
 
-    # -- the primary path ---------------------------------------------------------------
-
     def follow_primary(
         self,
         states: list[State],
@@ -115,10 +111,8 @@ class PathFollower:
 
         Parameters
         ----------
-        states
-            Equilibria so far, at least one; the new ones are appended.
-        targets
-            Nominal strains to pass through [-]; those already passed are left out.
+        states, targets
+            Equilibria so far, at least one; targets already passed are left out.
         until_unstable
             Stop after the first state with negative pivots.
         refuse_unstable

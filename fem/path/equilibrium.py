@@ -30,12 +30,10 @@ _TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
 
 @dataclass(frozen=True)
 class EdgeCompression:
-    """Compression along x by displacing the two edges x = +-half_width towards each other.
+    """Compression along x by displacing the two edges x = +-half_width [mm] towards each other.
 
     Parameters
     ----------
-    half_width
-        Position of the loaded edges [mm].
     length
         The length that nominal strain refers to [mm]; e * length is the shortening.
     edges
@@ -168,8 +166,6 @@ class Structure:
         fixed = np.union1d(*dofs)
         self._fixed_owned = fixed[fixed < 2 * self.V.dofmap.index_map.size_local]
 
-    # -- states -------------------------------------------------------------------------
-
     def zero(self) -> PETSc.Vec:
         """The undeformed state."""
         vector = self._u.x.petsc_vec.duplicate()
@@ -199,8 +195,6 @@ class Structure:
         """The largest nodal displacement of ``u`` [mm]."""
         length = np.linalg.norm(u.array.reshape(-1, 2), axis=1)
         return float(self.comm.allreduce(float(np.max(length, initial=0.0)), MPI.MAX))
-
-    # -- operators at a state -----------------------------------------------------------
 
     def residual(self, u: PETSc.Vec) -> PETSc.Vec:
         """Internal forces [N/mm], zero at the constrained components."""

@@ -32,10 +32,7 @@ class NewtonOutcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """The one equation that picks a point of the path: weights . (u - origin) = amplitude.
-
-    The alternative, used where the constraint is None, is to prescribe the strain.
-    """
+    """What picks a point of the path instead of a strain: weights . (u - origin) = amplitude."""
 
     weights: PETSc.Vec
     origin: PETSc.Vec
