@@ -27,10 +27,8 @@ class PathOptions:
 
     Parameters
     ----------
-    first_step, largest_step
-        Steps of nominal strain along the primary path [-].
-    critical_tolerance
-        To which the critical strain is located [-].
+    first_step, largest_step, critical_tolerance
+        Steps of nominal strain along the primary path; to which the critical one is located [-].
     first_amplitude
         Largest nodal displacement of the first step onto the branch, as a share of the pitch
         or whatever length the branch is given [-].

@@ -95,10 +95,8 @@ class Dispersion:
     ----------
     labels, stops
         Names of the path's corners, and their places among its points.
-    waves
-        (p, 2) phases (k . a1, k . a2) [rad].
-    distances
-        (p,) length of the path so far [rad/mm].
+    waves, distances
+        (p, 2) phases (k . a1, k . a2) [rad] and (p,) length of the path so far [rad/mm].
     loads
         (s,) [-].
     eigenvalues

@@ -64,9 +64,8 @@ def follow(
     """
     _check(path.cell, modes, combination, loads)
     mix = np.asarray(combination, dtype=np.float64)
-    return _Tracing(path, modes, mix / np.linalg.norm(mix), options or BranchOptions()).run(
-        sorted(loads), progress
-    )
+    tracing = _Tracing(path, modes, mix / np.linalg.norm(mix), options or BranchOptions())
+    return tracing.run(sorted(loads), progress)
 
 
 class _Tracing:

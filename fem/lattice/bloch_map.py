@@ -1,19 +1,15 @@
 """The Bloch map T(k) and matrices T(k)^H K T(k): a lattice reduced to one cell, for any wave.
 
-A Bloch wave is a displacement that changes from cell to cell by a phase only: at a node that
-lies R1 a1 + R2 a2 from its master, u = exp(i (R1 k1 + R2 k2)) times the master's, with the
-phases k1 = k . a1 and k2 = k . a2. An entry of K between nodes of shifts R and R' is thus
+At a node that lies R1 a1 + R2 a2 from its master, u = exp(i (R1 k1 + R2 k2)) times the master's,
+with the phases k1 = k . a1 and k2 = k . a2. An entry of K between nodes of shifts R and R' is thus
 multiplied by exp(i k . (R' - R)). Sorted by R' - R once, the reduced matrix for any k is a sum
 of a few arrays over one sparsity pattern.
 
 Only nodes with copies in other cells feel the phase. So the others are eliminated once
-(:class:`Condensation`), which leaves a small dense (Schur) complement on the cell's boundary, and
-only that is reduced by T(k) and factorised for each wave vector. Inertia adds up: the matrix for a
-wave has as many negative eigenvalues as its interior and its complement together (Haynsworth,
-Linear Algebra Appl. 1 (1968) 73-81).
-
-Many wave vectors at once share numpy's own time: a batch of vectors is an array (size, w, m), m
-vectors for each of w wave vectors.
+(:class:`Condensation`), and only the small dense (Schur) complement on the cell's boundary is
+reduced by T(k) and factorised for each wave vector. The matrix for a wave has as many negative
+eigenvalues as its interior and its complement together (Haynsworth, Linear Algebra Appl. 1 (1968)
+73-81). A batch of vectors is an array (size, w, m), m vectors for each of w wave vectors.
 """
 
 from __future__ import annotations

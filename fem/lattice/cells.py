@@ -147,11 +147,9 @@ def chiral(
 
     Parameters
     ----------
-    pitch
-        Distance of neighbouring rings' centres, the lattice constant [mm].
-    size
-        Target edge length of the elements [mm]; where walls are thinner than that, elements
-        are as long as the wall is thick. Half of that thickness is a good choice.
+    pitch, size
+        Distance of neighbouring rings' centres, and edge length of the elements, at most as long
+        as a wall is thick [mm]. Half of that thickness is a good choice.
     ligaments
         Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
     ring_radius, ring_thickness, ligament_thickness

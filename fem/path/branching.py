@@ -24,21 +24,8 @@ def follow_branch(
 ) -> list[State]:
     """States on the bifurcated branch at the ``targets`` (ascending strains).
 
-    Parameters
-    ----------
-    critical
-        Where the branch leaves the primary path.
-    targets
-        Nominal strains above the critical one [-].
-    sign
-        +1 or -1: which of the two branches.
-    length
-        The length that ``first_amplitude`` refers to, e.g. the pitch [mm].
-
-    Returns
-    -------
-    list of State
-        One for each target; shorter if the branch could not be followed that far.
+    One for each target; fewer if the branch could not be followed that far. ``sign``, +1 or -1,
+    is which of the two branches, ``length`` what ``first_amplitude`` refers to, the pitch [mm].
     """
     weights, start = _start(follower, critical, sign)
     points = [start]
@@ -86,19 +73,8 @@ def follow_to_pattern(
 ) -> tuple[State | None, float]:
     """Follow a branch, which may turn back, until its pattern has a given amplitude.
 
-    Parameters
-    ----------
-    critical
-        Where the branch leaves the primary path, along its first mode.
-    measure
-        The pattern's amplitude in nodal displacements (n, 2) [mm].
-    target
-        The amplitude to reach [mm].
-
-    Returns
-    -------
-    state, amplitude
-        The last state, None if there is none, and the pattern's amplitude there [mm].
+    ``measure`` is the amplitude in nodal displacements (n, 2), ``target`` that to reach [mm].
+    Returns the last state, None if there is none, and the pattern's amplitude there [mm].
     """
     weights, start = _start(follower, critical)
     points = [start]

@@ -45,11 +45,10 @@ def locate_critical(follower: PathFollower, low: State, high: State) -> Critical
     """The first critical point between a stable state and the unstable one reached last.
 
     Any field's curvature x . K x is above the lowest eigenvalue, by the square of what it is off
-    the mode. So the strain where it passes zero on the interpolated path, the least one for the
-    modes known, is an estimate from above. An equilibrium there gives better modes, and the next
-    estimate's error goes with the square of this one's. Two equilibria a tolerance below and
-    above are the proof; where the inertia below isn't zero, another mode became critical
-    earlier, and the search goes on.
+    the mode. So the lowest strain where that of a known mode passes zero on the interpolated path
+    is an estimate from above; an equilibrium there gives better modes, and quadratic convergence.
+    Two equilibria a tolerance below and above are the proof; where the inertia below isn't zero,
+    another mode became critical before, and the search goes on.
 
     None if an equilibrium in between can't be found, or if no eigenvalue passes zero: then the
     two states are not on one path.
@@ -120,7 +119,7 @@ class _CriticalBracket:
         return state
 
     def prove(self, strain: float) -> Critical | None:
-        """The critical point near a strain, if the inertia on both sides says that it is the first.
+        """The critical point near a strain, if the inertia on both sides proves it the first.
 
         If not, the bracket is smaller, or there is nothing more to look for.
         """

@@ -48,14 +48,8 @@ def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
 class BranchPoint:
     """A point of a branch as a function of its mode's amplitude [mm].
 
-    Parameters
-    ----------
-    amplitude, load
-        [mm], [-].
-    load_rate
-        d(load)/d(amplitude).
-    value, rate
-        The state, such as displacements [mm], and its derivative by the amplitude.
+    The load [-] and the ``value`` of the state, such as displacements [mm]; the rates are their
+    derivatives by the amplitude.
     """
 
     amplitude: float

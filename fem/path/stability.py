@@ -21,7 +21,7 @@ _NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
 _MOST_NEGATIVE = 24  # of the modes that are computed
 _LARGEST_SPACE = 60  # in blocks
 _ROOM = 48  # in vectors, at first
-_LITTLE, _DEPENDENT = 1e-4, 1e-12  # of a vector's squared length: little, nothing
+_LITTLE, _DEPENDENT = 1e-4, 1e-12  # eigenvalues of a normalised Gram matrix: small, zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class _Krylov:
     ) -> tuple[FloatArray, FloatArray, float]:
         """Orthonormal combinations of vectors; those that depend on others are left out.
 
-        And the smallest part of a vector's squared length that was kept.
+        And the smallest eigenvalue of the normalised Gram matrix.
         """
         gram = self._products(block, image)
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
