@@ -173,19 +173,23 @@ class Reduction:
         self._sort(pattern)
 
     def _sort(self, pattern: csr_array) -> None:
-        """Find where every entry of an unreduced matrix goes, and with which phase."""
-        master, shift = self.periodicity.master, self.periodicity.shift
+        """Find where every entry of an unreduced matrix goes, and with which phase.
+
+        ``bloch_map`` has the components of the mesh's nodes as copies of the reduced unknowns.
+        """
+        components = 2 * np.repeat(self.periodicity.master, 2)
+        components[1::2] += 1
+        places = np.argsort(self.order)[components]
+        shift = np.repeat(self.periodicity.shift, 2, axis=0)
+        self.bloch_map = BlochMap(places, shift)
         rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
         columns = pattern.indices
-        place = np.argsort(self.order)
-        row = place[2 * master[rows // 2] + rows % 2]
-        column = place[2 * master[columns // 2] + columns % 2]
-        entries, entry = np.unique(column * self.size + row, return_inverse=True)
+        numbers = places[columns] * self.size + places[rows]
+        entries, entry = np.unique(numbers, return_inverse=True)
         self._indices = (entries % self.size).astype(np.int32)
         counts = np.bincount(entries // self.size, minlength=self.size)
         self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        differences = shift[columns // 2] - shift[rows // 2]
-        self._entries = ShiftedEntries(differences, entry, len(entries))
+        self._entries = ShiftedEntries(shift[columns] - shift[rows], entry, len(entries))
 
     def reduced(self, matrix: csr_array) -> Reduced:
         """The matrix (of the pattern this was made for), ready for any wave vector."""
@@ -196,16 +200,8 @@ class Reduction:
         return csc_array((data, self._indices, self._indptr), shape=(self.size, self.size))
 
     @cached_property
-    def bloch_map(self) -> BlochMap:
-        """The components of the mesh's nodes as copies of the reduced unknowns."""
-        components = 2 * np.repeat(self.periodicity.master, 2)
-        components[1::2] += 1
-        places = np.argsort(self.order)[components]
-        return BlochMap(places, np.repeat(self.periodicity.shift, 2, axis=0))
-
-    @cached_property
     def boundary(self) -> BoundaryDofs:
-        """Those of them that have copies in other cells."""
+        """Those components that have copies in other cells."""
         return BoundaryDofs(self.bloch_map)
 
     def displacement(self, vector: NDArray[Any], wave: Wave = CENTRE) -> NDArray[Any]:
