@@ -125,10 +125,8 @@ def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: Int
 def _covered(mesh: Mesh, lattice: FloatArray, points: FloatArray) -> BoolArray:
     """Whether each point (n, 2) lies in the material of another copy of the cell."""
     triangles = mesh.nodes[mesh.cells[:, :3]]
-    covered = np.zeros(len(points), dtype=bool)
-    for r in _NEIGHBOURS:
-        covered |= _inside(points + np.array(r) @ lattice, triangles)
-    return covered
+    images = np.vstack([points + np.array(r) @ lattice for r in _NEIGHBOURS])
+    return np.asarray(_inside(images, triangles).reshape(len(_NEIGHBOURS), -1).any(axis=0))
 
 
 def _inside(points: FloatArray, triangles: FloatArray, depth: float = 0.0) -> BoolArray:
