@@ -295,5 +295,5 @@ def test_a_base_that_has_not_buckled_is_told(subject: ImagePairSpec, tmp_path: P
 
 
 def test_gradings_too_steep_are_told(subject: ImagePairSpec, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="make grading_x and grading_y smaller"):
+    with pytest.raises(InputError, match="make diameters or gradings smaller"):
         MeasuredModesStudy(gradings_x=(0.2,)).prepare(subject, tmp_path)
