@@ -165,7 +165,7 @@ class Brightness:
     offset_degree: int | None = None
 
     def __post_init__(self) -> None:
-        for name, degree in (("gain", self.gain_degree), ("offset", self.offset_degree)):
+        for name, degree in self._each:
             if degree is not None and not 0 <= degree <= 6:
                 raise InputError(
                     f"brightness: expected a degree of the {name} from 0 to 6, or none, got "
@@ -175,20 +175,21 @@ class Brightness:
     @property
     def degrees(self) -> tuple[int, ...]:
         """Those that are unknowns, the gain's first."""
-        return tuple(d for d in (self.gain_degree, self.offset_degree) if d is not None)
+        return tuple(degree for _, degree in self._each if degree is not None)
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return sum((d + 1) * (d + 2) // 2 for d in self.degrees)
+        return sum(len(orders(d)) for d in self.degrees)
 
     @property
     def names(self) -> tuple[str, ...]:
         """A name for each unknown: ``gain[0,0]``, ``offset[1,0]``."""
         return tuple(
             f"{name}[{i},{j}]"
-            for name, degree in self._parts
-            for i, j in ChebyshevField(_ANY, degree).orders
+            for name, degree in self._each
+            if degree is not None
+            for i, j in orders(degree)
         )
 
     @property
@@ -200,23 +201,24 @@ class Brightness:
         self, box: Box, coefficients: ArrayLike, x: FloatArray, y: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """The gain 1 + b [-] and the offset c [grey levels] at positions that broadcast [mm]."""
-        b, c = self._split(coefficients)
         values = [
             np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
             if degree is None
             else ChebyshevField(box, degree).evaluate(part, x, y)
-            for degree, part in ((self.gain_degree, b), (self.offset_degree, c))
+            for (_, degree), part in zip(self._each, self._split(coefficients), strict=True)
         ]
         return 1.0 + values[0], values[1]
 
     def squares(self, coefficients: ArrayLike) -> FloatArray:
         """(2, D + 1, D + 1) coefficients [i, j] of b and of c, zeros where not an unknown."""
-        result = np.zeros((2, max(self.degrees, default=0) + 1, max(self.degrees, default=0) + 1))
-        degrees = (self.gain_degree, self.offset_degree)
-        for k, (degree, part) in enumerate(zip(degrees, self._split(coefficients), strict=True)):
+        size = max(self.degrees, default=0) + 1
+        result = np.zeros((2, size, size))
+        for square, (_, degree), part in zip(
+            result, self._each, self._split(coefficients), strict=True
+        ):
             if degree is not None:
-                square = ChebyshevField(_ANY, degree).square(part)
-                result[k, : degree + 1, : degree + 1] = square
+                i, j = np.array(orders(degree)).T
+                square[i, j] = part
         return result
 
     def fields(self, first: int) -> tuple[int, int]:
@@ -226,15 +228,10 @@ class Brightness:
         return gain, offset
 
     @property
-    def _parts(self) -> list[tuple[str, int]]:
-        both = (("gain", self.gain_degree), ("offset", self.offset_degree))
-        return [(name, degree) for name, degree in both if degree is not None]
+    def _each(self) -> tuple[tuple[str, int | None], ...]:
+        return ("gain", self.gain_degree), ("offset", self.offset_degree)
 
     def _split(self, coefficients: ArrayLike) -> tuple[FloatArray, FloatArray]:
         values = np.asarray(coefficients, dtype=np.float64)
-        d = self.gain_degree
-        gains = 0 if d is None else (d + 1) * (d + 2) // 2
+        gains = 0 if self.gain_degree is None else len(orders(self.gain_degree))
         return values[:gains], values[gains:]
-
-
-_ANY = Box(-1.0, 1.0, -1.0, 1.0)  # the order of the coefficients doesn't depend on the box

@@ -337,19 +337,19 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
     amplitude, pattern = [], []
     for i in modes:
         part = ansatz.v_slice(i)
-        amplitude.append(_sd(basis, matrix[part, part]))
+        amplitude.append(propagated_sd(basis, matrix[part, part]))
         own = np.r_[part, ansatz.phi_slice(i)]
-        pattern.append(_sd(S[..., own], matrix[np.ix_(own, own)]))
+        pattern.append(propagated_sd(S[..., own], matrix[np.ix_(own, own)]))
     shape = S.shape[:-2]
     return FieldErrors(
-        v0=_sd(S[..., slow], matrix[slow, slow]),
+        v0=propagated_sd(S[..., slow], matrix[slow, slow]),
         v=np.array(amplitude).reshape(len(modes), *shape),
         fluctuation=np.array(pattern).reshape(len(modes), *shape, 2),
-        displacement=_sd(S, matrix),
+        displacement=propagated_sd(S, matrix),
     )
 
 
-def _sd(sensitivity: FloatArray, covariance: FloatArray) -> FloatArray:
+def propagated_sd(sensitivity: FloatArray, covariance: FloatArray) -> FloatArray:
     """Square root of the diagonal of S C Sᵀ; infinite where it touches an infinite variance."""
     known, lost = determined_part(covariance)
     variance = np.einsum("...n,nm,...m->...", sensitivity, known, sensitivity, optimize=True)

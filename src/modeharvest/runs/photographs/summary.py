@@ -57,7 +57,7 @@ from typing import Any
 import numpy as np
 
 from modeharvest.idic.modes import PER_WAVE
-from modeharvest.idic.uncertainty.covariance import FieldErrors
+from modeharvest.idic.uncertainty.covariance import FieldErrors, propagated_sd
 from modeharvest.runs.photographs.prepare import calibration_text
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
@@ -138,13 +138,7 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
 
 def _sd(rows: FloatArray, covariance: FloatArray | None) -> FloatArray | None:
     """(k,) standard deviations of rows (k, m) times unknowns; infinite where one of them is."""
-    if covariance is None:
-        return None
-    lost = np.isinf(np.diag(covariance))
-    known = np.where(lost[:, None] | lost[None, :], 0.0, covariance)
-    variance = np.einsum("km,mn,kn->k", rows, known, rows)
-    touched = (rows[:, lost] != 0.0).any(axis=1)
-    return np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    return None if covariance is None else propagated_sd(rows, covariance)
 
 
 def _item(values: FloatArray | None, k: int) -> float | None:
