@@ -37,13 +37,19 @@ from modeharvest.runs.photographs.prepare import (
     prepare,
     require_inputs,
 )
-from modeharvest.runs.photographs.results import Harvest, HarvestTruth, gather_harvest
+from modeharvest.runs.photographs.results import (
+    Harvest,
+    HarvestTruth,
+    amplitude_of,
+    harvested_frame,
+)
 from modeharvest.runs.photographs.summary import harvest_summary
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import made, to_plain
+from modeharvest.validation.onset import find_buckling
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
@@ -141,18 +147,36 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
-        return gather_harvest(
-            self.case,
-            self.prepared(),
-            self.geometry,
-            self.optics,
-            self.results(),
-            skipped=(*self.prepared().skipped, *self.failures()),
+        case, prepared, region = self.case, self.prepared(), self.geometry.region
+        results, source = self.results(), Path(self.source)
+        frames = []
+        for k, (name, measured) in enumerate(results.items()):
+            self.progress(k, len(results), "error bars")
+            frames.append(harvested_frame(case, prepared, self.geometry, name, measured))
+        moments = [amplitude_of(frame, region.cellular) for frame in frames]
+        return Harvest(
+            title=case.title or "Photographs of a test",
+            experiment=case.plain(),
+            grid=prepared.grid,
+            reference=prepared.image(),
+            mask=prepared.mask(),
+            cellular=region.cellular,
+            domain=region.domain,
+            frames=tuple(frames),
+            noise_sd=prepared.noise.sd,
+            noise_source=prepared.noise.source,
+            lattice=self.geometry.lattice,
+            skipped=(*prepared.skipped, *self.failures()),
+            timeline=moments,
+            buckling=find_buckling(moments),
+            calibration=self.optics.calibration,
+            distortion=self.optics.distortion,
+            full_scale=prepared.full_scale,
+            text=(*prepared.notes, *region.text),
             truth=truth,
-            source=self.source,
-            folder=self.folder,
+            command=f"modeharvest harvest {self.source} --out {self.folder}",
+            toml=source.read_text("utf-8") if source.is_file() else "",
             versions=versions(*_LIBRARIES),
-            progress=self.progress,
         )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:

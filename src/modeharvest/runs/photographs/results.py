@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,11 +31,10 @@ from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
+from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
-from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.onset import Buckling, ImageAmplitude, find_buckling, mean_strain
+from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,79 +288,14 @@ _ALONG = 120
 """Points of the error bars along the longer side: they are as smooth as the ansatz."""
 
 
-def gather_harvest(
-    case: PhotographCase,
-    prepared: PreparedPhotographs,
-    geometry: Geometry,
-    optics: Optics,
-    results: Mapping[str, MeasuredPhotograph],
-    *,
-    skipped: tuple[tuple[str, str], ...] = (),
-    truth: HarvestTruth | None = None,
-    source: str,
-    folder: Path,
-    versions: Mapping[str, str],
-    progress: Progress = silent,
-) -> Harvest:
-    """Gather what a harvest found.
-
-    Parameters
-    ----------
-    case
-        What was harvested.
-    prepared, geometry, optics, results
-        The stages' outcomes.
-    skipped
-        Names of photographs that were not used, and why.
-    truth
-        Of photographs made by a simulation.
-    source, folder
-        The experiment's file and the folder of the harvest, for the command to make it again.
-    versions
-        For the record.
-    progress
-        Listener.
-    """
-    frames, moments = [], []
-    for k, (name, measured) in enumerate(results.items()):
-        progress(k, len(results), "error bars")
-        frame = _frame(case, prepared, geometry, name, measured)
-        frames.append(frame)
-        moments.append(_moment(frame, geometry.region.cellular))
-    noise, path = prepared.noise, Path(source)
-    return Harvest(
-        title=case.title or "Photographs of a test",
-        experiment=case.plain(),
-        grid=prepared.grid,
-        reference=prepared.image(),
-        mask=prepared.mask(),
-        cellular=geometry.region.cellular,
-        domain=geometry.region.domain,
-        frames=tuple(frames),
-        noise_sd=noise.sd,
-        noise_source=noise.source,
-        lattice=geometry.lattice,
-        skipped=skipped,
-        timeline=tuple(moments),
-        buckling=find_buckling(moments),
-        calibration=optics.calibration,
-        distortion=optics.distortion,
-        full_scale=prepared.full_scale,
-        text=(*prepared.notes, *geometry.region.text),
-        truth=truth,
-        command=f"modeharvest harvest {source} --out {folder}",
-        toml=path.read_text("utf-8") if path.is_file() else "",
-        versions=versions,
-    )
-
-
-def _frame(
+def harvested_frame(
     case: PhotographCase,
     prepared: PreparedPhotographs,
     geometry: Geometry,
     name: str,
     measured: MeasuredPhotograph,
 ) -> HarvestedFrame:
+    """One photograph's measurement, with its error bars and spectra."""
     result, pair = measured.result, prepared.pair(name)
     box = geometry.region.cellular
     cell = case.specimen.cell_size
@@ -410,7 +343,8 @@ def _parts(
     return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
 
 
-def _moment(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
+def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
+    """A frame's place on the time line."""
     identified, px = frame.identifiability, frame.result.grid.pixel_size
     return ImageAmplitude(
         name=frame.name,
