@@ -105,10 +105,7 @@ def material_table(material: Any) -> dict[str, Any]:
 def material_of(table: Mapping[str, Any]) -> Material:
     """The material of a table with its ``kind`` as in a case or as in a solution.
 
-    Raises
-    ------
-    InputError
-        If there is no such kind, a constant is unknown or out of its range.
+    An InputError refuses an unknown kind or constant, and one out of its range.
     """
     constants = dict(table)
     kinds = {**MATERIALS, **{kind.__name__: kind for kind in MATERIALS.values()}}

@@ -172,10 +172,7 @@ def dispersion(
     count, bands
         Number of wave vectors, corners included, and of eigenvalues at each.
 
-    Raises
-    ------
-    InputError
-        If a wave vector is not two finite phases, or a load can't be reached.
+    An InputError refuses other wave vectors than two finite phases, and loads out of reach.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
     from modeharvest.fem.bloch.zone import zone_path

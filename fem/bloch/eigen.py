@@ -227,19 +227,9 @@ def largest(
 
     Every new block is made orthogonal to all others: there are few.
 
-    Parameters
-    ----------
-    solve, weigh
-        A^-1 and M, both positive definite, applied to batches (size, w, m).
-    start, fixed
-        (size, w, m) to begin with; (size, w, f) M-orthonormal, to be left out of the space.
-    tolerance
-        About the relative error of the eigenvalues that is allowed.
-
-    Returns
-    -------
-    values, vectors
-        (w, m) descending, and (size, w, m) M-orthonormal.
+    ``solve`` and ``weigh`` are A^-1 and M, both positive definite, applied to batches (size, w, m);
+    ``fixed`` (size, w, f) are M-orthonormal, and left out of the space; ``tolerance`` is about the
+    relative error of the eigenvalues. Returns values (w, m), descending, and M-orthonormal vectors.
     """
     count, width = start.shape[2], start.shape[1]
     images, spaces = [weigh(fixed)], [fixed]

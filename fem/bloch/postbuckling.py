@@ -56,11 +56,8 @@ def follow(
     options, progress
         Step lengths; called with the load reached.
 
-    Raises
-    ------
-    InputError
-        If the cell isn't that of the modes, or the combination doesn't fit them. A branch that
-        can't be followed is an outcome, not an exception.
+    An InputError refuses another cell than that of the modes, and a combination that doesn't fit
+    them. A branch that can't be followed is an outcome, not an exception.
     """
     _check(path.cell, modes, combination, loads)
     mix = np.asarray(combination, dtype=np.float64)

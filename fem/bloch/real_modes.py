@@ -58,11 +58,8 @@ def real_modes(
     largest
         The most copies along a1 or a2.
 
-    Raises
-    ------
-    InputError
-        If there is no wave (long waves are modes of no finite cell), or one doesn't repeat within
-        ``largest`` cells.
+    An InputError refuses no wave at all (long ones are modes of no finite cell), and one that
+    doesn't repeat within ``largest`` cells.
     """
     turns = _distinct([_commensurate(wave, largest) for wave in waves])
     if not turns:

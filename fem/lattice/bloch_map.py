@@ -237,10 +237,7 @@ def factorise(matrix: csc_array, order: str = "NATURAL") -> Any:
 def negative_pivots(factor: Any) -> int:
     """Number of negative eigenvalues of the factorised Hermitian matrix (law of inertia).
 
-    Raises
-    ------
-    ArithmeticError
-        If a zero pivot made SuperLU leave the diagonal, so that signs mean nothing.
+    An ArithmeticError where a zero pivot made SuperLU leave the diagonal: signs mean nothing then.
     """
     if not np.array_equal(factor.perm_r, factor.perm_c):
         raise ArithmeticError("a zero pivot: the matrix is singular or nearly so")

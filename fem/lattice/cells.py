@@ -158,11 +158,8 @@ def chiral(
         The sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
         leaves its ring. One lattice is the mirror image of the other.
 
-    Raises
-    ------
-    InputError
-        If rings touch, or ligaments are too thick to leave their ring apart from each other or
-        to have a free length.
+    An InputError refuses rings that touch, and ligaments too thick to leave their ring apart from
+    each other or to have a free length.
     """
     usual = (RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS)
     given = (ring_radius, ring_thickness, ligament_thickness)

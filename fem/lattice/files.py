@@ -57,11 +57,8 @@ def read_cell(
     size
         Largest edge length [mm] of the elements of a geometry; None: what it says itself.
 
-    Raises
-    ------
-    InputError
-        If there is no such file or it can't be read, is no plane mesh of sound triangles, or is
-        not periodic.
+    An InputError refuses a file that can't be read, is no plane mesh of sound triangles, or is not
+    periodic.
     """
     path = Path(path)
     require_file(path, "a cell (mesh or geometry)", "draw or export one")

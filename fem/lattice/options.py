@@ -76,13 +76,7 @@ CENTRE: Wave = (0.0, 0.0)
 
 
 def wave_of(given: Any) -> Wave:
-    """A wave vector as two finite phases [rad].
-
-    Raises
-    ------
-    InputError
-        If it is anything else: a third component points out of the plane.
-    """
+    """A wave vector as two finite phases [rad]; an InputError refuses anything else."""
     try:
         phases = np.asarray(given)
     except ValueError:  # rows of different lengths

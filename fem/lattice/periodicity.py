@@ -48,11 +48,8 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -
     ``lattice`` are its vectors a1 and a2 as rows (2, 2) [mm], ``tolerance`` is the largest distance
     of partners as a share of the shorter one [-].
 
-    Raises
-    ------
-    InputError
-        If the vectors are parallel; if copies of the cell overlap, touch without common nodes,
-        or don't hold together along both vectors. The message names the nodes.
+    An InputError refuses parallel vectors, and copies of the cell that overlap, touch without
+    common nodes, or aren't connected along both vectors; it names the nodes.
     """
     lattice = np.asarray(lattice, dtype=np.float64)
     if mesh.element != "T6":

@@ -75,16 +75,8 @@ def correct(
 ) -> Correction:
     """Find the equilibrium near ``guess``.
 
-    Parameters
-    ----------
-    guess
-        Start (left as it is); its constrained components are set from ``strain``.
-    strain
-        Nominal strain: prescribed, or with a constraint the start of it.
-    near
-        That of a state nearby, if there is one.
-    constraint
-        Prescribe an amplitude instead of the strain.
+    The guess is left as it is; its constrained components are set from ``strain``, the nominal one
+    that is prescribed or, with a constraint, its own start. ``near`` is that of a state nearby.
     """
     iterate = _Iterate(structure, guess, strain, near, constraint)
     outcome = NewtonOutcome.SLOW

@@ -62,10 +62,8 @@ def lowest_modes(
     ----------
     factor, mass
         Of the tangent stiffness; the mass matrix with zero rows at the constrained components.
-    count
-        Requested number of modes; more are returned if more are negative.
-    near
-        Modes of a state nearby, as a start.
+    count, near
+        Requested number of modes, more are returned if more are negative; those of a state nearby.
     tolerance
         By which a mode may be mixed with others, for that with the largest eigenvalue; less for
         those nearer to zero. Relative errors of eigenvalues go with its square.
