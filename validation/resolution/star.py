@@ -20,8 +20,6 @@ Nothing is secret: the displacement is a formula. The set's id is a digest of it
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -43,7 +41,7 @@ from modeharvest.util.machine import require_memory
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import stage_key
 from modeharvest.util.typed import made
-from modeharvest.validation.scoring.benchmark import RETURNED
+from modeharvest.validation.scoring.benchmark import RETURNED, are_whole, set_id
 
 KEPT = 0.9
 """Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
@@ -345,8 +343,8 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
     star = spec.star
     return {
         "format": FORMAT,
-        "id": hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:12],
-        "key": _key(spec),
+        "id": set_id(files),
+        "key": stage_key(asdict(spec)),
         "licence": "CC-BY-4.0",
         "made_with": f"modeharvest {__version__}",
         "law": {
@@ -363,18 +361,14 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
     }
 
 
-def _key(spec: StarSpec) -> str:
-    return stage_key(asdict(spec))
-
-
 def _is_whole(folder: Path, spec: StarSpec) -> bool:
     """Whether the folder holds this set, nothing missing or changed."""
     try:
         info = read_json(folder / SIDECAR)
         return bool(
-            info["key"] == _key(spec)
+            info["key"] == stage_key(asdict(spec))
             and (folder / README).read_text("utf-8") == star_readme(info)
-            and all(sha256_of(folder / n) == f["sha256"] for n, f in info["files"].items())
+            and are_whole(folder, {n: f["sha256"] for n, f in info["files"].items()})
         )
     except (InputError, OSError, ValueError, KeyError, TypeError):
         return False

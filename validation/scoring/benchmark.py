@@ -12,8 +12,6 @@ loading or imperfection that it could be computed from. The set's id is a digest
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -43,6 +41,7 @@ from modeharvest.util.files import (
     sha256_of,
     write_json,
 )
+from modeharvest.util.stages import digest
 from modeharvest.util.typed import made
 
 RETURNED = {
@@ -189,6 +188,16 @@ def displacement_at(
     return np.ascontiguousarray(u[:, 0].T)
 
 
+def set_id(files: Mapping[str, Any]) -> str:
+    """The id of a set: a digest of its files' sizes and digests."""
+    return digest(files)[:12]
+
+
+def are_whole(folder: Path, digests: Mapping[str, str]) -> bool:
+    """Whether a folder holds files with these SHA-256 by their names."""
+    return all(sha256_of(folder / name) == expected for name, expected in digests.items())
+
+
 def publish(
     images: ImageSet, specimen: Specimen, public: Path | str, truth: Path | str
 ) -> dict[str, Any]:
@@ -284,7 +293,7 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
     grid = images.grid
     info = {
         "format": FORMAT,
-        "id": hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:12],
+        "id": set_id(files),
         "licence": "CC-BY-4.0",
         "made_with": f"modeharvest {__version__}",
         "rows": grid.rows,
@@ -313,10 +322,7 @@ def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
             info["id"] == hidden["id"]
             and hidden["key"] == images.info["key"]
             and hidden["solution_sha256"] == sha256_of(truth / SOLUTION)
-            and all(
-                sha256_of(public / name) == expected
-                for name, expected in (digests | hidden["public_sha256"]).items()
-            )
+            and are_whole(public, digests | hidden["public_sha256"])
         )
     except (InputError, KeyError, TypeError):
         return False
