@@ -21,6 +21,7 @@ from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import spectral_density
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.distortion.calibration.model import PolynomialModel
 from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
@@ -55,11 +56,11 @@ def material(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
 MASK = material(*np.meshgrid(GRID.x, GRID.y))
 
 
-def ansatz(held: bool = False) -> Ansatz:
-    """The paper's, its mode held or free."""
+def ansatz(fixed: bool = False) -> Ansatz:
+    """The paper's, its mode fixed or free."""
     made = Ansatz.on(DOMAIN, [(square_family(), CELLULAR)], PITCH)
     mode = made.modes[0]
-    family = mode.family.fixed() if held else mode.family
+    family = mode.family.fixed() if fixed else mode.family
     return replace(made, modes=(FourierMode(family, mode.half_wavelength, mode.scale, mode.taper),))
 
 
@@ -75,9 +76,9 @@ def photographs(a: Ansatz, unknowns: FloatArray) -> tuple[Any, Any, NDArray[np.b
     return reference, deformed, seen
 
 
-def frame(name: str, strain: float, amplitude: float, held: bool = False) -> HarvestedFrame:
+def frame(name: str, strain: float, amplitude: float, fixed: bool = False) -> HarvestedFrame:
     """A photograph whose pattern has that amplitude [mm, times max phi = 0.04]."""
-    kinematics = ansatz(held)
+    kinematics = ansatz(fixed)
     a = kinematics.initial_guess(strain, amplitude)
     _, deformed, seen = photographs(kinematics, a)
     steps = ((8, 1, 3.0), (8, 2, 0.1), (1, 1, 0.2), (1, 2, 1e-4))
@@ -140,17 +141,27 @@ def calibration() -> Calibration:
         )
     )
     shifts = np.array([[0.0, 0.0], [0.1, 60.0], [-55.0, 0.3]])
+    found, fixed = lens(), 3
     return Calibration(
-        lens(), shifts, np.full((3, 2), 0.004), np.zeros(3), np.full(3, 1e-6), trials, 24.0,
-        np.array([0.99, 0.98, 0.99]), 1e-6 * np.eye(14), 3, ("S is a polynomial of degree 3.",),
-    )  # fmt: skip
+        distortion=found,
+        coefficients=found.coefficients[:, fixed:].ravel(),
+        covariance=1e-6 * np.eye(14),
+        model=PolynomialModel(found.shape, found.degree, fixed),
+        noise_sd=24.0,
+        matches=np.array([0.99, 0.98, 0.99]),
+        shifts=shifts,
+        shifts_sd=np.full((3, 2), 0.004),
+        angles=np.zeros(3),
+        angles_sd=np.full(3, 1e-6),
+        trials=trials,
+    )
 
 
 def harvest(
     states: Sequence[tuple[str, float, float]] = (("IMG_1", 0.04, 0.02), ("IMG_2", 0.07, 0.9)),
 ) -> Harvest:
-    """Photographs (name, strain, amplitude), everything known; the first one's mode is held."""
-    frames = tuple(frame(*state, held=k == 0) for k, state in enumerate(states))
+    """Photographs (name, strain, amplitude), everything known; the first one's mode is fixed."""
+    frames = tuple(frame(*state, fixed=k == 0) for k, state in enumerate(states))
     reference, _, _ = photographs(ansatz(), ansatz().initial_guess(0.0, 0.0))
     timeline = [moment(one) for one in frames]
     truth = {

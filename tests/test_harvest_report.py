@@ -120,7 +120,7 @@ def test_words_of_users_are_escaped_and_said(text: str) -> None:
     assert "expected an image &lt;of 290 x 250 px&gt;, got a damaged file" in text
     assert "<for tests>" not in text
     for said in ("The material was found by its speckle.", "v0 starts from the local DIC.",
-                 "S is a polynomial of degree 3.", "measured from 3 exposures",
+                 "S is a polynomial of degree 3", "measured from 3 exposures",
                  "modeharvest harvest EXPERIMENT.toml"):  # fmt: skip
         assert said in text
     assert text.count("✗ missed") == text.count("✓ met") == 1
