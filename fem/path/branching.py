@@ -37,7 +37,8 @@ def follow_branch(
         target, amplitude = targets[len(found)], reach
         is_near = load_at(points, reach) >= target
         if is_near:
-            amplitude = amplitude_at(points, target, points[-1].amplitude, reach)
+            before = points[-1] if points[-1].load < target else points[-2]  # stepped beyond it
+            amplitude = amplitude_at(points, target, before.amplitude, reach)
             state = follower.equilibrium(target, value_at(points, amplitude))
         else:
             strain, guess = load_at(points, amplitude), value_at(points, amplitude)
