@@ -237,6 +237,18 @@ def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
     return ModeFamily(name, matrix.reshape(-1, 6), offset.ravel(), start, names, units)
 
 
+def two_waves_near(parameters: ArrayLike, ideal: ArrayLike, half_wavelength: float) -> FloatArray:
+    """(6,) the equivalent parameters of :func:`zone_boundary_families` with phases nearest to ideal.
+
+    A wave whose phase moves by l changes sign; that of the first is v's, of the second T2's.
+    """
+    near, ideal = np.array(parameters, dtype=np.float64), np.asarray(ideal)
+    turns = np.round((near[4:] - ideal[4:]) / half_wavelength)
+    near[4:] -= turns * half_wavelength
+    near[1] *= (-1.0) ** turns.sum()
+    return near
+
+
 def _along_and_across(k: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit vectors along a wave vector, and that turned by +90 degrees."""
     along = k / np.linalg.norm(k)

@@ -11,6 +11,7 @@ import numpy as np
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.modes import two_waves_near
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.noise import ImageNoise
@@ -383,11 +384,11 @@ def _mode_numbers(
                 mode.family.name,
                 tuple(mode.family.names),
                 tuple(mode.family.units),
-                tuple(result.mode_parameters(i)),
+                tuple(two_waves_near(result.mode_parameters(i), start[part], pitch)),
                 tuple(start[part]),
                 tuple(noise[part]),
                 model[part] if i not in found.unobservable else (),
-                tuple(best.mode_parameters(i)),
+                tuple(two_waves_near(best.mode_parameters(i), start[part], pitch)),
                 found.amplitude_px[i],
                 i not in found.unobservable,
             )
