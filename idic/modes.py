@@ -238,7 +238,7 @@ def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
 
 
 def two_waves_near(parameters: ArrayLike, ideal: ArrayLike, half_wavelength: float) -> FloatArray:
-    """(6,) the equivalent parameters of :func:`zone_boundary_families` with phases nearest to ideal.
+    """(6,) equivalent parameters of :func:`zone_boundary_families`, phases nearest to the ideal.
 
     A wave whose phase moves by l changes sign; that of the first is v's, of the second T2's.
     """
