@@ -367,7 +367,7 @@ def test_levels_out_of_range_are_told_before_anything_runs(
         ("gradient", 3, "one of .*'reference'"),
         ("taper", -1.0, "wider than 0"),
         ("speckle_size", 0.0, "above 0 times"),
-        ("fill_factor", 2.0, "fill factor in 0"),
+        ("fill_factor", 2.0, "fill factor of 0"),
     ):
         study = SystematicStudy(factors=(name,), levels={name: (level,)})
         with pytest.raises(InputError, match=said):
