@@ -39,14 +39,8 @@ _CHALLENGE_DEGREE = 12
 class Columns:
     """T at every column of a field.
 
-    Parameters
-    ----------
-    period
-        (m,) of the wave there, ascending [px].
-    share
-        (m,) T [-].
-    weight
-        (m,) sum of the squared true displacements that T rests on [px^2].
+    (m,) each, by ascending ``period`` of the wave there [px]: ``share``, T [-], and ``weight``, the
+    sum of the squared true displacements that T rests on [px^2].
     """
 
     period: FloatArray

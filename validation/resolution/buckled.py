@@ -159,14 +159,8 @@ def noisy(pair: ImagePair, level: float, rng: np.random.Generator) -> ImagePair:
 class InverseMotion:
     """Where deformed pixels come from.
 
-    Parameters
-    ----------
-    near
-        (rows, cols) the n pixels that show material, or nearly.
-    at, points
-        (n, 2) their positions x, and X with X + u(X) = x [mm].
-    slope
-        (n, 2, 2) dX/dx, nearly [-].
+    ``near``: (rows, cols) the n pixels that show material, or nearly; ``at``, ``points``: (n, 2)
+    their positions x, and X with X + u(X) = x [mm]; ``slope``: (n, 2, 2) dX/dx, nearly [-].
     """
 
     near: BoolArray

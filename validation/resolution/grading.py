@@ -118,16 +118,9 @@ _TOO_LOUD = 0.7
 class NoiseFloor:
     """What is measured where nothing moves.
 
-    Parameters
-    ----------
-    v_px, u_px
-        Standard deviations along y and x [px].
-    v_se_px
-        Standard error of ``v_px`` [px], from the scatter between stretches of the image.
-    mean_px
-        (u, v) mean along x and y up [px].
-    points, returned
-        Points of the field, and the share of them with a displacement [-].
+    ``v_px``, ``u_px``: standard deviations along y and x; ``v_se_px``: standard error of ``v_px``,
+    from the scatter between stretches of the image; ``mean_px``: (u, v) along x and y up [px];
+    ``points`` of the field, and the share ``returned`` with a displacement [-].
     """
 
     v_px: float

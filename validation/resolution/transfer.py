@@ -171,13 +171,9 @@ _PHASES = (0.0, 0.5 * np.pi)
 class TransferCurves:
     """Transfers T over the period.
 
-    Parameters
-    ----------
-    periods
-        (n,) [mm], ascending.
-    own, whole
-        For each (part, axis, degree) the share (n,) of a wave that is found in its own part, and
-        in the whole displacement, over both phases [-].
+    ``periods``: (n,) [mm], ascending. ``own``, ``whole``: for each (part, axis, degree) the share
+    (n,) of a wave that is found in its own part, and in the whole displacement, over both phases
+    [-].
     """
 
     periods: FloatArray
@@ -262,17 +258,10 @@ def _waves(
 class Passband:
     """What becomes of a pattern of another wavelength than the mode's.
 
-    Parameters
-    ----------
-    stretch
-        (n,) its wave numbers over the mode's [-].
-    added
-        (n,) share that is found of a small one beside the mode [-]: a filter.
-    itself
-        (n,) share that is found of the pattern itself where it is that long, by a fit that starts
-        from the mode [-].
-    wavelength_error
-        (n,) relative error of the wavelength that fit finds [-].
+    (n,) each [-]: ``stretch``, its wave numbers over the mode's; the shares that are found of a
+    small one ``added`` to the mode, a filter, and of the pattern ``itself`` where it is that long,
+    by a fit that starts from the mode; ``wavelength_error``, the relative error of the wavelength
+    that fit finds.
     """
 
     stretch: FloatArray
@@ -347,18 +336,10 @@ _SUBSET_PX = 33
 class DegreeResolution:
     """A degree of v0 and v1, and what it costs.
 
-    Parameters
-    ----------
-    degree, unknowns
-        Of the ansatz.
-    finest_px
-        l10 of waves by part and axis, as "v0 x" [px].
-    floor_px
-        n by quantity, :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px].
-    indicator_px2
-        n l10 by part; l10 is the geometric mean of both axes' [px^2].
-    fixed_px2
-        That of v1 phi1 without motion, its phi1 fixed [px^2].
+    ``finest_px``: l10 of waves by part and axis, as "v0 x" [px]. ``floor_px``: n by quantity,
+    :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]. ``indicator_px2``: n l10 by part;
+    l10 is the geometric mean of both axes' [px^2]. ``fixed_px2``: that of v1 phi1 without motion,
+    its phi1 fixed [px^2].
     """
 
     degree: int

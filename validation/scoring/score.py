@@ -115,27 +115,13 @@ class RegionScore:
 class Score:
     """A graded field.
 
-    Parameters
-    ----------
-    source
-        Of the field.
-    everywhere
-        Over all its points on material.
-    by_region
-        For each of :data:`modeharvest.validation.scoring.score.REGIONS`.
-    off_material
-        Points that lie in holes or outside the specimen: not graded.
-    spacing_px
-        Of its points on material; of those at the same place, one counts [px].
-    reach_px
-        How far from a point its displacement stands for others: one spacing, if that is within
-        the reach given [px].
-    near
-        (rows, cols) True on material within reach of a valid point.
-    covered
-        Share of the material that is near [-].
-    x, y, error_px
-        (m,), (m,) [mm] and (m, 2) [px] of the valid points on material.
+    ``everywhere``: over all points on material; ``by_region``: for each of :data:`REGIONS`.
+    ``off_material``: points in holes or outside the specimen, not graded. ``spacing_px`` of the
+    points on material; of those at the same place, one counts [px]. ``reach_px``: how far from a
+    point its displacement stands for others, one spacing if that is within the reach given [px].
+    ``near``: (rows, cols) True on material within reach of a valid point; ``covered``: share of the
+    material that is near [-]. ``x``, ``y`` (m,) [mm] and ``error_px`` (m, 2) of the valid points on
+    material.
     """
 
     source: str
@@ -296,15 +282,10 @@ _MOST = 1000  # points along the longer side: finer fields are averaged to so ma
 class ErrorSpectrum:
     """The error by wavelength, in thirds of an octave.
 
-    Parameters
-    ----------
-    wavelength_px
-        (m,) middle of each band, ascending [px].
-    rms_px
-        (m,) rms error per component in it [px]: the squares of all and of ``affine_px`` add up to
-        that of the whole error, but for what bins of a fine field average out.
-    affine_px
-        Rms of the error's affine part: translation, rotation, strain [px].
+    ``wavelength_px``: (m,) middle of each band, ascending. ``rms_px``: (m,) rms error per component
+    in it; the squares of all and of ``affine_px`` add up to that of the whole error, but for what
+    bins of a fine field average out. ``affine_px``: rms of the error's affine part: translation,
+    rotation, strain.
     """
 
     wavelength_px: FloatArray

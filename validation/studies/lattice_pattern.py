@@ -195,15 +195,9 @@ class StudiedLattice:
 class PatternMode:
     """The numerical pattern of a lattice beside the analytic one.
 
-    Parameters
-    ----------
-    row
-        Numbers.
-    mesh
-        The primitive cell, about a hole: a quarter of the pattern's own [mm].
-    shape, analytic
-        (n, 2) both modes at its nodes [-]; the mean of their squared length over the material is
-        1, their product is positive.
+    ``mesh``: the primitive cell, about a hole, a quarter of the pattern's own [mm]. ``shape``,
+    ``analytic``: (n, 2) both modes at its nodes [-]; the mean of their squared length over the
+    material is 1, their product is positive.
     """
 
     row: ModeRow

@@ -142,19 +142,11 @@ def _solution(described: SpecimenSpec, folder: Path) -> Solution:
 class SpecimenRow:
     """What a specimen is, and how it and the infinite lattice of its cells buckle.
 
-    Parameters
-    ----------
-    ratio, smallest_ratio, largest_ratio
-        d/l in the middle, and of its holes [-].
-    first, pattern_share
-        What it buckles into, "pattern", "other" or "none"; the pattern's share of that mode [-].
-    critical_strain, strain
-        Where it buckles and where it is measured [-].
-    unstable_pivots
-        Negative pivots where it is measured.
-    lattice_first, lattice_pattern_strain, lattice_overlap_ideal, lattice_a1
-        ``kind``, ``pattern`` and ``overlap`` of the lattice's
-        :class:`~modeharvest.validation.studies.lattice_pattern.ModeRow`, and its a₁.
+    ``ratio``, ``smallest_ratio``, ``largest_ratio``: d/l in the middle, and of its holes.
+    ``first``: what it buckles into, "pattern", "other" or "none"; ``pattern_share``: the pattern's
+    share of that mode. ``critical_strain``, ``strain``: where it buckles and where it is measured,
+    with ``unstable_pivots`` negative pivots. ``lattice_...``: ``kind``, ``pattern``, ``overlap`` of
+    the lattice's :class:`~modeharvest.validation.studies.lattice_pattern.ModeRow`, and its a₁.
     """
 
     ratio: float
