@@ -216,7 +216,6 @@ FACTORS: dict[str, VariedFactor] = {
 
 
 BASE = "base"
-_QUICK_LEVELS = 3
 
 
 ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
