@@ -1,6 +1,6 @@
 """Distortion from photographs of a shifted target: the truth is found, and the error bars hold.
 
-The photographs are exact: an analytic speckle, seen through the exact inverse of the lens.
+The photographs are exact: an analytic speckle, through the exact inverse of the lens.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def test_standard_deviations_are_larger_in_corners(found: Calibration) -> None:
         assert sd[0, 0] > sd[1, 1] > 0.0
 
 
-def test_what_cannot_be_seen_is_said(found: Calibration) -> None:
+def test_what_cannot_be_observed_is_reported(found: Calibration) -> None:
     assert any("affine part of S can't be observed" in s for s in calibration_text(found))
     assert not found.distortion.coefficients[:, :3].any()
 
@@ -152,7 +152,7 @@ def test_the_noise_of_undistorted_images_is_predicted(order: int) -> None:
     assert np.mean(np.square(again)) == pytest.approx(twice, rel=0.03)
 
 
-def test_sets_that_cannot_be_used_are_said_in_a_line() -> None:
+def test_sets_that_cannot_be_used_are_refused_in_a_line() -> None:
     images = photographs(LENS, SHAPE, SHIFTS)
     with pytest.raises(InputError, match="without enough shifts"):
         calibrate(images[:2])

@@ -25,8 +25,8 @@ def pair(lens: Distortion, noise: float = NOISE) -> tuple[FloatArray, FloatArray
     """Make both images exactly: the lens shows the scene at the inverse of phi_S."""
     nothing = PolynomialDistortion(SHAPE, np.zeros((2, 1)))
     (ideal,) = photographs(nothing, SHAPE, [[0.0, 0.0]], noise=noise, seed=4)
-    (seen,) = photographs(lens, SHAPE, [[0.0, 0.0]], seed=4)
-    return ideal, seen + noise * np.random.default_rng(8).normal(size=SHAPE)
+    (observed,) = photographs(lens, SHAPE, [[0.0, 0.0]], seed=4)
+    return ideal, observed + noise * np.random.default_rng(8).normal(size=SHAPE)
 
 
 def difference(found: LensEstimate, lens: Distortion) -> float:
@@ -46,7 +46,7 @@ def test_a_camera_is_recovered_within_its_error_bars() -> None:
     lens = found.distortion
     assert isinstance(lens, CameraDistortion)
     assert (lens.cx, lens.cy) == pytest.approx((LENS.cx, LENS.cy), abs=0.5)
-    # The focal length is a matter of choice: k1 / f^2 is what is seen.
+    # The focal length is a matter of choice: k1 / f^2 is what is observable.
     assert lens.k1 / lens.fx**2 == pytest.approx(LENS.k1 / LENS.fx**2, rel=0.05)
 
 
@@ -73,11 +73,11 @@ def test_the_better_model_has_the_lower_bic() -> None:
 
 
 def test_a_mask_leaves_out_what_changed() -> None:
-    ideal, seen = pair(LENS)
-    seen[100:140, 100:180] = 0.5  # something lay on the scene
+    ideal, observed = pair(LENS)
+    observed[100:140, 100:180] = 0.5  # something lay on the scene
     mask = np.ones(SHAPE, np.bool_)
     mask[85:155, 85:195] = False
-    found = recover_camera(ideal, seen, mask=mask)
+    found = recover_camera(ideal, observed, mask=mask)
     assert difference(found, LENS) < 0.02
 
 
@@ -100,17 +100,17 @@ def test_sensitivities_are_derivatives(kind: str) -> None:
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * h[k]), atol=1e-6)
 
 
-def test_pairs_that_cannot_be_used_are_said_in_a_line() -> None:
-    ideal, seen = pair(LENS)
+def test_pairs_that_cannot_be_used_are_refused_in_a_line() -> None:
+    ideal, observed = pair(LENS)
     with pytest.raises(InputError, match="of one size"):
-        recover_camera(ideal, seen[:-1])
+        recover_camera(ideal, observed[:-1])
     with pytest.raises(InputError, match="constant grey level"):
         recover_camera(ideal, np.ones(SHAPE))
     with pytest.raises(InputError, match="finite grey levels"):
         recover_camera(ideal, np.full(SHAPE, np.nan))
     with pytest.raises(InputError, match="of one scene"):
-        recover_camera(ideal, seen[::-1])
+        recover_camera(ideal, observed[::-1])
     with pytest.raises(InputError, match="a mask of 240 x 320 px"):
-        recover_camera(ideal, seen, mask=np.zeros(SHAPE))
+        recover_camera(ideal, observed, mask=np.zeros(SHAPE))
     with pytest.raises(InputError, match="unknown camera parameters among"):
         CameraModel(LENS, ("fx",))

@@ -1,4 +1,4 @@
-"""Guards the photographs of a calibration: one flat target, moved rigidly, seen through a lens."""
+"""Guards the photographs of a calibration: one flat target, moved rigidly, through a lens."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def test_without_a_lens_photographs_are_shifts_of_each_other() -> None:
 
 
 def test_through_a_lens_they_are_shifts_up_to_the_distortion() -> None:
-    """What is seen at phi_S(x) in the first is seen at phi_S(x + t) in the others.
+    """What the first shows at phi_S(x) appears at phi_S(x + t) in the others.
 
     The pixels' intensities against the target's own pattern, evaluated exactly there.
     """
-    seen = ideal_points(LENS, SHAPE)
+    points = ideal_points(LENS, SHAPE)
     pattern = Speckle(
         replace(SPECKLE, seed=TARGET.seed, ink=replace(SPECKLE.ink, seed=TARGET.seed)), SHAPE
     )
     at = (slice(None, None, 7), slice(None, None, 9))
     for shot, (down, right) in zip(photographs(TARGET, LENS), TARGET.true_shifts, strict=True):
-        exact = pattern.exact(seen[0][at] - down, seen[1][at] - right)
+        exact = pattern.exact(points[0][at] - down, points[1][at] - right)
         np.testing.assert_allclose(shot[at], exact, rtol=0, atol=0.51 / (2**16 - 1))
     straight, bent = photographs(TARGET)[0], photographs(TARGET, LENS)[0]
     assert np.abs(straight - bent).max() > 0.3
@@ -86,7 +86,7 @@ def test_the_target_is_not_the_specimen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"shifts_px": ()}, "finite shifts"),
         ({"shifts_px": ((0.0, np.nan),)}, "finite shifts"),
@@ -94,6 +94,6 @@ def test_the_target_is_not_the_specimen() -> None:
         ({"seed": -1}, "seed"),
     ],
 )
-def test_what_cannot_be_is_refused(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=f"calibration: .*{said}"):
+def test_what_cannot_be_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"calibration: .*{message}"):
         CalibrationTarget(**changes)

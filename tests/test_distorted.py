@@ -56,10 +56,10 @@ def state(u: FloatArray | None = None, mesh: Mesh = MESH) -> ImagedState:
 
 
 def test_a_lens_without_distortion_changes_nothing() -> None:
-    seen = ideal_points(PolynomialDistortion(GRID.shape, np.zeros((2, 3))), GRID.shape)
+    points = ideal_points(PolynomialDistortion(GRID.shape, np.zeros((2, 3))), GRID.shape)
     located = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
     plain = render_reference(state(), located)
-    shown = render_observed(state(), seen)
+    shown = render_observed(state(), points)
     np.testing.assert_array_equal(shown.mask, plain.mask)
     np.testing.assert_allclose(shown.image, plain.image, rtol=0, atol=FLOAT32)
 
@@ -68,9 +68,9 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
     """Pixel p shows the speckle at F^-1 (phi_S^-1(p) - shift), no pixel more and none less."""
     F, shift = np.array([[0.9, 0.08], [-0.05, 1.04]]), np.array([0.21, -0.13])
     u = MESH.nodes @ (F - np.eye(2)).T + shift
-    seen = ideal_points(LENS, GRID.shape)
-    shown = render_observed(state(u), seen)
-    x = np.stack(GRID.to_mm(*seen), axis=-1)
+    points = ideal_points(LENS, GRID.shape)
+    shown = render_observed(state(u), points)
+    x = np.stack(GRID.to_mm(*points), axis=-1)
     X = (x - shift) @ np.linalg.inv(F).T
     inside = (np.abs(X) <= [9.0, 7.0]).all(axis=-1)
     np.testing.assert_array_equal(shown.mask, inside)
@@ -78,10 +78,10 @@ def test_affine_motion_through_a_lens_against_its_closed_inverse() -> None:
     np.testing.assert_allclose(shown.image[inside], exact, rtol=0, atol=FLOAT32)
     assert (shown.image[~inside] == np.float32(BACKGROUND)).all()
     # The pixels' ideal points are those that the lens shows there.
-    row, col = LENS.observed(*seen)
+    row, col = LENS.observed(*points)
     np.testing.assert_allclose(row, np.arange(GRID.rows)[:, None] + 0.0 * col, atol=1e-9)
     np.testing.assert_allclose(col, np.arange(GRID.cols) + 0.0 * row, atol=1e-9)
-    assert np.hypot(row - seen[0], col - seen[1]).max() > 5.0
+    assert np.hypot(row - points[0], col - points[1]).max() > 5.0
 
 
 def test_a_lens_may_show_what_lies_beside_the_ideal_image() -> None:
@@ -97,10 +97,10 @@ def test_a_lens_may_show_what_lies_beside_the_ideal_image() -> None:
 def test_material_beside_the_ideal_image_is_shown_too() -> None:
     wide = plate(half_width=12.0)  # its right edge lies at column 186 of 181
     col = 150.0 + np.arange(60.0)[None]
-    seen = np.full(col.shape, 75.0), col
-    shown = render_observed(state(mesh=wide), seen)
+    points = np.full(col.shape, 75.0), col
+    shown = render_observed(state(mesh=wide), points)
     np.testing.assert_array_equal(shown.mask, col <= 186.0)
-    exact = SPECKLE.exact(*(s[shown.mask] for s in seen))
+    exact = SPECKLE.exact(*(s[shown.mask] for s in points))
     np.testing.assert_allclose(shown.image[shown.mask], exact, rtol=0, atol=FLOAT32)
 
 

@@ -106,12 +106,12 @@ def test_undistorting_the_exactly_distorted_pattern_gives_the_pattern(
     # by 6e-5 (facts of imaging/interpolation.py); S compresses the speckle a little.
     distortion = kind(np.random.default_rng(2))
     speckle = Speckle(SpeckleSpec(seed=1), SHAPE)
-    seen = speckle(*distortion.ideal(*np.indices(SHAPE, dtype=np.float64)))
+    observed = speckle(*distortion.ideal(*np.indices(SHAPE, dtype=np.float64)))
     whole = undistorted_mask(np.ones(SHAPE, np.bool_), distortion)
     whole[:24], whole[-24:], whole[:, :24], whole[:, -24:] = 0, 0, 0, 0  # the border's ringing
     assert whole.sum() > 0.6 * whole.size
     for order, off in ((5, 5e-6), (3, 3e-4)):
-        error = undistorted(seen, distortion, order) - speckle.image()
+        error = undistorted(observed, distortion, order) - speckle.image()
         assert np.abs(error[whole]).max() < off
 
 
@@ -161,7 +161,7 @@ def test_positions_that_are_not_numbers_stay_so() -> None:
     assert np.isnan([row[1], col[1]]).all()
 
 
-def test_what_cannot_be_used_is_said_in_a_line() -> None:
+def test_what_cannot_be_used_is_refused_in_a_line() -> None:
     with pytest.raises(InputError, match="n = 1, 3, 6, 10"):
         PolynomialDistortion(SHAPE, np.zeros((2, 4)))
     with pytest.raises(InputError, match="finite coefficients"):

@@ -112,7 +112,7 @@ def test_opencvs_json_is_read(tmp_path: Path) -> None:
         ("a.txt", "x", "json, .xml"),
     ],
 )
-def test_what_is_no_distortion_is_said_in_a_line(
+def test_what_is_no_distortion_is_refused_in_a_line(
     name: str, text: str, message: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text(text)
@@ -121,6 +121,6 @@ def test_what_is_no_distortion_is_said_in_a_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_said_in_a_line(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a distortion at"):
         read_distortion(tmp_path / "none.xml")

@@ -151,7 +151,7 @@ def test_a_sidecar_without_a_sensor_reads_as_the_default_one(made: ImageSet) -> 
 NOISY = replace(SPEC, bits=12, sensor=Sensor(gain=0.9, offset=0.02, full_well=1e4, read_noise=0.01))
 
 
-def test_a_sensor_is_told_of_and_its_noise_is_the_predicted_one(tmp_path: Path) -> None:
+def test_a_sensor_is_recorded_and_its_noise_is_the_predicted_one(tmp_path: Path) -> None:
     made = make_images(plate(), NOISY, tmp_path / "noisy", STRAINS)
     assert ImageSet.read(made.folder).spec == NOISY
     clean = make_images(plate(), SPEC, tmp_path / "clean", STRAINS)
@@ -203,7 +203,7 @@ def test_averaging_pixels_tell_how_they_were_averaged(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made.mask(), plain.mask())
 
 
-def test_a_specimen_that_overlaps_is_told_of(made: ImageSet, tmp_path: Path) -> None:
+def test_a_specimen_that_overlaps_gives_a_warning(made: ImageSet, tmp_path: Path) -> None:
     assert made.info["warnings"] == []
     solution = plate()
     apart = Mesh(solution.mesh.nodes[[0, 1, 4, 3, 1, 2, 5, 4]], np.arange(8).reshape(2, 4), "Q4")

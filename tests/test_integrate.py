@@ -211,7 +211,7 @@ def test_edge_pixels_mix_material_and_background_in_their_shares(aperture: Apert
     np.testing.assert_allclose(image[far], expected[far], atol=1e-6)
 
 
-def test_background_and_material_far_from_edges_are_told_apart() -> None:
+def test_background_and_material_far_from_edges_are_distinguished() -> None:
     mask = np.zeros((20, 20), dtype=np.bool_)
     mask[5:15, 5:15] = True
     near = near_edges(mask, 2)

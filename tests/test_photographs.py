@@ -1,4 +1,4 @@
-"""Files from a camera: what is read is what was stored, and what is wrong is said in one line.
+"""Files from a camera: what is read is what was stored, and what is wrong is reported in one line.
 
 Pictures are written here, by the libraries themselves, so the truth is the array that went in.
 """
@@ -86,7 +86,7 @@ def test_float_images_keep_their_levels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_colour_becomes_grey_and_that_is_said(tmp_path: Path, bits: int) -> None:
+def test_colour_becomes_grey_and_that_is_noted(tmp_path: Path, bits: int) -> None:
     colour = np.stack([counts(bits, seed=k) for k in range(3)], axis=-1)
     tifffile.imwrite(tmp_path / "a.tif", colour, photometric="rgb")
     photograph = read_photograph(tmp_path / "a.tif")
@@ -122,7 +122,7 @@ def test_white_stored_as_zero_is_inverted(tmp_path: Path) -> None:
     assert photograph.notes == ("It stores white as 0 and was inverted.",)
 
 
-def test_first_page_of_several_is_taken_and_that_is_said(tmp_path: Path) -> None:
+def test_first_page_of_several_is_taken_and_that_is_noted(tmp_path: Path) -> None:
     pages = np.stack([counts(8, seed=k) for k in range(3)])
     tifffile.imwrite(tmp_path / "a.tif", pages, photometric="minisblack")
     photograph = read_photograph(tmp_path / "a.tif")
@@ -137,9 +137,9 @@ def test_orientation_is_obeyed_as_pillow_does(tmp_path: Path, orientation: int) 
     exif[274] = orientation
     picture.save(tmp_path / "a.png", exif=exif)
     expected = read_photograph(tmp_path / "a.png")
-    turned, said = _upright(counts(8), orientation)
+    turned, notes = _upright(counts(8), orientation)
     np.testing.assert_array_equal(turned, expected.image)
-    assert said == expected.notes
+    assert notes == expected.notes
 
 
 def test_saturation_is_counted_where_the_camera_cuts_off(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_saturation_is_counted_where_the_camera_cuts_off(tmp_path: Path) -> None
 
 @given(bits=st.sampled_from([8, 12]), seed=st.integers(0, 10))
 @settings(max_examples=6, deadline=None, derandomize=True)
-def test_speckle_is_told_from_noise(bits: int, seed: int) -> None:
+def test_speckle_is_distinguished_from_noise(bits: int, seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=(128, 128)).astype(np.float32)
     ramp = np.linspace(0, 30, 128, dtype=np.float32)  # uneven lighting is no speckle
     assert abs(neighbour_correlation(noise + ramp)) < 0.05  # 128 px squared: sd 0.008

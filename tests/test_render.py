@@ -131,15 +131,15 @@ def test_truth_in_both_frames_is_one_motion() -> None:
     """What a reference pixel shows is found again at X + u(X), at the same xi."""
     u = wavy(MESH.nodes)
     _, truth = deformed(u)
-    home = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
-    rows, cols = np.nonzero(home.mask)
+    reference_pixels = locate(MESH.nodes, MESH.cells, MESH.element, GRID)
+    rows, cols = np.nonzero(reference_pixels.mask)
     for k in np.random.default_rng(0).choice(rows.size, 25, replace=False):
         row, col = rows[k], cols[k]
         dx, dy = truth.displacement[row, col]
         there = PixelGrid(1, 1, H, GRID.x[col] + dx, GRID.y[row] + dy)
         found = locate(MESH.nodes + u, MESH.cells, MESH.element, there)
-        assert found.element.item() == home.element[row, col]
-        np.testing.assert_allclose(found.xi[0, 0], home.xi[row, col], atol=1e-12)
+        assert found.element.item() == reference_pixels.element[row, col]
+        np.testing.assert_allclose(found.xi[0, 0], reference_pixels.xi[row, col], atol=1e-12)
 
 
 def test_folding_displacement_is_refused_by_name() -> None:

@@ -1,4 +1,4 @@
-"""A calibrated distortion: S, the choice of its degree, its covariance, and what can't be observed.
+"""Lenses as found: S with its covariance, the choice of its degree, the photographs' noise.
 
 The noise of a photograph follows from the residual by what becomes of white noise where a blurred
 image is sampled between its pixels.
