@@ -89,7 +89,7 @@ class ErrorMaps:
 
     @classmethod
     def of(cls, mesh: Mesh, grid: PixelGrid, scores: Sequence[Score]) -> ErrorMaps:
-        """Make a sheet, and a scale on which 98 % of every code's errors are told apart."""
+        """Make a sheet, and a scale on which 98 % of every code's errors are distinguished."""
         lengths = [_error_length(graded) for graded in scores if len(graded.error_px)]
         ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
         low = min((end[0] for end in ends), default=1e-3)
@@ -410,15 +410,15 @@ def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> 
     ``end`` is that of the colours; by default what 99 % of the values stay below.
     """
     star = grade.star
-    seen = np.isfinite(values)
-    at = -grade.moved.y[seen], grade.moved.x[seen]
+    valid = np.isfinite(values)
+    at = -grade.moved.y[valid], grade.moved.x[valid]
     reach = min(0.5 * star.rows, float(np.abs(at[0]).max()) + _CELL_PX)
     shape = (max(1, round(2 * reach / _CELL_PX)), max(1, star.cols // _CELL_PX))
     limits = ((-reach, reach), (-0.5, star.cols - 0.5))
     count = np.histogram2d(*at, shape, limits)[0]
-    total = np.histogram2d(*at, shape, limits, weights=values[seen])[0]
+    total = np.histogram2d(*at, shape, limits, weights=values[valid])[0]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    top = float(np.quantile(np.abs(values[seen]), 0.99)) if end is None else end
+    top = float(np.quantile(np.abs(values[valid]), 0.99)) if end is None else end
     drawn = figure(9.0, 1.75)
     axes = drawn.add_axes((0.035, 0.24, 0.88, 0.72))
     image = axes.imshow(mean, cmap=SIGNED, vmin=-top, vmax=top, aspect="auto",

@@ -167,7 +167,7 @@ class Card:
     text
         Statements, as a list; by headings, side by side, where it is a mapping.
     caption
-        What is seen, below.
+        What is shown, below.
     name
         Its anchor; none if empty.
     symbol, paper

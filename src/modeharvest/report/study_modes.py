@@ -63,9 +63,9 @@ def buckling_table(ran: pd.DataFrame) -> pd.DataFrame:
     return _renamed(ran.assign(**percent), _BUCKLING)
 
 
-def likeness_table(seen: pd.DataFrame) -> pd.DataFrame:
+def likeness_table(measured: pd.DataFrame) -> pd.DataFrame:
     """A row for each specimen: overlaps of its mode, and errors of its displacement."""
-    return _renamed(seen, _LIKENESS)
+    return _renamed(measured, _LIKENESS)
 
 
 def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
@@ -73,17 +73,17 @@ def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
     return rows.reindex(columns=list(names)).rename(columns=names)
 
 
-def parameters_summary(seen: pd.DataFrame) -> pd.DataFrame:
+def parameters_summary(measured: pd.DataFrame) -> pd.DataFrame:
     """A row for each specimen: a₁, and how far its wave vectors and phases are from Eq. (mode)."""
-    off, best = 100.0 * deviations(seen), 100.0 * deviations(seen, "best_")
-    sd = 100.0 * seen[[f"{name}_sd_model_error" for name in PARAMETERS]].set_axis(
+    off, best = 100.0 * deviations(measured), 100.0 * deviations(measured, "best_")
+    sd = 100.0 * measured[[f"{name}_sd_model_error" for name in PARAMETERS]].set_axis(
         PARAMETERS, axis=1
     )
     phases = list(PARAMETERS[5:])
     return pd.DataFrame({
-        "varied": seen["varied"], "level": seen["level"], "a₁": seen["a1"],
-        "± 2 sd": 0.02 * sd["a1"], "a₁ of the best fit": seen["best_a1"],
-        "a₁ of the infinite lattice": seen["lattice_a1"],
+        "varied": measured["varied"], "level": measured["level"], "a₁": measured["a1"],
+        "± 2 sd": 0.02 * sd["a1"], "a₁ of the best fit": measured["best_a1"],
+        "a₁ of the infinite lattice": measured["lattice_a1"],
         "wave vectors off by up to [%]": off[WAVE_VECTORS].abs().max(axis=1),
         "± 2 sd [%]": 2.0 * sd[WAVE_VECTORS].max(axis=1),
         "those of the best fit [%]": best[WAVE_VECTORS].abs().max(axis=1),
@@ -93,7 +93,7 @@ def parameters_summary(seen: pd.DataFrame) -> pd.DataFrame:
     })  # fmt: skip
 
 
-def parameters_table(seen: pd.DataFrame) -> pd.DataFrame:
+def parameters_table(measured: pd.DataFrame) -> pd.DataFrame:
     """A row for each parameter of each specimen, phases in shares of l."""
     rows = [
         {"varied": row["varied"], "level": row["level"], "d/l": row["ratio"], "parameter": name,
@@ -102,7 +102,7 @@ def parameters_table(seen: pd.DataFrame) -> pd.DataFrame:
          "± 2 sd by 1 % of noise": 2.0 * row[f"{name}_sd_noise"],
          "best fit": row[f"best_{name}"],
          "infinite lattice": row["lattice_a1"] if name == "a1" else ideal}
-        for _, row in seen.iterrows() for name, ideal in zip(PARAMETERS, IDEAL, strict=True)
+        for _, row in measured.iterrows() for name, ideal in zip(PARAMETERS, IDEAL, strict=True)
     ]  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -284,18 +284,18 @@ def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
     seeds
         In words.
     """
-    ran, seen, sizes = found.ran, found.measured, found.sizes
+    ran, measured, sizes = found.ran, found.measured, found.sizes
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
         sentences=_sentences(found),
         keys=_keys(sizes),
-        figures=_figures(seen, sizes, folder, seeds),
+        figures=_figures(measured, sizes, folder, seeds),
         tables=[
             ReportTable.of("Buckling", buckling_table(ran)),
-            ReportTable.of("Parameters", parameters_summary(seen)),
-            ReportTable.of("Overlaps and errors", likeness_table(seen)),
+            ReportTable.of("Parameters", parameters_summary(measured)),
+            ReportTable.of("Overlaps and errors", likeness_table(measured)),
         ],
-        attachments=[ReportTable.of("Every parameter", parameters_table(seen))],
+        attachments=[ReportTable.of("Every parameter", parameters_table(measured))],
     )
 
 
@@ -327,14 +327,14 @@ def _keys(sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
 
 def _sentences(found: ModesAnalysis) -> list[str]:
     """What was found, the most important first."""
-    ran, seen, sizes = found.ran, found.measured, found.sizes
+    ran, measured, sizes = found.ran, found.measured, found.sizes
     text = []
     if len(sizes):
         text += [*_of_parameters(sizes), _of_overlaps(sizes)]
     text += [
-        *_of_the_others(seen),
-        *_of_graded(seen),
-        *_not_observable_sentences(ran, seen),
+        *_of_the_others(measured),
+        *_of_graded(measured),
+        *_not_observable_sentences(ran, measured),
         *_of_strains(ran),
     ]
     return text
@@ -371,11 +371,11 @@ def _of_overlaps(sizes: pd.DataFrame) -> str:
     )
 
 
-def _of_the_others(seen: pd.DataFrame) -> list[str]:
+def _of_the_others(measured: pd.DataFrame) -> list[str]:
     """How far the mode moves with l and with the material."""
-    base, text = seen[seen["varied"] == "base"], []
+    base, text = measured[measured["varied"] == "base"], []
     for varied, what in (("l", "size of the cells"), ("material", "material")):
-        part = seen[seen["varied"] == varied]
+        part = measured[measured["varied"] == varied]
         if not len(part) or not len(base):
             continue
         moved = deviations(part).to_numpy() - deviations(base).to_numpy()
@@ -389,8 +389,11 @@ def _of_the_others(seen: pd.DataFrame) -> list[str]:
     return text
 
 
-def _of_graded(seen: pd.DataFrame) -> list[str]:
-    part, base = seen[seen["varied"].str.startswith("graded")], seen[seen["varied"] == "base"]
+def _of_graded(measured: pd.DataFrame) -> list[str]:
+    part, base = (
+        measured[measured["varied"].str.startswith("graded")],
+        measured[measured["varied"] == "base"],
+    )
     if not len(part) or not len(base):
         return []
     off = deviations(part)
@@ -406,7 +409,7 @@ def _of_graded(seen: pd.DataFrame) -> list[str]:
     ]
 
 
-def _not_observable_sentences(ran: pd.DataFrame, seen: pd.DataFrame) -> list[str]:
+def _not_observable_sentences(ran: pd.DataFrame, measured: pd.DataFrame) -> list[str]:
     """Specimens without a measured pattern, or in an unstable state."""
     text = []
     for _, row in ran.iterrows():
@@ -448,7 +451,7 @@ def _of_strains(ran: pd.DataFrame) -> list[str]:
     ]
 
 
-def _figures(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Card]:
+def _figures(measured: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Card]:
     cards = []
     if len(sizes):
         drawn = partial(draw_parameters, sizes, sizes["ratio"].to_numpy(), (), "d/l [–]")
@@ -465,7 +468,7 @@ def _figures(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) 
             ),
             _pattern_card("patterns", "Patterns, measured and true", sizes, folder),
         ]  # fmt: skip
-    others = seen[~seen["varied"].isin(["d/l"])]
+    others = measured[~measured["varied"].isin(["d/l"])]
     if len(others) > 1:
         names = [f"{row['varied']} {row['level']}".strip() for _, row in others.iterrows()]
         drawn = partial(
@@ -473,7 +476,7 @@ def _figures(seen: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) 
         )
         title = "Parameters of the mode, all else"
         cards.append(Card.single("others", title, drawn, _MARKS, wide=True))
-    graded = seen[seen["varied"].str.startswith("graded")]
+    graded = measured[measured["varied"].str.startswith("graded")]
     if len(graded):
         title = "Graded specimens, measured and true"
         cards.append(_pattern_card("graded", title, graded, folder))

@@ -185,8 +185,8 @@ def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Fig
     for axes, (name, at_base) in zip(grid, bases.items(), strict=False):
         part = levels[levels["name"] == name]
         for column, look in _CURVES.items():
-            seen = part[part[column] > 0.0]  # the base is not moved from itself
-            axes.plot(seen["number"], seen[column], linewidth=1, markersize=4, label=column,
+            shown = part[part[column] > 0.0]  # the base is not moved from itself
+            axes.plot(shown["number"], shown[column], linewidth=1, markersize=4, label=column,
                       **look)  # fmt: skip
         _finish_axes(axes, part, at_base)
     for axes in grid[::_COLUMNS]:

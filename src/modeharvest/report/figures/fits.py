@@ -133,7 +133,7 @@ class Panel(Generic[S]):
     section, key
         Where on the page it is, and its anchor there.
     symbol, title, paper, caption
-        HTML, words, the panel in the paper or "", and what is seen, HTML.
+        HTML, words, the panel in the paper or "", and what is shown, HTML.
     draw
         Draws it of a state.
     shows

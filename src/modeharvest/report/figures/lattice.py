@@ -259,8 +259,8 @@ def draw_lattice_spectrum(
     reach
         Of the axes [1/l].
     """
-    seen = np.abs(xi).max(axis=1) <= reach + 1e-9
-    xi, density = xi[seen], density[seen]
+    shown_waves = np.abs(xi).max(axis=1) <= reach + 1e-9
+    xi, density = xi[shown_waves], density[shown_waves]
     level = 10.0 * np.log10(np.maximum(density, 1e-30) / largest)
     order = np.argsort(level)
     shown = order[level[order] >= _FLOOR]

@@ -41,11 +41,11 @@ class MeshBoundary:
         """Find the outline of a mesh."""
         edges = boundary_sides(mesh)
         following = {int(a): k for k, a in enumerate(edges[:, 0])}
-        loops, seen = [], np.zeros(len(edges), dtype=bool)
+        loops, visited = [], np.zeros(len(edges), dtype=bool)
         for first in range(len(edges)):
             loop, k = [], first
-            while not seen[k]:
-                seen[k] = True
+            while not visited[k]:
+                visited[k] = True
                 loop.append(k)
                 k = following.get(int(edges[k, 2]), first)
             if loop:

@@ -439,7 +439,7 @@ def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Lin
     ends += [((i0, j), (i1, j)) for j in range(j0, j1 + 1)]
     lines = [np.stack(_to_mm(lattice.position(pair), grid), axis=1) for pair in ends]
     axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.7, alpha=0.9))
-    said = [Line2D([], [], color=BLUE, lw=1.0, label="lattice")]
+    handles = [Line2D([], [], color=BLUE, lw=1.0, label="lattice")]
     kinds = (
         (lattice.centres, "o", GREEN, f"{len(lattice)} holes"),
         (lattice.position(lattice.missing), "x", RED, f"{len(lattice.missing)} missing"),
@@ -449,8 +449,8 @@ def _draw_lattice(axes: Axes, lattice: HoleLattice, grid: PixelGrid) -> list[Lin
         if len(at):
             dots = axes.plot(*_to_mm(at, grid), marker, color=colour, ms=3.0, mew=1.0, ls="none",
                              label=name)  # fmt: skip
-            said += dots
-    return said
+            handles += dots
+    return handles
 
 
 def _to_mm(at: FloatArray, grid: PixelGrid) -> tuple[FloatArray, FloatArray]:
