@@ -33,6 +33,7 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run, require_same_experiment
 from modeharvest.util.errors import InputError
+from modeharvest.validation.studies.study import ImagePairSpec
 
 RECTANGULAR = Specimen(4, 6, diameter=1.5, diameter_y=1.7, stacking="rectangular", pitch_y=2.0)
 TRIANGULAR = Specimen(3, 5, diameter=1.5, stacking="triangular", bulk_x=1.0, bulk_y=0.5)
@@ -193,3 +194,9 @@ def test_the_recipe_for_a_further_stacking_works(monkeypatch: pytest.MonkeyPatch
     assert np.abs(mesh.nodes).max(axis=0) == pytest.approx([a, b])
     families = names["FAMILIES"][specimen.stacking](specimen)
     assert [family.wave_count for family in families] == [2, 2, 2]
+
+
+def test_studies_of_one_mode_refuse_staggered_rows() -> None:
+    experiment = Experiment(TRIANGULAR)
+    with pytest.raises(InputError, match="square or rectangular stacking.*got triangular"):
+        ImagePairSpec(experiment, IMAGING, FEW, lambda: simulate(experiment))

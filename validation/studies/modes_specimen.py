@@ -168,6 +168,11 @@ class SpecimenSpec:
                 "study: expected a perfect specimen that buckles at a strain of its own, got an "
                 "experiment with an imperfection, a tilt or guides; leave them out"
             )
+        if e.specimen.stacking != "square" or e.specimen.aspect != 1.0:
+            raise InputError(
+                "study: expected round holes in square stacking, got a specimen in "
+                f"{e.specimen.stacking} stacking with holes of aspect {e.specimen.aspect:.3g}"
+            )
         if type(e.material) not in MATERIALS.values():
             known = [kind.__name__ for kind in MATERIALS.values()]
             raise InputError(f"study: expected a material among {known}, got {e.material!r}")

@@ -55,6 +55,13 @@ class ImagePairSpec:
     correlation: SquareLatticeOptions
     load: Callable[[], Solution]
 
+    def __post_init__(self) -> None:
+        if self.experiment.specimen.is_staggered:
+            raise InputError(
+                "study: expected a specimen in square or rectangular stacking, which one mode "
+                f"measures, got {self.experiment.specimen.stacking} stacking"
+            )
+
     @cached_property
     def solution(self) -> Solution:
         """The exact displacements."""
