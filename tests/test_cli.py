@@ -136,5 +136,5 @@ def test_without_dolfinx_the_paper_case_takes_the_shipped_solution(
 ) -> None:
     monkeypatch.setitem(sys.modules, "modeharvest.fem.simulate", None)
     assert called(monkeypatch, "fem", "paper-virtual", "--out", tmp_path) == 0
-    assert "critical strain 9.6" in capsys.readouterr().out
+    assert "Critical strain 9.6" in capsys.readouterr().out
     assert (tmp_path / "solution.h5").is_file()
