@@ -8,8 +8,9 @@
 in a folder of its own in OUT; finished commands are not repeated. ``compare`` walks both: every
 number of every JSON, CSV, HDF5, NPZ, TIFF and VTU file, by the names that
 ``scripts/renamed_outputs.toml`` gives to what was called otherwise before. Pages, pictures,
-durations and software versions are left out: they are not what is computed. Exit code 1 where
-anything differs by more than the tolerance (relative, absolute below 1).
+durations, software versions and digests are left out, and so are files named after a digest (tables
+repeat what they hold). Sentences for readers are listed where they differ, but are no difference.
+Exit code 1 where anything else differs by more than the tolerance (relative, absolute below 1).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import subprocess
 import sys
 import tomllib
@@ -43,6 +45,10 @@ COMMANDS = {
 RENAMED = Path(__file__).with_name("renamed_outputs.toml")
 NOT_COMPUTED = {"timings.json", "stages.json"}
 READ = {".json", ".csv", ".npz", ".tif", ".tiff", ".h5", ".vtu"}
+SENTENCE = "a sentence"
+DIGEST = re.compile(r"[0-9a-f]{12,64}")
+LEAST_WORDS = 4
+"""A text of that many words is a sentence for readers."""
 SKIPPED = {"seconds", "versions", "source", "sha256", "digest", "key", "software", "files"}
 
 
@@ -72,7 +78,11 @@ class Renamed:
         self.names: dict[str, str] = content.get("names", {})
         self.values: dict[str, str] = content.get("values", {})
         self.files: dict[str, str] = content.get("files", {})
-        self.removed = set(content.get("removed", {}).get("names", []))
+        self.removed: dict[str, list[str]] = content.get("removed", {})
+
+    def gone(self, path: Path) -> set[str]:
+        """Keys that a file of the earlier run had."""
+        return {key for file, keys in self.removed.items() if path.match(file) for key in keys}
 
     def path(self, path: Path) -> Path:
         """Where a file of the earlier run lies now."""
@@ -81,15 +91,17 @@ class Renamed:
         )
 
 
-def flat(thing: object, renamed: Renamed, at: str = "") -> Iterator[tuple[str, object]]:
+def flat(
+    thing: object, renamed: Renamed, skipped: set[str], at: str = ""
+) -> Iterator[tuple[str, object]]:
     """Every number and text of a JSON file, with the path of keys that leads to it."""
     if isinstance(thing, dict):
         for key, value in thing.items():
-            if key not in SKIPPED | renamed.removed:
-                yield from flat(value, renamed, f"{at}/{renamed.names.get(key, key)}")
+            if key not in skipped:
+                yield from flat(value, renamed, skipped, f"{at}/{renamed.names.get(key, key)}")
     elif isinstance(thing, list):
         for index, value in enumerate(thing):
-            yield from flat(value, renamed, f"{at}/{index}")
+            yield from flat(value, renamed, skipped, f"{at}/{index}")
     else:
         yield at, renamed.values.get(thing, thing) if isinstance(thing, str) else thing
 
@@ -105,7 +117,8 @@ def contents(path: Path, renamed: Renamed) -> Iterator[tuple[str, object]]:
     names = renamed.names
     match path.suffix:
         case ".json":
-            yield from flat(json.loads(path.read_text()), renamed)
+            skipped = SKIPPED | renamed.gone(path)
+            yield from flat(json.loads(path.read_text()), renamed, skipped)
         case ".csv":
             for key, column in pd.read_csv(path, comment="#").items():
                 values = [renamed.values.get(v, v) if isinstance(v, str) else v for v in column]
@@ -144,8 +157,11 @@ def difference(before: object, now: object, tolerance: float) -> str:
     if one.shape != other.shape:
         return f"shape {one.shape} is now {other.shape}"
     if one.dtype.kind not in "biufc" or other.dtype.kind not in "biufc":
-        unlike = [(x, y) for x, y in zip(one.flat, other.flat, strict=True) if str(x) != str(y)]
-        return f"{len(unlike)} of {one.size} differ, e.g. {unlike[0]}" if unlike else ""
+        pairs = [(str(x), str(y)) for x, y in zip(one.flat, other.flat, strict=True)]
+        unlike = [(x, y) for x, y in pairs if x != y and not DIGEST.fullmatch(x)]
+        if any(len(x.split()) < LEAST_WORDS for x, _ in unlike):
+            return f"{len(unlike)} of {one.size} differ, e.g. {unlike[0]}"
+        return f"{SENTENCE}: {unlike[0][0]!r} is now {unlike[0][1]!r}" if unlike else ""
     one, other = one.astype(complex), other.astype(complex)
     equal = (one == other) | (np.isnan(one) & np.isnan(other))
     with np.errstate(invalid="ignore"):
@@ -158,7 +174,11 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
     """Print every difference; the number of them."""
     renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
     files = [
-        p for p in sorted(before.rglob("*")) if p.suffix in READ and p.name not in NOT_COMPUTED
+        path
+        for path in sorted(before.rglob("*"))
+        if path.suffix in READ
+        and path.name not in NOT_COMPUTED
+        and not any(DIGEST.fullmatch(Path(p).stem) for p in path.relative_to(before).parts)
     ]
     for old in files:
         path = old.relative_to(before)
@@ -173,7 +193,7 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
             what = difference(value, now.pop(key), tolerance) if key in now else "missing"
             if what:
                 print(f"{path}: {key}: {what}")
-                differences += 1
+                differences += not what.startswith(SENTENCE)
         for key in now:
             print(f"{path}: {key}: new")
     print(f"{len(files)} files, {values} values and arrays compared: {differences} differences")
