@@ -198,5 +198,5 @@ def test_the_recipe_for_a_further_stacking_works(monkeypatch: pytest.MonkeyPatch
 
 def test_studies_of_one_mode_refuse_staggered_rows() -> None:
     experiment = Experiment(TRIANGULAR)
-    with pytest.raises(InputError, match="square or rectangular stacking.*got triangular"):
+    with pytest.raises(InputError, match=r"square or rectangular stacking.*got triangular"):
         ImagePairSpec(experiment, IMAGING, FEW, lambda: simulate(experiment))
