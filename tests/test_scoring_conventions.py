@@ -120,8 +120,8 @@ def test_a_field_read_by_another_convention_is_put_right(
     columns = convention.write(*measured(truth, NOISE_PX, seed))
     field = declared(columns, down, convention.in_mm)
     meant, said = check_conventions(field, truth, GRID)
-    assert bool(said) == bool(meant.words)
-    left = median_px(truth, *meant.taken(field.x, field.y, field.u))
+    assert bool(said) == bool(meant.text)
+    left = median_px(truth, *meant.applied(field.x, field.y, field.u))
     # As little as the noise leaves: of 1300 points the median is known to 2 %; a shift that is
     # not seen, because it changes nothing to speak of, may add a thousandth of a pixel.
     assert left < 1.06 * MEDIAN * NOISE_PX + 1e-3
@@ -149,7 +149,7 @@ def test_one_mistake_is_named(words: str) -> None:
     field = declared(NAMED[words].write(*measured(truth, NOISE_PX)), down=True, in_mm=False)
     meant, (said,) = check_conventions(field, truth, GRID)
     assert words in said
-    assert len(meant.words) == 1
+    assert len(meant.text) == 1
 
 
 @pytest.mark.parametrize("corner", [(0, 0), (GRID.rows - 1, 0)])
