@@ -33,7 +33,13 @@ from pathlib import Path
 from typing import Any
 
 NO_DISK = 77
-_MODULES = ("pipeline", "harvest.pipeline", "validation.harvest.report", "studies.pipeline", "cli")
+_MODULES = (
+    "runs.experiment",
+    "runs.photographs.pipeline",
+    "report.photographs",
+    "runs.study",
+    "cli.root",
+)
 _NEW_USER, _NEW_MOUNTS, _REMOUNT = 0x10000000, 0x00020000, 0x20
 _ATTEMPTS = 60
 _DANGER = 0.3

@@ -133,5 +133,5 @@ def test_guide_leaves_a_symmetric_path_as_it_is() -> None:
 
 
 def test_guide_needs_junctions_at_mid_height() -> None:
-    with pytest.raises(InputError, match="guided: expected .* an even holes_y"):
+    with pytest.raises(InputError, match=r"guided: expected .* an even holes_y"):
         Experiment(Specimen(4, 3), guided=True)

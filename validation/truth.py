@@ -159,13 +159,13 @@ def compare(
     grid, mask, ansatz = images.grid, images.mask(), result.ansatz
     truth = images.truth(strain).displacement
     best = best_fit(images.truth(strain), result, guesses=(start,), progress=progress)
-    unmatched = residual(
+    left = residual(
         Assembly(ansatz, grid, mask),
         result.unknowns,
         images.reference(camera=camera),
         SplineImage.of(images.deformed(strain, camera=camera)),
     )
-    return Comparison(strain, grid, mask, truth, result, best, unmatched.astype(np.float64))
+    return Comparison(strain, grid, mask, truth, result, best, left.astype(np.float64))
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class BlochTransform:
     def expand(self, vectors: Batch) -> Batch:
         """T x for x (size, w, m)."""
         copies = self._copies
-        result = vectors[copies.places]
+        result = vectors[copies.places].astype(np.result_type(vectors, self.dtype), copy=False)
         result[copies._turned] *= self._factors
         return np.asarray(result)
 

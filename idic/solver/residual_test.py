@@ -243,7 +243,7 @@ def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) 
 def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> float:
     """Fraction of the image whose two grey levels are decorrelated [-].
 
-    Over blocks of ``BLOCK_PX``: those in which the reference and the deformed image brought
+    Over blocks of ``BLOCK_PX``: those in which the reference and the deformed image pulled
     back to it have a zero-normalised cross-correlation below ``CORRELATED``. At a local minimum a
     speckle or more off, it is about 0.
 

@@ -78,18 +78,18 @@ class ErrorMaps:
 
     Parameters
     ----------
-    sheet
+    map_frame
         Frame, outline and cells.
     lengths
         The scale of the error's length.
     """
 
-    sheet: MapFrame
+    map_frame: MapFrame
     lengths: LogScale
 
     @classmethod
     def of(cls, mesh: Mesh, grid: PixelGrid, scores: Sequence[Score]) -> ErrorMaps:
-        """Make a sheet, and a scale on which 98 % of every code's errors are distinguished."""
+        """Make a map, and a scale on which 98 % of every code's errors are distinguished."""
         lengths = [_error_length(graded) for graded in scores if len(graded.error_px)]
         ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
         low = min((end[0] for end in ends), default=1e-3)
@@ -119,19 +119,22 @@ class FieldMaps:
 
     @cached_property
     def _nearest(self) -> NDArray[np.intp]:
-        """(rows, cols) of the sheet: number of the nearest point, the count of all if too far."""
-        graded, sheet = self.graded, self.maps.sheet
+        """(rows, cols) of the map: number of the nearest point, the count of all if too far."""
+        graded, map_frame = self.graded, self.maps.map_frame
         if not len(graded.x):
-            return np.zeros(sheet.grid.shape, dtype=np.intp)
-        reach = max(graded.reach_px * sheet.grid.pixel_size / sheet.factor, sheet.grid.pixel_size)
+            return np.zeros(map_frame.grid.shape, dtype=np.intp)
+        reach = max(
+            graded.reach_px * map_frame.grid.pixel_size / map_frame.factor,
+            map_frame.grid.pixel_size,
+        )
         points = np.column_stack([graded.x, graded.y])
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        pixels = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
+        pixels = np.stack(np.meshgrid(map_frame.grid.x, map_frame.grid.y), axis=-1)
         return np.asarray(tree.query(pixels, distance_upper_bound=reach)[1])
 
     def _draw(self, values: FloatArray, scale: ColourScale) -> Figure:
         """A map; blank where nothing was measured."""
-        return draw_field(self.maps.sheet, np.append(values, np.nan)[self._nearest], scale)
+        return draw_field(self.maps.map_frame, np.append(values, np.nan)[self._nearest], scale)
 
     def draw_length(self) -> Figure:
         """Draw the error's length, on the scale of all codes."""

@@ -115,14 +115,18 @@ def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
 
 def draw_hero(state: SnapshotState) -> Figure:
     """The deformed image turning into the pattern that was measured in it."""
-    images, strain, sheet = state.data.images, state.data.strains[state.k], state.view.sheet()
+    images, strain, map_frame = (
+        state.data.images,
+        state.data.strains[state.k],
+        state.view.map_frame(),
+    )
     if has_mode(0)(state):
-        length = UM * lengths(pattern_field(state.result, sheet.grid))
+        length = UM * lengths(pattern_field(state.result, map_frame.grid))
     else:
-        length = sheet.average(UM * lengths(state.comparison.w))
+        length = map_frame.average(UM * lengths(state.comparison.w))
     end = ColourScale.size(state.view.on_material(length), "µm")
     return draw_blend(
-        sheet, images.deformed(strain), images.deformed_mask(strain), images.grid, length,
+        map_frame, images.deformed(strain), images.deformed_mask(strain), images.grid, length,
         ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
 
@@ -130,15 +134,15 @@ def draw_hero(state: SnapshotState) -> Figure:
 def _image(state: SnapshotState) -> Figure:
     images, strain = state.data.images, state.data.strains[state.k]
     return draw_image(
-        state.view.sheet(), images.deformed(strain), images.deformed_mask(strain), images.grid,
+        state.view.map_frame(), images.deformed(strain), images.deformed_mask(strain), images.grid,
         state.data.solution.at(strain).displacement,
     )  # fmt: skip
 
 
 def _residual(state: SnapshotState) -> Figure:
-    sheet = state.view.sheet(FINE)
-    residual = sheet.sample(state.comparison.residual)
-    return draw_field(sheet, residual, ColourScale.signed(residual, "", 0.99), state.motion)
+    map_frame = state.view.map_frame(FINE)
+    residual = map_frame.sample(state.comparison.residual)
+    return draw_field(map_frame, residual, ColourScale.signed(residual, "", 0.99), state.motion)
 
 
 def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
@@ -146,7 +150,7 @@ def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
 
     def draw(state: SnapshotState) -> Figure:
         field: FloatArray = getattr(state.comparison, name)
-        return draw_length(state, state.view.sheet().average(lengths(field)))
+        return draw_length(state, state.view.map_frame().average(lengths(field)))
 
     return draw
 

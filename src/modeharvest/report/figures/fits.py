@@ -58,16 +58,16 @@ class SpecimenView:
     pitch: float
     _sheets: dict[int, MapFrame] = field(default_factory=dict, repr=False)
 
-    def sheet(self, cells: int = SMOOTH) -> MapFrame:
+    def map_frame(self, cells: int = SMOOTH) -> MapFrame:
         """The frame of maps with about that many cells along the longer side."""
         if cells not in self._sheets:
             self._sheets[cells] = MapFrame.of(self.outline, self.grid, cells)
         return self._sheets[cells]
 
     def on_material(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:
-        """Values on a sheet; NaN off the material, where the ansatz has no meaning."""
-        sheet = self.sheet(cells)
-        (rows, cols), n = sheet.grid.shape, sheet.factor
+        """Values on a map; NaN off the material, where the ansatz has no meaning."""
+        map_frame = self.map_frame(cells)
+        (rows, cols), n = map_frame.grid.shape, map_frame.factor
         blocks = self.mask[: rows * n, : cols * n].reshape(rows, n, cols, n)
         return np.where(blocks.any(axis=(1, 3)), values, np.nan)
 
@@ -100,13 +100,13 @@ class FittedState:
         return self.result.ansatz.displacement(self.result.unknowns, x, y)
 
     def support(self, i: int, cells: int = SMOOTH) -> FloatArray:
-        """Taper of mode i (from 0) on a sheet [-]."""
-        taper, grid = self.result.ansatz.modes[i].taper, self.view.sheet(cells).grid
+        """Taper of mode i (from 0) on a map [-]."""
+        taper, grid = self.result.ansatz.modes[i].taper, self.view.map_frame(cells).grid
         return np.asarray(taper.along_y(grid.y)[:, None] * taper.along_x(grid.x)[None, :])
 
     def shape_scale(self, i: int) -> float:
         """By how much phi_i is drawn [mm], for a largest displacement of DRAWN_SHAPE l."""
-        phi = self.result.phi(i, self.view.sheet().grid)
+        phi = self.result.phi(i, self.view.map_frame().grid)
         largest = float(np.linalg.norm(phi, axis=-1).max())
         return DRAWN_SHAPE * self.view.pitch / largest if largest > 0 else 1.0
 
@@ -188,9 +188,9 @@ def panel_sections(
 def draw_length(
     state: FittedState, length: FloatArray, cells: int = SMOOTH, share: float = 0.998
 ) -> Figure:
-    """Draw a length [mm] on a sheet in the deformed configuration, colours up to this share."""
+    """Draw a length [mm] on a map in the deformed configuration, colours up to this share."""
     scale = ColourScale.size(UM * length, "µm", share)
-    return draw_field(state.view.sheet(cells), UM * length, scale, state.motion)
+    return draw_field(state.view.map_frame(cells), UM * length, scale, state.motion)
 
 
 def _spectrum(state: FittedState, component: int) -> Figure:
@@ -199,31 +199,31 @@ def _spectrum(state: FittedState, component: int) -> Figure:
 
 
 def _v0(state: FittedState, component: int) -> Figure:
-    v0 = UM * state.result.v0(state.view.sheet().grid)[..., component]
+    v0 = UM * state.result.v0(state.view.map_frame().grid)[..., component]
     scale = ColourScale.signed(state.view.on_material(v0), "µm")
-    return draw_field(state.view.sheet(), v0, scale)
+    return draw_field(state.view.map_frame(), v0, scale)
 
 
 def _amplitude(state: FittedState, i: int) -> Figure:
     """v_i where phi_i is not zero; the colours end at the largest value where it is whole."""
     support = state.support(i)
-    v = UM * state.result.v(i, state.view.sheet().grid)
+    v = UM * state.result.v(i, state.view.map_frame().grid)
     inside = state.view.on_material(np.where(support == 1.0, v, np.nan))
     scale = replace(ColourScale.signed(inside, "µm"), extend="both")
-    return draw_field(state.view.sheet(), np.where(support > 0.0, v, np.nan), scale)
+    return draw_field(state.view.map_frame(), np.where(support > 0.0, v, np.nan), scale)
 
 
 def _shape(state: FittedState, i: int) -> Figure:
     ansatz, unknowns, scale = state.result.ansatz, state.result.unknowns, state.shape_scale(i)
-    return draw_shape(state.view.sheet(), lambda x, y: scale * ansatz.phi(i, unknowns, x, y))
+    return draw_shape(state.view.map_frame(), lambda x, y: scale * ansatz.phi(i, unknowns, x, y))
 
 
 def _fluctuation(state: FittedState, i: int, component: int) -> Figure:
-    result, sheet = state.result, state.view.sheet()
-    values = UM * result.fluctuation(i, sheet.grid)[..., component]
+    result, map_frame = state.result, state.view.map_frame()
+    values = UM * result.fluctuation(i, map_frame.grid)[..., component]
     motion: DisplacementFunction = partial(result.ansatz.fluctuation, i, result.unknowns)
     scale = ColourScale.signed(state.view.on_material(values), "µm")
-    return draw_field(sheet, values, scale, motion)
+    return draw_field(map_frame, values, scale, motion)
 
 
 def named(paper: str, letters: str) -> str:

@@ -150,7 +150,7 @@ class ColourScale:
 
 
 def draw_field(
-    sheet: MapFrame,
+    map_frame: MapFrame,
     values: FloatArray,
     scale: ColourScale,
     motion: DisplacementFunction | None = None,
@@ -159,18 +159,18 @@ def draw_field(
 
     Parameters
     ----------
-    sheet
+    map_frame
         Frame and outline.
     values
-        (rows, cols) on ``sheet.grid``; NaN is left blank.
+        (rows, cols) on ``map_frame.grid``; NaN is left blank.
     scale
         Colours and unit.
     motion
         The displacement to draw it with; None for the reference configuration.
     """
-    drawn, axes = _empty_map(sheet)
-    edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
-    X, Y = sheet.moved_corners(motion)
+    drawn, axes = _empty_map(map_frame)
+    edge = _draw_edge(axes, map_frame.outline.path(map_frame.moved_nodes(motion)))
+    X, Y = map_frame.moved_corners(motion)
     quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
                             norm=scale.normalise, rasterized=True)  # fmt: skip
     quads.set_clip_path(edge)
@@ -179,7 +179,7 @@ def draw_field(
 
 
 def draw_image(
-    sheet: MapFrame,
+    map_frame: MapFrame,
     image: NDArray[np.float32],
     material: BoolArray,
     grid: PixelGrid,
@@ -189,7 +189,7 @@ def draw_image(
 
     Parameters
     ----------
-    sheet
+    map_frame
         Frame and outline.
     image, material
         (rows, cols) grey levels [fraction of full scale] and where they show material.
@@ -198,26 +198,26 @@ def draw_image(
     displacement
         (n, 2) true displacement at the mesh's nodes [mm], for the outline.
     """
-    drawn, axes = _empty_map(sheet)
-    _show_grey(axes, sheet, image, material, grid)
-    _draw_edge(axes, sheet.outline.path(displacement))
+    drawn, axes = _empty_map(map_frame)
+    _show_grey(axes, map_frame, image, material, grid)
+    _draw_edge(axes, map_frame.outline.path(displacement))
     colour_bar(drawn, axes, ColourScale(GREY, 0.0, 1.0))
     return drawn
 
 
-def draw_shape(sheet: MapFrame, motion: DisplacementFunction) -> Figure:
+def draw_shape(map_frame: MapFrame, motion: DisplacementFunction) -> Figure:
     """Draw the specimen's outline deformed over the undeformed one; no colour bar."""
-    drawn, axes = _empty_map(sheet)
-    draw_path(axes, sheet.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
+    drawn, axes = _empty_map(map_frame)
+    draw_path(axes, map_frame.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
               clip_on=False)  # fmt: skip
-    deformed = sheet.outline.path(sheet.moved_nodes(motion))
+    deformed = map_frame.outline.path(map_frame.moved_nodes(motion))
     draw_path(axes, deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False)
     draw_path(axes, deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False)
     return drawn
 
 
 def draw_blend(
-    sheet: MapFrame,
+    map_frame: MapFrame,
     image: NDArray[np.float32],
     material: BoolArray,
     grid: PixelGrid,
@@ -229,24 +229,24 @@ def draw_blend(
 
     Parameters
     ----------
-    sheet
+    map_frame
         Frame and outline.
     image, material
         (rows, cols) grey levels [fraction of full scale] and where they show material.
     grid
         Their pixels.
     values
-        (rows, cols) on ``sheet.grid``, what was measured; NaN is left blank.
+        (rows, cols) on ``map_frame.grid``, what was measured; NaN is left blank.
     scale
         Colours and unit.
     motion
         The displacement to draw it with.
     """
-    drawn, axes = _empty_map(sheet, width=3.2)
+    drawn, axes = _empty_map(map_frame, width=3.2)
     # Gone where the field is opaque, or slivers of it would show along the holes.
-    _show_grey(axes, sheet, image, material, grid, dissolve=True)
-    edge = _draw_edge(axes, sheet.outline.path(sheet.moved_nodes(motion)))
-    X, Y = sheet.moved_corners(motion)
+    _show_grey(axes, map_frame, image, material, grid, dissolve=True)
+    edge = _draw_edge(axes, map_frame.outline.path(map_frame.moved_nodes(motion)))
+    X, Y = map_frame.moved_corners(motion)
     colours = scale.colours(scale.normalise(values))
     colours[..., 3] *= _ramp(values.shape)
     quads = axes.pcolormesh(X, Y, colours, rasterized=True)
@@ -255,9 +255,9 @@ def draw_blend(
     return drawn
 
 
-def _empty_map(sheet: MapFrame, width: float = WIDTH) -> tuple[Figure, Axes]:
+def _empty_map(map_frame: MapFrame, width: float = WIDTH) -> tuple[Figure, Axes]:
     """An empty map with a scale bar."""
-    left, right, bottom, top = sheet.limits
+    left, right, bottom, top = map_frame.limits
     tall = _MAP * width * (top - bottom) / (right - left)
     height = tall + _BELOW + _ABOVE
     drawn = figure(width, height)
@@ -305,14 +305,14 @@ def _ramp(shape: tuple[int, ...]) -> FloatArray:
 
 def _show_grey(
     axes: Axes,
-    sheet: MapFrame,
+    map_frame: MapFrame,
     image: NDArray[np.float32],
     material: BoolArray,
     grid: PixelGrid,
     dissolve: bool = False,
 ) -> None:
     """Show an image averaged over blocks of pixels, its background transparent."""
-    joined = max(1, sheet.factor // 2)
+    joined = max(1, map_frame.factor // 2)
     coarse = grid.binned(joined)
     rows, cols = coarse.shape
 
@@ -326,7 +326,7 @@ def _show_grey(
     rgba[..., 3] = cover * np.minimum(1.0, 4.0 * (1.0 - _ramp(coarse.shape))) if dissolve else cover
     axes.imshow(np.nan_to_num(rgba), extent=coarse.extent, interpolation="antialiased",
                 rasterized=True, aspect="auto")  # fmt: skip
-    axes.set(xlim=sheet.limits[:2], ylim=sheet.limits[2:])
+    axes.set(xlim=map_frame.limits[:2], ylim=map_frame.limits[2:])
 
 
 def _quantile(values: FloatArray, share: float) -> float:

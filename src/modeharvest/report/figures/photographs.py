@@ -148,16 +148,16 @@ def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[Photo
 
 def draw_hero(state: PhotographState) -> Figure:
     """Let a photograph dissolve into the pattern that was found in it."""
-    result, sheet = state.result, state.view.sheet()
-    pattern = result.displacement(sheet.grid)
+    result, map_frame = state.result, state.view.map_frame()
+    pattern = result.displacement(map_frame.grid)
     if state.frame.modes:
-        pattern = pattern - result.v0(sheet.grid)
+        pattern = pattern - result.v0(map_frame.grid)
     length = UM * np.linalg.norm(pattern, axis=-1)
     end = ColourScale.size(state.view.on_material(length), "µm")
     everywhere = np.ones(state.frame.image.shape, dtype=np.bool_)
     drawn = draw_blend(
-        sheet, grey_levels(state.frame.image, state.levels), everywhere, state.view.grid, length,
-        ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
+        map_frame, grey_levels(state.frame.image, state.levels), everywhere, state.view.grid,
+        length, ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
     # The photograph ends where the measured outline does: a mask of it may have ragged edges.
     axes = drawn.axes[0]
@@ -167,13 +167,15 @@ def draw_hero(state: PhotographState) -> Figure:
 
 def draw_deformed(state: PhotographState) -> Figure:
     """Draw a deformed photograph, and over it the reference's outline moved as measured."""
-    sheet = state.view.sheet()
-    moved = sheet.moved_nodes(state.motion)
+    map_frame = state.view.map_frame()
+    moved = map_frame.moved_nodes(state.motion)
     assert moved is not None
     image, everywhere = state.frame.image, np.ones(state.frame.image.shape, dtype=np.bool_)
-    drawn = draw_image(sheet, grey_levels(image, state.levels), everywhere, state.view.grid, moved)
+    drawn = draw_image(
+        map_frame, grey_levels(image, state.levels), everywhere, state.view.grid, moved
+    )
     axes, bar = drawn.axes
-    draw_path(axes, sheet.outline.path(moved), fill=False, ec=GOLD, lw=0.7, rasterized=True,
+    draw_path(axes, map_frame.outline.path(moved), fill=False, ec=GOLD, lw=0.7, rasterized=True,
               zorder=2)  # fmt: skip
     bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in state.levels])
     bar.set_title("levels", fontsize=8, pad=6, loc="left")
@@ -198,7 +200,7 @@ def draw_closeup(state: PhotographState) -> Figure:
     axes.set_axis_off()
     axes.imshow(part, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, rasterized=True,
                 interpolation="antialiased", aspect="auto")  # fmt: skip
-    path = state.view.outline.path(state.view.sheet().moved_nodes(state.motion))
+    path = state.view.outline.path(state.view.map_frame().moved_nodes(state.motion))
     draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return drawn
@@ -214,16 +216,16 @@ def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Fig
 
 def draw_residual(state: PhotographState) -> Figure:
     """Draw f - g(x + u) in the deformed configuration, single pixels."""
-    full, sheet = state.harvest.full_scale, state.view.sheet(FINE)
-    values = np.asarray(_residual(state, sheet) / (full or 1.0), dtype=np.float64)
+    full, map_frame = state.harvest.full_scale, state.view.map_frame(FINE)
+    values = np.asarray(_residual(state, map_frame) / (full or 1.0), dtype=np.float64)
     scale = ColourScale.signed(values, "" if full else "levels", 0.99)
-    return draw_field(sheet, values, scale, state.motion)
+    return draw_field(map_frame, values, scale, state.motion)
 
 
-def _residual(state: PhotographState, sheet: MapFrame) -> FloatArray:
+def _residual(state: PhotographState, map_frame: MapFrame) -> FloatArray:
     """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
     harvest, ansatz, a = state.harvest, state.result.ansatz, state.result.unknowns
-    rows, cols = _pixels(sheet)
+    rows, cols = _pixels(map_frame)
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
     spline = SplineImage.of(np.asarray(state.frame.image), state.result.order)
@@ -234,10 +236,10 @@ def _residual(state: PhotographState, sheet: MapFrame) -> FloatArray:
     return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
 
 
-def _pixels(sheet: MapFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the images' pixels that the middles of a sheet's cells show."""
-    n = sheet.factor
-    rows, cols = (n // 2 + n * np.arange(size) for size in sheet.grid.shape)
+def _pixels(map_frame: MapFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the images' pixels that the middles of a map's cells show."""
+    n = map_frame.factor
+    rows, cols = (n // 2 + n * np.arange(size) for size in map_frame.grid.shape)
     return rows, cols
 
 
@@ -247,10 +249,10 @@ def draw_w(state: PhotographState) -> Figure:
     assert local is not None
     w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
     cells = min(SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
-    sheet = state.view.sheet(cells)
-    points = np.stack(np.meshgrid(sheet.grid.x, sheet.grid.y), axis=-1)
+    map_frame = state.view.map_frame(cells)
+    points = np.stack(np.meshgrid(map_frame.grid.x, map_frame.grid.y), axis=-1)
     near, nearest = cKDTree(np.column_stack([w.x, w.y])[w.good]).query(points)
-    reach = _REACH * max(w.spacing, sheet.grid.pixel_size)
+    reach = _REACH * max(w.spacing, map_frame.grid.pixel_size)
     length = np.linalg.norm(w.u[w.good], axis=1)[nearest]
     return draw_length(state, np.where(near <= reach, length, np.nan), cells)
 
@@ -260,15 +262,15 @@ def draw_error(state: PhotographState, field: str, cause: Cause) -> Figure:
 
     That of a vector is the root of the sum of both components' variances.
     """
-    sheet, frame = state.view.sheet(COARSE), state.frame
+    map_frame, frame = state.view.map_frame(COARSE), state.frame
     errors = frame.by_noise if cause == "noise" else frame.by_model_error
     assert errors is not None
-    sd = UM * _resampled(frame, _sd(errors, field), sheet)
+    sd = UM * _resampled(frame, _sd(errors, field), map_frame)
     if field != "v0":
         i = int(field.removeprefix("fluc").removeprefix("v")) - 1
         sd = np.where(state.support(i, COARSE) > 0.0, sd, np.nan)
     scale = ColourScale.size(state.view.on_material(sd, COARSE), "µm", 0.99)
-    return draw_field(sheet, sd, scale)
+    return draw_field(map_frame, sd, scale)
 
 
 def _sd(errors: FieldErrors, field: str) -> FloatArray:
@@ -280,15 +282,15 @@ def _sd(errors: FieldErrors, field: str) -> FloatArray:
     return np.asarray(errors.v[int(field[1:]) - 1])
 
 
-def _resampled(frame: HarvestedFrame, sd: FloatArray, sheet: MapFrame) -> FloatArray:
-    """Error bars on the cells of a sheet, linear between the axes' values; NaN if infinite."""
+def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: MapFrame) -> FloatArray:
+    """Error bars on the cells of a map, linear between the axes' values; NaN if infinite."""
     along_y, along_x = np.argsort(frame.error_y), np.argsort(frame.error_x)
     between = RegularGridInterpolator(
         (frame.error_y[along_y], frame.error_x[along_x]),
         np.where(np.isfinite(sd), sd, np.nan)[np.ix_(along_y, along_x)],
         bounds_error=False, fill_value=None,
     )  # fmt: skip
-    y, x = np.meshgrid(sheet.grid.y, sheet.grid.x, indexing="ij")
+    y, x = np.meshgrid(map_frame.grid.y, map_frame.grid.x, indexing="ij")
     return np.asarray(np.maximum(between((y, x)), 0.0))
 
 
@@ -297,10 +299,10 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
 
     "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
     """
-    harvest, sheet = state.harvest, state.view.sheet()
+    harvest, map_frame = state.harvest, state.view.map_frame()
     assert harvest.truth is not None
     known = harvest.truth.frames[state.frame.name]
-    rows, cols = _pixels(sheet)
+    rows, cols = _pixels(map_frame)
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     fields: dict[str, Callable[[], FloatArray]] = {
         "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),

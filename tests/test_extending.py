@@ -1,0 +1,46 @@
+"""The recipes of docs/extending.md run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from modeharvest.fem import materials
+from modeharvest.util.typed import quantities
+
+PAGE = Path(__file__).parents[1] / "docs/extending.md"
+
+
+def run(heading: str) -> dict[str, Any]:
+    """What the code below a heading defines."""
+    code = PAGE.read_text("utf-8").split(f"## {heading}")[1].split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {"__name__": "recipe"}
+    exec(compile(code, str(PAGE), "exec", dont_inherit=True), names)
+    return names
+
+
+@pytest.mark.dolfinx
+def test_a_material(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At rest its energy and stress vanish, and a case's table makes it."""
+    import ufl
+
+    monkeypatch.setattr(materials, "MATERIALS", materials.MATERIALS.copy())
+    run("A material")
+    made = materials.material_of({"kind": "neo-hookean", "mu": 0.5})
+    F = ufl.variable(ufl.as_matrix([[1.0, 0.0], [0.0, 1.0]]))
+    P = ufl.diff(made.energy(F), F)
+    assert float(made.energy(F)) == pytest.approx(0.0)
+    for i in (0, 1):
+        for j in (0, 1):
+            applied = ufl.algorithms.apply_derivatives.apply_derivatives(
+                ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering(P[i, j])
+            )
+            assert float(applied) == pytest.approx(0.0)
+    assert materials.material_table(made) == {"kind": "NeoHookean", "mu": 0.5, "kappa": 5.4}
+
+
+def test_a_number_in_the_report() -> None:
+    names = run("A number in the report of a virtual experiment")
+    assert list(quantities(names["Snapshot"])) == [("w, largest", "px", "largest_w_px")]

@@ -1,0 +1,122 @@
+"""The shape of the project: how many modules, where what draws is, and the words it speaks."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import subprocess
+import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parent.parent
+TOPS = [PROJECT / name for name in ("fem", "imaging", "idic", "validation", "src/modeharvest")]
+MOST_MODULES, MOST_ENTRIES = 200, 12
+MOST_LINES = 46_400
+"""What there was when this was written; it is to become 42 500."""
+
+PRIVATE_WORDS = """
+    told judged leftover softness softened pushes unmatched trapped landed levelled marched
+    walker desk nobodys atlas mistakes introduce grains sheet
+"""
+"""Parts of names that once meant something to this project alone."""
+
+PRIVATE_PHRASES = (
+    "what is left over",
+    "what the model can't say",
+    "what the measurement loses",
+    "lit alike",
+    "brought back",
+    "the images as they are",
+)
+
+
+def modules() -> list[Path]:
+    """Every module of the four folders and of the application, once."""
+    found = {path.resolve() for top in TOPS for path in top.rglob("*.py")}
+    return sorted(path for path in found if "__pycache__" not in path.parts)
+
+
+def names(module: Path) -> Iterator[tuple[int, str]]:
+    """Every name in a module's code, with its line."""
+    text = module.read_text(encoding="utf-8")
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.NAME:
+            yield token.start[0], token.string
+
+
+def test_there_are_few_modules_and_lines() -> None:
+    found = modules()
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in found)
+    assert len(found) <= MOST_MODULES
+    assert lines <= MOST_LINES
+
+
+def test_a_folder_can_be_taken_in_at_a_glance() -> None:
+    folders = {path.parent for path in modules()}
+    for folder in folders:
+        entries = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
+        entries |= {
+            path.name for path in folder.iterdir() if path.is_dir() and any(path.glob("*.py"))
+        }
+        assert len(entries) <= MOST_ENTRIES, f"{folder.relative_to(PROJECT)}: {sorted(entries)}"
+
+
+def test_no_two_classes_share_a_name() -> None:
+    found = Counter(
+        node.name
+        for path in modules()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in found.items() if count > 1] == []
+
+
+def test_every_module_says_what_it_is() -> None:
+    for path in modules():
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        assert re.match(r"\S.*\.$", text.partition("\n")[0]), path.relative_to(PROJECT)
+
+
+def test_names_are_the_field_s() -> None:
+    private = set(PRIVATE_WORDS.split())
+    found = [
+        f"{path.relative_to(PROJECT)}:{line}: {name}"
+        for path in modules()
+        for line, name in names(path)
+        if private & set(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_"))
+    ]
+    assert found == []
+
+
+def test_sentences_are_the_field_s() -> None:
+    pages = [*modules(), *PROJECT.glob("*.md"), *(PROJECT / "docs").glob("*.md")]
+    found = [
+        f"{path.relative_to(PROJECT)}: {phrase}"
+        for path in pages
+        for phrase in PRIVATE_PHRASES
+        if phrase in " ".join(path.read_text(encoding="utf-8").lower().split())
+    ]
+    assert found == []
+
+
+def test_the_architecture_page_is_drawn_from_the_code() -> None:
+    script = [sys.executable, PROJECT / "scripts/architecture.py", "--check"]
+    assert subprocess.run(script, check=False).returncode == 0, "run scripts/architecture.py"
+
+
+@pytest.mark.parametrize(
+    "line", ["import modeharvest", "from modeharvest.fem.specimen import Specimen"]
+)
+def test_what_does_not_draw_starts_without_plotting(line: str) -> None:
+    drawing = {"matplotlib", "pandas", "rich", "jinja2"}
+    script = f"{line}; import sys; print(*{drawing} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == []
