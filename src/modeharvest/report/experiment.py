@@ -202,7 +202,7 @@ def number_cards(summary: Summary) -> list[Card]:
     labels = [snapshot_label(s["nominal_strain"], s["branch"], critical) for s in snapshots]
     columns = ("rms: per component, all material", *labels)
     table = ReportTable("Results", columns, rows, name="results", on_terminal=True)
-    return [Card.tabular(table), *_mode_cards(summary)]
+    return [Card.tabular(table, wide=True), *_mode_cards(summary)]
 
 
 def _mode_cards(summary: Summary) -> list[Card]:
