@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 COMMANDS = {
@@ -170,6 +171,11 @@ def difference(before: object, now: object, tolerance: float) -> str:
     return "" if worst <= tolerance else f"differs by {worst:.3g}"
 
 
+def alternatives(key: str) -> list[str]:
+    """A path of keys; several, where one of them is now called this|or that."""
+    return ["/".join(parts) for parts in product(*(part.split("|") for part in key.split("/")))]
+
+
 def compare(before: Path, after: Path, tolerance: float) -> int:
     """Print every difference; the number of them."""
     renamed, as_is, differences, values = Renamed(RENAMED), Renamed(Path()), 0, 0
@@ -190,7 +196,8 @@ def compare(before: Path, after: Path, tolerance: float) -> int:
         now = dict(contents(new, as_is))
         for key, value in contents(old, renamed):
             values += 1
-            what = difference(value, now.pop(key), tolerance) if key in now else "missing"
+            name = next((name for name in alternatives(key) if name in now), None)
+            what = "missing" if name is None else difference(value, now.pop(name), tolerance)
             if what:
                 print(f"{path}: {key}: {what}")
                 differences += not what.startswith(SENTENCE)

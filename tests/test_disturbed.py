@@ -66,7 +66,7 @@ holes_y = 2
 STUDY = """
 [study]
 kind = "robustness"
-starts = 2
+initial_guesses = 2
 radii = []
 strain_errors = []
 [imaging]

@@ -51,7 +51,7 @@ TINY = """
 title = "A <tiny> study"
 [study]
 kind = "robustness"
-starts = 2
+initial_guesses = 2
 radii = [0.5]
 per_radius = 1
 strain_errors = []
@@ -108,7 +108,7 @@ def test_numbers_of_a_robustness_study() -> None:
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
     found = report_robustness(RobustnessStudy(), table, Path())
     numbers = found.numbers
-    assert (numbers["starts"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
+    assert (numbers["initial_guesses"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
     assert numbers["success"] == 0.97
     assert numbers["outliers"] == 1  # 2 % is above the paper's 1.5 %
     assert numbers["mean_epsilon_percent"] == pytest.approx(2.5 / 99)
@@ -145,7 +145,7 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
 
 
 def test_one_start_against_a_calculation_of_its_own(subject: ImagePairSpec, folder: Path) -> None:
-    study = RobustnessStudy(starts=1, radii=(), strain_errors=(-0.5,))
+    study = RobustnessStudy(initial_guesses=1, radii=(), strain_errors=(-0.5,))
     near, far = study.prepare(subject, folder)
     found = one_start(near, folder)
     scene = VirtualImagePair.open(folder, near["images"])
@@ -320,7 +320,7 @@ def test_a_quick_study_is_smaller() -> None:
     for name in shipped_cases("study"):
         case = StudyCase.read(name)
         assert case.quick().imaging.pixel_size == 2.0 * case.imaging.pixel_size
-    assert RobustnessStudy().quick().starts == 20
+    assert RobustnessStudy().quick().initial_guesses == 20
     assert NoiseStudy().quick().pairs == 5
     assert SystematicStudy().quick().levels["v_degree"] == (2, 5, 8)
 
@@ -329,8 +329,8 @@ def test_a_quick_study_is_smaller() -> None:
     ("text", "said"),
     [
         ('[study]\nkind = "robustnes"', "kind among"),
-        ("[study]\nstart = 3", "did you mean 'start"),
-        ("[study]\nstarts = 0", "expected 1 to 100000 starts"),
+        ("[study]\ninitial_guess = 3", "did you mean 'initial_guesses"),
+        ("[study]\ninitial_guesses = 0", "expected 1 to 100000 initial guesses"),
         ("[study]\nradius = 1.5", "radii above 0"),
         ("[study]\nradii = [0.1]", "other than radius"),
         ("[study]\nradii = [0.2, 0.2]", "radii that differ"),
@@ -400,7 +400,7 @@ def test_a_study_from_the_command_line(
     assert "2 of 2 initial guesses" in (printed := capsys.readouterr().out)
     assert "report.html" in printed
     summary = read_json(out / "summary.json")
-    assert summary["numbers"]["starts"] == 2
+    assert summary["numbers"]["initial_guesses"] == 2
     assert summary["failed"] == []
     assert len(pd.read_csv(out / "table.csv")) == 3
     check_page((out / "report.html").read_text("utf-8"), summary)
@@ -449,7 +449,7 @@ def test_a_case_has_one_thread(tmp_path: Path) -> None:
 def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in which one of two starts failed, and none is left to be run."""
     assert PAPER is not None
-    case = StudyCase(study=RobustnessStudy(starts=2, radii=(), strain_errors=()))
+    case = StudyCase(study=RobustnessStudy(initial_guesses=2, radii=(), strain_errors=()))
     case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
     pipeline = StudyAnalysis(case, tmp_path, solution=PAPER)
     cases = case.study.prepare(pipeline.subject(), tmp_path)

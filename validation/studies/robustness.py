@@ -35,7 +35,7 @@ PUBLISHED = {
     "mean_epsilon_percent": 0.86,
     "mean_epsilon_without_outliers_percent": 0.45,
 }
-"""Section "Virtual Experiments" of the paper: 100 starts, parameters up to 10 % off."""
+"""Section "Virtual Experiments" of the paper: 100 initial guesses, parameters up to 10 % off."""
 EVERY = 4
 """Displacements are compared at every fourth pixel: they are smooth."""
 
@@ -71,7 +71,7 @@ class GuessStatistics:
     ``distance``: rms length of the difference of two displacements, from the reference solution's.
     """
 
-    starts: int
+    initial_guesses: int
     radius: float
     same_minimum: int
     success: float
@@ -155,7 +155,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
     ----------
     strain
         Of the deformed image [-].
-    starts, radius
+    initial_guesses, radius
         Number of guesses whose mode parameters are perturbed by up to ``radius``: a share of 1
         for a1 ... a5, of the unit cell for the two phases. The paper: 100 and 0.1.
     radii, per_radius
@@ -172,14 +172,14 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
     """
 
     question: ClassVar[str] = (
-        "A correlation searches from a start. Does it matter which? The same pair of virtual "
-        "images is correlated from starts whose mode parameters are off, and their ends are "
-        "compared with that of the standard start."
+        "A correlation begins at an initial guess. Does it matter which? The same pair of virtual "
+        "images is correlated from guesses whose mode parameters are off, and their results are "
+        "compared with that of the standard guess."
     )
     function: ClassVar[str] = f"{__name__}:one_start"
 
     strain: float = 0.128
-    starts: int = 100
+    initial_guesses: int = 100
     radius: float = 0.1
     radii: tuple[float, ...] = (0.05, 0.15, 0.2, 0.3, 0.4, 0.5)
     per_radius: int = 20
@@ -187,10 +187,11 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.starts <= MOST and 0 <= self.per_radius <= MOST) or self.seed < 0:
+        counts_fit = 1 <= self.initial_guesses <= MOST and 0 <= self.per_radius <= MOST
+        if not counts_fit or self.seed < 0:
             raise InputError(
-                f"study: expected 1 to {MOST} starts, per_radius and seed of 0 or more, got "
-                f"{self.starts}, {self.per_radius} and {self.seed}"
+                f"study: expected 1 to {MOST} initial guesses, per_radius and seed from 0 on, got "
+                f"{self.initial_guesses}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
             raise InputError(
@@ -200,7 +201,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         if self.radius in self.radii:
             raise InputError(
                 f"study: expected radii other than radius = {self.radius}, which has its own "
-                f"starts, got {list(self.radii)}"
+                f"initial guesses, got {list(self.radii)}"
             )
         require_different("radii", self.radii)
         require_different("strain_errors", self.strain_errors)
@@ -216,7 +217,9 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
 
     def quick(self) -> Self:
         """A fifth of the initial guesses."""
-        return replace(self, starts=-(-self.starts // 5), per_radius=-(-self.per_radius // 5))
+        return replace(
+            self, initial_guesses=-(-self.initial_guesses // 5), per_radius=-(-self.per_radius // 5)
+        )
 
     def prepare(
         self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
@@ -226,7 +229,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         VirtualImagePair.open(folder, name, progress)
         base = {"images": name, "radius": self.radius, "start": 0, "strain_error": 0.0,
                 "seed": self.seed}  # fmt: skip
-        cases = [{**base, "start": k} for k in range(self.starts)]
+        cases = [{**base, "start": k} for k in range(self.initial_guesses)]
         for radius in self.radii:
             cases += [{**base, "radius": radius, "start": k} for k in range(self.per_radius)]
         cases += [{**base, "radius": 0.0, "strain_error": e} for e in self.strain_errors]

@@ -183,7 +183,7 @@ def _keys(found: GuessStatistics) -> tuple[KeyNumber, ...]:
     low, high = found.success_interval_95
     return (
         KeyNumber(
-            "initial guesses that converge", f"{found.same_minimum} of {found.starts}", "",
+            "initial guesses that converge", f"{found.same_minimum} of {found.initial_guesses}", "",
             f"95 % interval {100 * low:.1f} to {100 * high:.1f} %; the paper: 98 of 100",
         ),
         KeyNumber(
@@ -201,7 +201,7 @@ def _keys(found: GuessStatistics) -> tuple[KeyNumber, ...]:
 def _sentences(found: GuessStatistics) -> tuple[str, ...]:
     low, high = found.success_interval_95
     text = [
-        f"{found.same_minimum} of {found.starts} initial guesses with mode parameters "
+        f"{found.same_minimum} of {found.initial_guesses} initial guesses with mode parameters "
         f"up to {100 * found.radius:g} % off converge to the standard guess' minimum "
         f"(within {SAME_PX} px rms): {100 * found.success:.1f} %, 95 % interval "
         f"{100 * low:.1f} to {100 * high:.1f} %. The paper has {100 * PUBLISHED['success']:.0f} of "
@@ -218,7 +218,7 @@ def _sentences(found: GuessStatistics) -> tuple[str, ...]:
         "The paper's perturbations are shares of the parameters' nominal values, which are 0 for "
         "the two phases; here these are off by up to the same share of the unit cell, too.",
     ]
-    elsewhere = found.starts - found.same_minimum - found.failed
+    elsewhere = found.initial_guesses - found.same_minimum - found.failed
     if elsewhere:
         text.append(
             f"Of the {elsewhere} in other minima, "

@@ -14,7 +14,7 @@
 Its TOML file has the tables of a virtual experiment and ``[study]``, with a kind ("robustness",
 "noise", "systematic", "modes" or "resolution") and that kind's options. In Python::
 
-    case = StudyCase(study=Robustness(starts=20, radius=0.2))
+    case = StudyCase(study=Robustness(initial_guesses=20, radius=0.2))
 """
 
 from __future__ import annotations
