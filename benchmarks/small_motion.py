@@ -80,6 +80,8 @@ class Row:
         where = "both" if self.in_f and self.in_g else "f" if self.in_f else "g"
         blurred = ", deformed image's gradient, blurred" if self.options else ""
         how = ", least squares" if self.options == LEAST_SQUARES else blurred
+        if self.options.get("gradient") == "reference":
+            how = f", blur of {self.options['gradient_blur_px']:g} px"
         noise = 100 * max(self.in_f, self.in_g)
         return f"{noise:g} % in {where}, {self.width_px:g} px, degree {self.degree}{how}"
 
@@ -94,6 +96,10 @@ ROWS = (
     Row(0.0, 0.01, options=LEAST_SQUARES),
     *(Row(0.01, 0.01, width, options=LEAST_SQUARES) for width in (3.0, 6.0)),
     *(Row(in_f, 0.01, options=BLURRED) for in_f in (0.01, 0.0)),
+    *(
+        Row(0.002, 0.002, 3.0, options={"gradient": "reference", "gradient_blur_px": blur})
+        for blur in (0.6, 0.7)
+    ),
 )
 
 

@@ -438,22 +438,22 @@ def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> W
 
     The reference's gradient if the residual is noise, blurred as makes the unknowns' variance
     smallest; otherwise the deformed image's. Of the finest speckle the reference's in any case:
-    waves that the pixels fold back are in its residual, and in the deformed image's gradient too.
+    it is aliased, in the residual and in the deformed image's gradient alike.
     """
-    is_noise, is_folded = result.residual_test().is_white, size_px < _FINEST_PX
+    is_noise, is_aliased = result.residual_test().is_white, size_px < _FINEST_PX
     gradient, blur_px = options.gradient, options.gradient_blur_px
     if gradient is None:
-        gradient = "reference" if is_noise or is_folded else "deformed"
+        gradient = "reference" if is_noise or is_aliased else "deformed"
     if blur_px is None:
         blur_px = best_blur(result.noise_to_slope, size_px, result.order) if is_noise else 0.0
-        if is_folded:
-            blur_px = max(blur_px, LEAST_BLUR_PX if is_noise else _FOLDED_BLUR_PX)
+        if is_aliased:
+            blur_px = max(blur_px, LEAST_BLUR_PX if is_noise else _ALIASED_BLUR_PX)
     return Weighting(Gradient(gradient), blur_px, size_px)
 
 
 _FINEST_PX = 4.0
-"""Pixels that sample finer speckles than this fold some of their waves back; a blur keeps those
-out of what weighs the residual."""
-_FOLDED_BLUR_PX = 0.75
-"""Where they stand out of the noise: as little as keeps the bias at 0.2 of a standard error in
-benchmarks/small_motion.py (0.24 with 0.7 px, 0.3 with 0.6 px)."""
+"""Finer speckle than this is aliased by the pixels; a blur keeps that out of what weighs the
+residual."""
+_ALIASED_BLUR_PX = 0.75
+"""Where aliasing stands out of the noise: as little as keeps the bias at 0.2 of a standard error in
+benchmarks/small_motion.py, whose last rows have less."""

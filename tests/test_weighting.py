@@ -350,7 +350,7 @@ def test_small_motions_have_no_bias(
     assert abs(bias_of_a_shift(shift_px, in_f, in_g, FINEST)).max() < 0.2
 
 
-def test_folded_waves_are_kept_out_of_what_weighs_the_residual() -> None:
+def test_aliasing_is_kept_out_of_what_weighs_the_residual() -> None:
     """Speckle of 3 px under little noise: the residual isn't white, though there is no model error.
 
     What that does to the bias is a row of benchmarks/small_motion.py.
