@@ -13,7 +13,7 @@ def main(experiment=EXPERIMENT, imaging=IMAGING, folder="out/example"):
 
     errors = {}
     for pair in mh.make_images(solution, imaging, folder, experiment.strains):
-        ansatz = mh.Ansatz.square(experiment.specimen)
+        ansatz = mh.Ansatz.square(solution.specimen)
         result = mh.correlate(pair, ansatz, strain=pair.strain)
         best = mh.best_fit(pair.truth, result)
         errors[pair.strain] = [pair.rms(fit) / pair.grid.pixel_size for fit in (result, best)]

@@ -22,6 +22,7 @@ import h5py
 import meshio
 import numpy as np
 
+from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
@@ -133,6 +134,16 @@ class Solution:
                 )
             if not np.isfinite(s.displacement).all():
                 raise InputError(f"{where}: expected finite displacements, got NaN or infinity")
+
+    @property
+    def specimen(self) -> Specimen:
+        """The specimen that was simulated; InputError for a solution of another solver."""
+        if "specimen" not in self.info:
+            raise InputError(
+                "expected a solution that says of which specimen it is, got one that does not "
+                "(read from another solver's mesh); state a Specimen"
+            )
+        return Specimen(**self.info["specimen"])
 
     def at(self, nominal_strain: float) -> Snapshot:
         """The stable snapshot at a nominal strain (the first one listed, if several).

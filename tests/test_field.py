@@ -15,7 +15,9 @@ import meshio
 import numpy as np
 import pytest
 
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution, read_meshio
+from modeharvest.fem.specimen import Specimen
 from modeharvest.util.errors import InputError
 
 RANDOM = np.random.default_rng(0)
@@ -92,6 +94,15 @@ def test_file_is_readable_with_h5py_alone(tmp_path: Path) -> None:
         assert second.attrs["branch"] == "primary"
         assert second.attrs["reaction"] == 1.5
         assert second.attrs["energy"] == 1.25
+
+
+def test_a_solution_knows_its_specimen(tmp_path: Path) -> None:
+    specimen = Specimen(4, 6, diameter=1.5, stacking="triangular")
+    solution = Solution(MESHES["T3"], (), Experiment(specimen).described())
+    solution.write(tmp_path / "solution.h5")
+    assert Solution.read(tmp_path / "solution.h5").specimen == specimen
+    with pytest.raises(InputError, match="of which specimen it is"):
+        _ = sample().specimen
 
 
 def test_at_prefers_the_stable_snapshot() -> None:
