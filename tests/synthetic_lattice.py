@@ -152,7 +152,7 @@ def run(**changes: Any) -> LatticeRun:
         "mesh": mesh,
         "lattice": lattice,
         "pitch": PITCH,
-        "critical": (point,),
+        "critical": point,
         "dispersion": dispersion(),
         "modes": set_of_modes,
         "branches": branches,

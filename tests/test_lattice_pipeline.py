@@ -27,7 +27,7 @@ from modeharvest.runs.lattice.case import (
     LatticeCase,
     Loading,
     ModesPlan,
-    Search,
+    SearchPlan,
     SquareLattice,
     StudyPlan,
 )
@@ -215,14 +215,14 @@ def coarse(**changes: Any) -> LatticeCase:
         "lattice": SquareLattice(1.0, 0.8696, 0.2),
         "material": TwoTermI1(),
         "loading": Loading("equibiaxial"),
-        "search": Search(divisions=2),
+        "search": SearchPlan(divisions=2),
         "dispersion": DispersionPlan(points=8, bands=1, map_divisions=0),
     }
     return LatticeCase(**{**tables, **changes})
 
 
 def test_a_lattice_that_never_buckles_is_an_outcome(tmp_path: Path) -> None:
-    case = coarse(search=Search(largest=0.005, divisions=2))
+    case = coarse(search=SearchPlan(largest=0.005, divisions=2))
     summary = run(case, tmp_path)
     assert "stable up to 0.005" in summary["outcome"]
     assert not summary["critical"]["found"]

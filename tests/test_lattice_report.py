@@ -76,7 +76,7 @@ def test_the_paper_s_family_is_recognised_and_its_waves_are_written(text: str) -
 
 
 def test_what_a_run_does_not_have_is_left_out(tmp_path: Path) -> None:
-    bare = made_up.run(critical=(), dispersion=None, modes=None, branches=(), patterns=(),
+    bare = made_up.run(critical=None, dispersion=None, modes=None, branches=(), patterns=(),
                        study=None, exports={}, notes=())  # fmt: skip
     seen = Page(page(bare, tmp_path))
     assert not set(SECTIONS) & set(seen.ids)
@@ -86,7 +86,7 @@ def test_what_a_run_does_not_have_is_left_out(tmp_path: Path) -> None:
 
 def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
     point = CriticalPoint("uniaxial", 0.28, False, "stable up to 0.28", value=0.3)
-    run = made_up.run(critical=(point,), modes=None, branches=(), patterns=())
+    run = made_up.run(critical=point, modes=None, branches=(), patterns=())
     text = page(run, tmp_path)
     assert "stable so far" in text
     assert "critical wave</dt>" not in text
@@ -96,7 +96,7 @@ def test_a_lattice_that_stays_stable_is_an_outcome(tmp_path: Path) -> None:
 
 def critical(point: CriticalPoint) -> dict[str, Any]:
     """As it is in ``summary.json``."""
-    summary: dict[str, Any] = summary_of(made_up.run(critical=(point,)), ())
+    summary: dict[str, Any] = summary_of(made_up.run(critical=point), ())
     return summary
 
 

@@ -349,7 +349,7 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     corners = Card.tabular(table)
     if run is None or run.dispersion is None:
         return [corners]
-    found, waves = run.dispersion, [wave for point in run.critical for wave in point.waves]
+    found, waves = run.dispersion, run.critical.waves if run.critical else ()
     path = partial(figures.draw_dispersion, found, waves)
     maps = [
         ReportFigure(f"zone-{n}", f"At {100 * part.load:.4g} %",

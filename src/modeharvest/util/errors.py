@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -41,3 +43,12 @@ def dolfinx_missing(what: str) -> MissingDependencyError:
         "conda-forge fenics-dolfinx petsc4py python-gmsh' or, on Debian 13, 'apt install "
         "python3-dolfinx python3-petsc4py python3-gmsh python3-h5py-mpi'"
     )
+
+
+@contextmanager
+def requiring_dolfinx(what: str) -> Iterator[None]:
+    """Have an import that fails in the block end with what :func:`dolfinx_missing` says."""
+    try:
+        yield
+    except ImportError as error:
+        raise dolfinx_missing(what) from error

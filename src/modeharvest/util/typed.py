@@ -96,6 +96,11 @@ def to_plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def picked(thing: object, names: str) -> dict[str, Any]:
+    """Some attributes of an object by their names, which stand in one text."""
+    return {name: getattr(thing, name) for name in names.split()}
+
+
 def quantity(label: str, unit: str = "", **options: Any) -> Any:
     """A dataclass' field that readers call by a label, in a unit; ``options``: of a field."""
     return field(metadata={"label": label, "unit": unit}, **options)

@@ -11,12 +11,9 @@
     [modes]        # which modes, which branches
     [study]        # optional: how the pattern depends on d/l, l, material and loading
 
-In Python::
-
-    case = LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))
-
-No lattice needs gmsh before its cell is meshed. Here is also what each stage of the analysis
-depends on: with the same key it is not done again.
+In Python: ``LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))``. No
+lattice needs gmsh before its cell is meshed. Here is also what each stage of the analysis depends
+on: with the same key it is not done again.
 """
 
 from __future__ import annotations
@@ -31,26 +28,22 @@ from pydantic import model_validator
 
 from modeharvest.fem.bloch.dispersion import ZONES
 from modeharvest.fem.experiment import SMALLEST_STEP
-from modeharvest.fem.lattice.options import (
-    MacroLoading,
-    Rates,
-    Wave,
-    equibiaxial,
-    simple_shear,
-    uniaxial,
-    uniaxial_strain,
-    wave_of,
-)
+from modeharvest.fem.lattice import options
+from modeharvest.fem.lattice.options import Wave
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import sha256_of
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import digest, stage_key
 from modeharvest.util.typed import nearest
 from modeharvest.validation.studies.lattice import SHOWN, LatticeModeStudy, run_lattice_study
-from modeharvest.validation.studies.lattice_pattern import LOADINGS, RATIOS, StudiedLattice
-from modeharvest.validation.studies.lattice_pattern import STUDIED_MATERIALS as MATERIALS_BY_NAME
+from modeharvest.validation.studies.lattice_pattern import (
+    LOADINGS,
+    RATIOS,
+    STUDIED_MATERIALS,
+    StudiedLattice,
+)
 
 if TYPE_CHECKING:
     from modeharvest.fem.lattice.cells import UnitCell
@@ -72,68 +65,49 @@ class LatticeSpec(Protocol):
         """The primitive cell, meshed; an InputError if there is no such lattice."""
 
 
-@dataclass(frozen=True)
-class SquareLattice:
-    """Circular holes in square stacking: ``fem.lattice.cells.square``.
+class _HoleStacking:
+    """Circular holes, one in a primitive cell."""
 
-    Parameters
-    ----------
-    pitch, diameter
-        l and d [mm].
-    mesh_size
-        Edge length of the elements [mm].
-    """
+    pitch: float
+    diameter: float
+    mesh_size: float
+    symmetry: str
+
+    def cell(self) -> UnitCell:
+        """The primitive cell, by the function of :mod:`modeharvest.fem.lattice.cells`."""
+        from modeharvest.fem.lattice.cells import hexagonal, square
+
+        stacked = square if self.symmetry == "square" else hexagonal
+        return stacked(self.pitch, self.diameter, self.mesh_size)
+
+
+@dataclass(frozen=True)
+class SquareLattice(_HoleStacking):
+    """Holes in square stacking: l, d, and the edge length of the elements [mm]."""
 
     pitch: float = 1.9
     diameter: float = 1.5
     mesh_size: float = 0.15
     symmetry = "square"
 
-    def cell(self) -> UnitCell:
-        """The primitive cell."""
-        from modeharvest.fem.lattice.cells import square
-
-        return square(self.pitch, self.diameter, self.mesh_size)
-
 
 @dataclass(frozen=True)
-class HexagonalLattice:
-    """Circular holes in hexagonal stacking: ``fem.lattice.cells.hexagonal``.
-
-    Parameters
-    ----------
-    pitch, diameter
-        Distance of the holes' centres and their diameter [mm].
-    mesh_size
-        Edge length of the elements [mm].
-    """
+class HexagonalLattice(_HoleStacking):
+    """Holes in hexagonal stacking: distance of centres, d, edge length of the elements [mm]."""
 
     pitch: float = 1.386
     diameter: float = 1.28
     mesh_size: float = 0.1
     symmetry = "hexagonal"
 
-    def cell(self) -> UnitCell:
-        """The primitive cell: one hole."""
-        from modeharvest.fem.lattice.cells import hexagonal
-
-        return hexagonal(self.pitch, self.diameter, self.mesh_size)
-
 
 @dataclass(frozen=True)
 class ChiralLattice:
     """Rings joined by ligaments that touch them tangentially: ``fem.lattice.cells.chiral``.
 
-    Parameters
-    ----------
-    pitch
-        Distance of neighbouring rings' centres [mm].
-    mesh_size
-        Edge length of the elements [mm].
-    ring_radius, ring_thickness, ligament_thickness
-        [mm]; shares of the pitch that ``chiral`` states unless given.
-    handedness
-        "clockwise" or "counterclockwise".
+    Lengths in mm; ``pitch``: distance of neighbouring rings' centres. Radius and thicknesses are
+    shares of it that ``chiral`` states unless given. ``handedness``: "clockwise" or
+    "counterclockwise".
     """
 
     pitch: float = 1.9
@@ -233,9 +207,9 @@ class Loading:
 
     def __post_init__(self) -> None:
         if self.kind == "prescribed" and self.gradient is None:
+            example = '[[-1.0, 0.0], [0.0, "free"]]'
             raise InputError(
-                'loading: expected the gradient of "prescribed", such as [[-1.0, 0.0], [0.0, '
-                '"free"]], got none'
+                f'loading: expected the gradient of "prescribed", such as {example}, got none'
             )
         if self.kind != "prescribed" and (self.gradient or self.stress):
             raise InputError(
@@ -243,18 +217,18 @@ class Loading:
             )
         self.macro()
 
-    def macro(self) -> MacroLoading:
+    def macro(self) -> options.MacroLoading:
         """What the equilibrium equations need."""
-        axis = "xy".index(self.axis)
         if self.gradient is not None:
             (a, b), (c, d) = self.gradient
-            rates: Rates = ((_rate(a), _rate(b)), (_rate(c), _rate(d)))
-            return MacroLoading(rates, self.stress or _ZERO)
+            rates = (_rate(a), _rate(b)), (_rate(c), _rate(d))
+            return options.MacroLoading(rates, self.stress or _ZERO)
+        axis = "xy".index(self.axis)
         return {
-            "uniaxial": uniaxial(axis),
-            "uniaxial-strain": uniaxial_strain(axis),
-            "equibiaxial": equibiaxial(),
-            "shear": simple_shear(),
+            "uniaxial": options.uniaxial(axis),
+            "uniaxial-strain": options.uniaxial_strain(axis),
+            "equibiaxial": options.equibiaxial(),
+            "shear": options.simple_shear(),
         }[self.kind]
 
     @property
@@ -275,18 +249,8 @@ def _rate(component: Component) -> float | None:
 
 
 @dataclass(frozen=True)
-class Search:
-    """Up to which load, and how finely, the first critical point is looked for.
-
-    Parameters
-    ----------
-    largest
-        Load up to which to look [-].
-    divisions
-        Of each axis of the zone of wave vectors; an even number has M and X on the grid.
-    largest_step
-        Of the load [-].
-    """
+class SearchPlan:
+    """Where :class:`modeharvest.fem.lattice.options.CriticalSearch` looks; loads [-]."""
 
     largest: float = 0.3
     divisions: int = 8
@@ -298,8 +262,7 @@ class Search:
                 f"search: expected 0 < largest < 1 and steps of {SMALLEST_STEP:g} or more, got "
                 f"{self}"
             )
-        if not 2 <= self.divisions <= 200:
-            raise InputError(f"search: expected 2 to 200 divisions, got {self.divisions}")
+        require_within("search: expected divisions", self.divisions, 2, 200)
 
 
 @dataclass(frozen=True)
@@ -329,31 +292,30 @@ class DispersionPlan:
 
     def __post_init__(self) -> None:
         _check_loads("dispersion", self.loads)
-        tour = _phases(wave for _, wave in self.corners)
-        if self.corners and (len(tour) < 2 or self.points < len(tour)):
+        tour = self._own_tour()
+        if tour and not 2 <= len(tour) <= self.points:
             raise InputError(
                 "dispersion: expected two corners or more, and no fewer points, got "
                 f"{len(tour)} corners and {self.points} points"
             )
-        if not (8 <= self.points <= 10_000 and 1 <= self.bands <= 100):
+        require_within("dispersion: expected points", self.points, 8, 10_000)
+        require_within("dispersion: expected bands", self.bands, 1, 100)
+        require_within("dispersion: expected map_divisions", self.map_divisions, 0, 1000)
+        if self.map_divisions % 2:
             raise InputError(
-                "dispersion: expected 8 to 10000 points and 1 to 100 bands, got "
-                f"{self.points} and {self.bands}"
-            )
-        if not 0 <= self.map_divisions <= 1000 or self.map_divisions % 2:
-            raise InputError(
-                "dispersion: expected an even number of map divisions from 0 to 1000, got "
-                f"{self.map_divisions}"
+                f"dispersion: expected an even number of map divisions, got {self.map_divisions}"
             )
 
     def tour(self, lattice: LatticeSpec, loading: Loading) -> tuple[tuple[str, Wave], ...]:
         """Names and phases [rad] of the path's corners."""
         if self.corners:
-            waves = _phases(wave for _, wave in self.corners)
-            return tuple((name, w) for (name, _), w in zip(self.corners, waves, strict=True))
+            return self._own_tour()
         if loading.is_isotropic or lattice.symmetry == "oblique":
             return ZONES[lattice.symmetry]
         return ZONES["rhombic" if lattice.symmetry == "hexagonal" else "oblique"]
+
+    def _own_tour(self) -> tuple[tuple[str, Wave], ...]:
+        return tuple((name, _phases(wave)) for name, wave in self.corners)
 
 
 @dataclass(frozen=True)
@@ -382,7 +344,7 @@ class ModesPlan:
     branch_loads: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        _phases(self.waves)
+        _ = self.phases
         _check_loads("modes", (self.load, *self.branch_loads))
         for row in self.combinations:
             if not any(row) or not all(math.isfinite(c) for c in row):
@@ -391,18 +353,21 @@ class ModesPlan:
     @property
     def phases(self) -> tuple[Wave, ...]:
         """The waves in rad."""
-        return _phases(self.waves)
+        return tuple(_phases(wave) for wave in self.waves)
 
 
-def _phases(waves: Any) -> tuple[Wave, ...]:
-    """Units of π to rad, each wave checked to be in the plane."""
-    checked = (wave_of(wave) for wave in waves)
-    return tuple((math.pi * p, math.pi * q) for p, q in checked)
+def _phases(wave: Sequence[float]) -> Wave:
+    """Units of π to rad; InputError if the wave is not in the plane."""
+    p, q = options.wave_of(wave)
+    return math.pi * p, math.pi * q
 
 
 def _check_loads(where: str, loads: Sequence[float]) -> None:
     if not all(0 <= load < 1 for load in loads):
         raise InputError(f"{where}: expected loads of 0 or more and below 1, got {tuple(loads)}")
+
+
+_LOADINGS = tuple(name.replace(" ", "-") for name in LOADINGS)
 
 
 @dataclass(frozen=True)
@@ -414,16 +379,12 @@ class StudyPlan:
 
     Parameters
     ----------
-    ratios
-        d/l [-].
+    ratios, overlays
+        d/l [-], and those of the pictures of numerical over analytic mode.
     loadings
         "uniaxial", "uniaxial-strain", "equibiaxial".
-    pitches
-        Other l [mm].
-    materials
-        Other materials, by their names in ``STUDIED_MATERIALS``.
-    overlays
-        d/l of the pictures of numerical over analytic mode [-].
+    pitches, materials
+        Other l [mm]; names of other materials, among ``STUDIED_MATERIALS``.
     divisions
         Elements along l.
     largest
@@ -431,7 +392,7 @@ class StudyPlan:
     """
 
     ratios: tuple[float, ...] = RATIOS
-    loadings: tuple[str, ...] = tuple(name.replace(" ", "-") for name in LOADINGS)
+    loadings: tuple[str, ...] = _LOADINGS
     pitches: tuple[float, ...] = ()
     materials: tuple[str, ...] = ()
     overlays: tuple[float, ...] = SHOWN
@@ -439,20 +400,17 @@ class StudyPlan:
     largest: float = 0.28
 
     def __post_init__(self) -> None:
-        known = [name.replace(" ", "-") for name in LOADINGS]
-        for names, among in ((self.loadings, known), (self.materials, list(MATERIALS_BY_NAME))):
+        for names, known in ((self.loadings, _LOADINGS), (self.materials, STUDIED_MATERIALS)):
             for name in names:
-                if name not in among:
-                    raise InputError(f"unknown name {name!r}{nearest(name, among)}")
+                if name not in known:
+                    raise InputError(f"unknown name {name!r}{nearest(name, list(known))}")
         if not self.loadings or not self.ratios:
             raise InputError("study: expected a ratio and a loading or more, got none")
-        if not (4 <= self.divisions <= 200 and 0 < self.largest < 1):
-            raise InputError(
-                "study: expected 4 to 200 divisions and 0 < largest < 1, got "
-                f"{self.divisions} and {self.largest}"
-            )
-        if not all(0 < pitch < math.inf for pitch in self.pitches):
-            raise InputError(f"study: expected pitches above 0 mm, got {self.pitches}")
+        require_within("study: expected divisions", self.divisions, 4, 200)
+        if not 0 < self.largest < 1:
+            raise InputError(f"study: expected 0 < largest < 1, got {self.largest}")
+        for pitch in self.pitches:
+            require_within("study: expected pitches [mm]", pitch, 0, above=True)
         if not all(0 < ratio < 1 for ratio in (*self.ratios, *self.overlays)):
             raise InputError(f"study: expected 0 < d/l < 1, got {self.ratios}, {self.overlays}")
 
@@ -465,7 +423,7 @@ class LatticeCase(CaseModel):
     lattice: Annotated[LatticeSpec, of_kind(LATTICES, "lattice")] = SquareLattice()
     material: Annotated[Material, of_kind(MATERIALS, "material")] = Ogden()
     loading: Loading = Loading()
-    search: Search = Search()
+    search: SearchPlan = SearchPlan()
     dispersion: DispersionPlan = DispersionPlan()
     modes: ModesPlan = ModesPlan()
     study: StudyPlan | None = None
@@ -474,10 +432,10 @@ class LatticeCase(CaseModel):
     def read(cls, name: str | Path) -> Self:
         """Read a case as every other; a lattice's own file is found beside the case's."""
         case = super().read(name)
-        if isinstance(case.lattice, FileLattice):
-            file = str(Path(name).parent / case.lattice.path)
-            case = case.model_copy(update={"lattice": replace(case.lattice, path=file)})
-        return case
+        if not isinstance(case.lattice, FileLattice):
+            return case
+        file = str(Path(name).parent / case.lattice.path)
+        return case.model_copy(update={"lattice": replace(case.lattice, path=file)})
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, lattice and material by their kinds."""
@@ -497,16 +455,11 @@ class LatticeCase(CaseModel):
         plan, lattice = self.study, self.lattice
         if plan is None or not isinstance(lattice, SquareLattice):
             return None
-        base = StudiedLattice(
-            ratio=lattice.diameter / lattice.pitch,
-            loading=self.loading.macro(),
-            material=self.material,
-            pitch=lattice.pitch,
-            divisions=plan.divisions,
-            largest=plan.largest,
-        )
+        ratio, loading = lattice.diameter / lattice.pitch, self.loading.macro()
         return run_lattice_study(
-            base,
+            StudiedLattice(
+                ratio, loading, self.material, lattice.pitch, plan.divisions, plan.largest
+            ),
             table,
             ratios=plan.ratios,
             loadings=[name.replace("-", " ") for name in plan.loadings],

@@ -18,15 +18,11 @@ from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.modes import Branch, ModeSet
 from modeharvest.idic.spectra.mode_family import read_family, read_spectrum, write_family
+from modeharvest.runs.lattice import results
 from modeharvest.runs.lattice.case import LatticeCase
-from modeharvest.runs.lattice.results import (
-    DRAWN_AMPLITUDE,
-    CriticalPoint,
-    FoundPattern,
-    PeriodicField,
-)
+from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, PeriodicField
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError, dolfinx_missing
+from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, named, silent
 from modeharvest.util.typed import made, to_plain
@@ -74,19 +70,15 @@ class LatticeModel:
     @cached_property
     def unit(self) -> UnitCell:
         """The primitive cell's mesh and lattice vectors."""
-        try:
+        with requiring_dolfinx("infinite lattices need"):
             return self.case.lattice.cell()
-        except ImportError as error:
-            raise dolfinx_missing("infinite lattices need") from error
 
     @cached_property
     def cell(self) -> PeriodicCell:
         """The primitive cell with its material."""
         unit = self.unit
-        try:
+        with requiring_dolfinx("infinite lattices need"):
             from modeharvest.fem.lattice.cell import PeriodicCell
-        except ImportError as error:
-            raise dolfinx_missing("infinite lattices need") from error
         return PeriodicCell(unit, self.case.material)
 
     def path(self, load: float = 0.0, cell: PeriodicCell | None = None) -> CellPath:
@@ -124,13 +116,9 @@ class LatticeModel:
     ) -> tuple[ModeSet, tuple[Branch, ...]]:
         """The modes of the plan as real fields, and the branches that start with critical ones.
 
-        ``info``: plain JSON values to keep with the modes.
-
-        Raises
-        ------
-        InputError
-            If a wave doesn't repeat within a dozen cells, the load can't be reached, or
-            combinations don't have one coefficient for each mode.
+        ``info``: plain JSON values to keep with the modes. Raises InputError if a wave doesn't
+        repeat within a dozen cells, the load can't be reached, or combinations don't have one
+        coefficient for each mode.
         """
         plan = self.case.modes
         path = self.path(max(plan.load, critical.load))
@@ -171,8 +159,10 @@ class LatticeModel:
         found = []
         if modes is not None:
             found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
-            ends = [(k, branch) for k, branch in enumerate(branches, start=1) if branch.states]
-            found += [PeriodicField.of_branch(modes, k, branch, info) for k, branch in ends]
+            found += [
+                PeriodicField.of_branch(modes, k, branch, info)
+                for k, branch in enumerate(branches, start=1) if branch.states
+            ]  # fmt: skip
         return [*found, self._primary(self.case.modes.load or critical.load, modes, info)]
 
     def _primary(
@@ -225,13 +215,7 @@ def find_family(pattern: PeriodicField, pitch: float, folder: Path) -> None:
 
 
 def found_pattern(pattern: PeriodicField, folder: Path) -> FoundPattern:
-    """A pattern with the family and spectrum that :func:`find_family` left.
-
-    Raises
-    ------
-    InputError
-        If the file lacks the Fourier coefficients.
-    """
+    """A pattern with the family and spectrum that :func:`find_family` left; InputError if not."""
     path = folder / pattern.file
     family, spectrum = read_family(path), read_spectrum(path)
     if spectrum is None:
@@ -246,6 +230,6 @@ def to_be_shown(
     branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
     found = [found_pattern(pattern, folder) for pattern in branches]
     if not found:
-        drawn = [mode.scaled(DRAWN_AMPLITUDE * pitch) for mode in every[: len(modes.waves)]]
+        drawn = [mode.scaled(results.DRAWN_AMPLITUDE * pitch) for mode in every[: len(modes.waves)]]
         found = [mode.analysed(pitch) for mode in drawn]
     return [*found, found_pattern(every[-1], folder)]

@@ -1,16 +1,7 @@
 """The analysis of an infinite lattice in one folder, in stages that can be resumed.
 
-::
-
-    critical.json                   critical    the first critical load over all wave vectors
-    dispersion.h5 dispersion.csv    dispersion  lowest eigenvalues against the wave vector
-    modes.h5 modes.vtu modes.xdmf   modes       real modes and buckled branches
-    family_*.json families.json     families    their spectra and mode families
-    study.csv                       study       how the pattern depends on d/l and more
-    report.html summary.json        report      everything of it that is there
-    stages.json timings.json                    which stages are finished, what they took
-
-``modeharvest bloch`` is the first two, ``modeharvest modes`` all of them.
+Their files: docs/bloch.md. ``modeharvest bloch`` is the first two and the report, ``modeharvest
+modes`` all of them.
 """
 
 from __future__ import annotations
@@ -41,7 +32,6 @@ from modeharvest.runs.lattice.modes import (
 )
 from modeharvest.runs.lattice.results import (
     CriticalPoint,
-    FoundPattern,
     LatticeRun,
     PeriodicField,
     exports_in,
@@ -52,32 +42,19 @@ from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
-from modeharvest.validation.studies.lattice import LatticeModeStudy
 
 
 @dataclass(frozen=True)
 class LatticeAnalysis(StagedRun[LatticeCase]):
-    """The stages of a lattice's analysis.
-
-    Parameters
-    ----------
-    case, folder, progress
-        As of every run.
-    source
-        Name or file of the case, for the report.
-    """
+    """The stages of a lattice's analysis; ``source``: name or file of the case, for the report."""
 
     source: str = "CASE"
 
     def critical(self) -> CriticalPoint:
         """Find the first critical load over all wave vectors; leaves ``critical.json``.
 
-        Raises
-        ------
-        InputError
-            If the cell is not periodic, or the lattice is a mechanism.
-        MissingDependencyError
-            If dolfinx is not there.
+        Raises InputError if the cell is not periodic or the lattice is a mechanism,
+        MissingDependencyError if dolfinx is not there.
         """
         path = self.folder / "critical.json"
 
@@ -90,8 +67,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def dispersion(self) -> Dispersion:
         """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
         critical, plan = self.critical(), self.case.dispersion
-        path = self.folder / "dispersion.h5"
-        table = path.with_suffix(".csv")
+        path, table = self.folder / "dispersion.h5", self.folder / "dispersion.csv"
 
         def work() -> tuple[Path, ...]:
             loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
@@ -99,8 +75,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             tour = plan.tour(self.case.lattice, self.case.loading)
             found = dispersion(cell_path, tour, loads, plan.points, plan.bands, self.progress)
             if plan.map_divisions:
-                divisions = plan.map_divisions
-                zone.append(zone_map(cell_path, critical.load, divisions, self.progress))
+                zone.append(zone_map(cell_path, critical.load, plan.map_divisions, self.progress))
             replace(found, zone=tuple(zone)).write(path)
             write_dispersion_table(found, table)
             return path, table
@@ -110,10 +85,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
         """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
 
-        Raises
-        ------
-        InputError
-            If a wave asked for doesn't repeat within a dozen cells, or a load can't be reached.
+        Raises InputError if a wave asked for doesn't repeat within a dozen cells, or a load can't
+        be reached.
         """
         critical = self.critical()
         if self._model.why_no_modes(critical):
@@ -174,7 +147,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             from modeharvest.report.model import write_page
 
             run = self._run(done)
-            summary = summary_of(run, self._found_patterns() if "families" in done else [])
+            families = self._patterns if "families" in done else []
+            summary = summary_of(run, [found_pattern(field, self.folder) for field in families])
             write_page(lattice_report(summary, run), page, self.progress)
             write_json(path, summary)
             return path, page
@@ -185,10 +159,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def bloch(self) -> dict[str, Any]:
         """Stability against all waves, and dispersion; returns the content of ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            If another process works in the folder.
+        Raises InputError if another process works in the folder.
         """
         with exclusive(self.folder):
             self.dispersion()
@@ -197,11 +168,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def all(self) -> dict[str, Any]:
         """All stages that are not finished; returns the content of ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            If another process works in the folder, or modes can't be had; what there is is
-            reported before.
+        Raises InputError if another process works in the folder, or modes can't be had; what
+        there is is reported before.
         """
         with exclusive(self.folder):
             self.dispersion()
@@ -231,9 +199,6 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         critical = self.critical()
         return self._model.fields(critical, *self.modes(), self._info(critical))
 
-    def _found_patterns(self) -> list[FoundPattern]:
-        return [found_pattern(pattern, self.folder) for pattern in self._patterns]
-
     def _run(self, done: Collection[str]) -> LatticeRun:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
@@ -248,23 +213,18 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             mesh=unit.mesh,
             lattice=unit.lattice,
             pitch=self.case.lattice.pitch,
-            critical=(critical,),
+            critical=critical,
             dispersion=self.dispersion() if "dispersion" in done else None,
             modes=modes,
             branches=branches,
-            patterns=self._shown(modes) if modes and "families" in done else (),
-            study=self._study() if "study" in done else None,
+            patterns=to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
+            if modes and "families" in done else (),
+            study=self.case.run_study(self.folder / "study.csv", self.progress)
+            if "study" in done else None,  # of which the rows are all there
             notes=[note for note in (self._model.why_no_modes(critical),) if note],
             exports=exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
-        )
-
-    def _shown(self, modes: ModeSet) -> list[FoundPattern]:
-        return to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
-
-    def _study(self) -> LatticeModeStudy | None:
-        """The study of which the rows are all there."""
-        return self.case.run_study(self.folder / "study.csv", self.progress)
+        )  # fmt: skip
 
     @cached_property
     def _keys(self) -> dict[str, str]:

@@ -1,54 +1,13 @@
 """What the analysis of a lattice found: its result types, and their ``summary.json``.
 
-Keys of the latter; loads are nominal strains or what else the case's loading makes of the load
-parameter [-], waves are phases (k . a1, k . a2) [rad], eigenvalues those of K x = lambda M x with M
-of unit density [N/mm^4]:
-
-``title``, ``case``
-    What was run.
-``outcome``
-    In words: critical at which load, or up to which load it was found stable.
-``critical``
-    ``loading``, ``found``, ``load`` (critical, or the largest reached), ``waves`` (the whole
-    degenerate set; empty for long waves), ``long_wave_angle`` [rad] or null, ``value`` (lowest
-    filling · lambda / k² at that load [MPa]); the proof: ``below`` and ``above`` (negative
-    eigenvalues at each wave a millionth of the load below and above), ``earlier`` (waves of the
-    grid that are unstable already below).
-``dispersion``
-    A list, one entry for each load: ``load``, ``corners`` (names and lowest eigenvalues of the
-    path's corners).
-``zone``
-    For each map of the whole zone: ``load``, the ``wave`` of its grid with the lowest λ / k², and
-    its ``eigenvalue``.
-``modes``
-    Null without, else: ``load`` (whose tangent they belong to), ``copies`` (m, n: of the primitive
-    cell), ``waves`` and ``eigenvalues`` of each mode.
-``branches``
-    A list: ``combination`` of the modes it starts with, ``outcome`` in words, and ``states``, each
-    with ``load``, ``energy`` and ``primary_energy`` (per area of the cell, of the branch and of the
-    unbuckled lattice at the same load [MPa]), ``negative_eigenvalues`` (0: stable against the
-    branch's own period) and ``amplitudes`` of the modes [mm].
-``families``
-    A list: ``of`` (which field), ``family``, ``captured`` (share of the field's energy [-]),
-    ``waves`` (rows A, B, kx, ky [-], c [mm]), ``parameters`` (number), ``found`` (sentences),
-    ``peaks`` (wave vectors [1/l], S_xx + S_yy [mm^6], shares).
-``study``
-    Null without, else: ``lattices`` (how many; ``study.csv`` has them all), ``overlap`` (smallest
-    and largest with the analytic mode) and ``limits``: for each ``loading`` between which d/l
-    (``without``, ``with_``) the pattern stops being what buckles first, and what does ``instead``.
-``notes``
-    What a reader should know.
-``files``
-    Names of the files beside this one, and what is in them.
-``versions``
-    With which software; what it took is in ``timings.json``.
+Keys of the latter: docs/bloch.md.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +22,7 @@ from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json
+from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 
 if TYPE_CHECKING:
@@ -72,7 +32,7 @@ if TYPE_CHECKING:
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
-def combination_name(combination: Sequence[float]) -> str:
+def combination_name(combination: Sequence[float] | FloatArray) -> str:
     """Modes and signs, with numbers where their sizes differ: "φ₁ + φ₂" or "0.8 φ₁ − 0.6 φ₂"."""
     parts = [(k, c) for k, c in enumerate(combination, start=1) if abs(c) > 1e-6]
     alike = np.ptp([abs(c) for _, c in parts] or [0.0]) < 1e-6
@@ -89,28 +49,11 @@ DRAWN_AMPLITUDE = 0.16
 
 @dataclass(frozen=True)
 class CriticalPoint:
-    """What ``LatticeCritical`` says, in plain values: where a lattice first becomes unstable.
+    """Where a lattice first becomes unstable: what ``LatticeCritical`` says, in plain values.
 
-    Parameters
-    ----------
-    loading
-        Its name, e.g. "uniaxial".
-    load
-        Critical load [-]; without one, the largest at which the lattice was found stable.
-    found
-        Whether there is a critical point up to there.
-    outcome
-        In words.
-    waves
-        Phases (k . a1, k . a2) of the critical waves [rad]; empty for long waves.
-    below, above
-        Negative eigenvalues at each of them a millionth of the load below and above.
-    earlier
-        Waves of the grid that are unstable already below.
-    value
-        Lowest measure filling · λ / k² at ``load`` [MPa].
-    angle
-        Direction of long waves [rad]; None for others.
+    ``loading`` by its name; ``load`` [-], the largest at which it was found stable where nothing
+    is critical; ``earlier``: waves of the grid that are unstable already below; ``value``: lowest
+    filling · λ / k² at ``load`` [MPa]; ``angle``: direction of long waves [rad], None for others.
     """
 
     loading: str
@@ -168,10 +111,9 @@ class PeriodicField:
     @classmethod
     def of_mode(cls, modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
         """Mode k (from 0) of a set."""
-        name = combination_name([float(j == k) for j in range(len(modes.waves))])
-        return PeriodicField(
+        return cls(
             file=f"family_mode_{k + 1}.json",
-            name=f"mode {name}",
+            name=f"mode {combination_name(np.eye(len(modes.waves))[k])}",
             mesh=modes.mesh,
             lattice=modes.lattice,
             displacement=modes.shapes[k],
@@ -185,7 +127,7 @@ class PeriodicField:
     ) -> PeriodicField:
         """The last state of branch k (from 1)."""
         last = branch.states[-1]
-        return PeriodicField(
+        return cls(
             file=f"family_branch_{k}.json",
             name=f"{combination_name(branch.combination)} at {100 * last.load:.4g} %",
             mesh=modes.mesh,
@@ -230,18 +172,12 @@ class LatticeRun:
 
     Parameters
     ----------
-    title
-        Of the page.
-    case
-        What was run, as plain values.
-    command
-        That makes this page again.
+    case, command
+        What was run, as plain values, and what makes this page again.
     mesh, lattice
         Primitive cell [mm], and its (2, 2) lattice vectors as rows [mm].
     pitch
         Unit cell size l [mm].
-    critical
-        First critical points, one for each loading.
     dispersion
         Lowest eigenvalues along a path and over the zone.
     modes, branches
@@ -254,8 +190,6 @@ class LatticeRun:
         Files beside the page, and what each holds.
     notes
         What a reader should know before trusting the numbers.
-    versions
-        Of software.
     """
 
     title: str
@@ -264,7 +198,7 @@ class LatticeRun:
     mesh: Mesh
     lattice: FloatArray
     pitch: float
-    critical: Sequence[CriticalPoint] = ()
+    critical: CriticalPoint | None = None
     dispersion: Dispersion | None = None
     modes: ModeSet | None = None
     branches: Sequence[Branch] = ()
@@ -301,37 +235,32 @@ def exports_in(folder: Path) -> dict[str, str]:
 
 def summary_of(run: LatticeRun, families: Sequence[FoundPattern]) -> dict[str, Any]:
     """The content of ``summary.json``."""
-    critical = run.critical[0] if run.critical else None
+    critical, modes, study = run.critical, run.modes, run.study
     return {
         "title": run.title,
         "case": dict(run.case),
         "outcome": critical.outcome if critical else "",
-        "critical": _critical(critical) if critical else None,
+        "critical": critical and {
+            **to_plain(picked(critical, "loading found load waves value below above earlier")),
+            "long_wave_angle": critical.angle,
+        },
         **_eigenvalues(run.dispersion),
-        "modes": None if run.modes is None else _modes(run.modes),
+        "modes": modes and {
+            **to_plain(picked(modes, "load waves eigenvalues")), "copies": modes.info["copies"]
+        },
         "branches": [_branch(branch) for branch in run.branches],
         "families": [_family(found) for found in families],
-        "study": None if run.study is None else _study(run.study),
+        "study": study and _study(study),
         "notes": list(run.notes),
         "files": dict(run.exports),
         "versions": dict(run.versions),
-    }
-
-
-def _modes(modes: ModeSet) -> dict[str, Any]:
-    return {
-        "load": modes.load,
-        "copies": modes.info["copies"],
-        "waves": [list(wave) for wave in modes.waves],
-        "eigenvalues": modes.eigenvalues.tolist(),
-    }
+    }  # fmt: skip
 
 
 def _branch(branch: Branch) -> dict[str, Any]:
-    names = ("load", "energy", "primary_energy", "negative_eigenvalues")
+    names = "load energy primary_energy negative_eigenvalues"
     states = [
-        {**{name: getattr(state, name) for name in names}, "amplitudes": state.amplitudes.tolist()}
-        for state in branch.states
+        {**picked(state, names), "amplitudes": state.amplitudes.tolist()} for state in branch.states
     ]
     return {"combination": list(branch.combination), "outcome": branch.outcome, "states": states}
 
@@ -345,23 +274,15 @@ def _family(found: FoundPattern) -> dict[str, Any]:
         "waves": family.waves.tolist(),
         "parameters": family.family.size,
         "found": list(family.text),
-        "peaks": [asdict(peak) for peak in found.spectrum.peaks[:_PEAKS]],
+        "peaks": to_plain(found.spectrum.peaks[:_PEAKS]),
     }
 
 
 def _study(study: LatticeModeStudy) -> dict[str, Any]:
     rows = (*study.ratios, *study.scales, *study.materials)
     overlaps = [row.overlap for row in rows]
-    return {
-        "lattices": len(rows),
-        "overlap": [min(overlaps), max(overlaps)],
-        "limits": [asdict(limit) for limit in study.limits],
-    }
-
-
-def _critical(point: CriticalPoint) -> dict[str, Any]:
-    names = ("loading", "found", "load", "waves", "value", "below", "above", "earlier")
-    return {**{n: getattr(point, n) for n in names}, "long_wave_angle": point.angle}
+    limits = to_plain(study.limits)
+    return {"lattices": len(rows), "overlap": [min(overlaps), max(overlaps)], "limits": limits}
 
 
 def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
@@ -372,10 +293,8 @@ def _eigenvalues(found: Dispersion | None) -> dict[str, Any]:
         pairs = zip(found.labels, found.stops, strict=True)
         corners = [[label, float(values[stop])] for label, stop in pairs]
         along.append({"load": float(load), "corners": corners})
-    zone = [
-        {"load": part.load, "wave": list(part.least_stable[1]), "eigenvalue": part.least_stable[0]}
-        for part in found.zone
-    ]
+    least = [(part.load, *part.least_stable) for part in found.zone]
+    zone = [{"load": e, "wave": list(wave), "eigenvalue": value} for e, value, wave in least]
     return {"dispersion": along, "zone": zone}
 
 
