@@ -189,6 +189,7 @@ def harvest(
         timeline=timeline,
         buckling=find_buckling(timeline),
         calibration=calibration(),
+        lens=lens(),
         noise_sd=NOISE,
         noise_source="measured from 3 exposures",
         full_scale=LEVELS,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_harvest as made_up
+from documented_keys import undocumented
 from html_page import Page
 from matplotlib.path import Path
 
@@ -77,8 +78,12 @@ def bare(harvest: Harvest) -> Harvest:
     frame = replace(harvest.frames[1], mask=None, by_model_error=None, model_error_covariance=None,
                     spectrum=None, pattern=None, local=None, start_text=())  # fmt: skip
     return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
-                   calibration=None, full_scale=None, text=(), truth=None,
+                   calibration=None, lens=None, full_scale=None, text=(), truth=None,
                    versions={})  # fmt: skip
+
+
+def test_the_user_s_guide_has_every_key_of_the_summary(summary: dict[str, Any]) -> None:
+    assert undocumented(summary, "harvest.md") == set()
 
 
 def test_nothing_is_loaded_from_elsewhere(text: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import synthetic_lattice as made_up
+from documented_keys import undocumented
 from html_page import Page
 
 from modeharvest.report.lattice import (
@@ -39,6 +40,11 @@ def page(run: LatticeRun, folder: Path) -> str:
 @pytest.fixture(scope="module")
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
     return page(made_up.run(), tmp_path_factory.mktemp("report"))
+
+
+def test_the_guide_has_every_key_of_the_summary() -> None:
+    run = made_up.run()
+    assert undocumented(summary_of(run, run.patterns), "bloch.md") == set()
 
 
 def test_nothing_is_loaded_from_elsewhere(text: str) -> None:

@@ -1,19 +1,7 @@
 """Photographs of a test as a case: everything a harvest needs, read from a TOML file.
 
-::
-
-    title = "..."
-    [images]          # files of the reference, of the deformed states, of repeated exposures
-    [scale]           # pixel size, or a line drawn in the reference and its length
-    [specimen]        # cell size; region and material, if they are not to be found
-    [[specimen.regions]]    # parts with patterns of their own, if there are several
-    [distortion]      # of the optics: a file, a camera, or calibration images
-    [local]           # a displacement field of a local DIC, for spectra and w
-    [noise]           # of the camera, if it is known
-    [correlation]     # the ansatz and how to correlate
-
-Only files, scale and cell size must be there. Paths are relative to the TOML file.
-The shipped ``cases/photographs.toml`` has every table and key, commented.
+Only files, scale and cell size must be there. Paths are relative to the TOML file. The shipped
+``cases/photographs.toml`` has every table and key, commented.
 """
 
 from __future__ import annotations
@@ -25,10 +13,11 @@ from typing import Self
 
 from pydantic import PrivateAttr
 
+from modeharvest.idic.local.subsets import SubsetOptions
 from modeharvest.idic.photograph.geometry import Corners, SpecimenTable
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.runs.case import CaseModel
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.typed import nearest
 
 LOCAL = ("none", "pyvale", "file")
@@ -44,10 +33,8 @@ class LocalTable:
         "none", "pyvale" (an optional package), or "file" for fields of any other code.
     files
         A field for each deformed image (CSV, NPZ, HDF5, MAT), with code = "file".
-    unit
-        "px" or "mm", of the files; "auto" as their columns' names say.
-    y_axis
-        "down" or "up", of the files; "auto" as their columns' names say.
+    unit, y_axis
+        "px" or "mm", and "down" or "up", of the files; "auto" as their columns' names say.
     first_pixel
         What the files call the first pixel, 0 or 1.
     columns
@@ -79,46 +66,32 @@ class LocalTable:
                 "local: expected unit 'auto', 'px' or 'mm' and y_axis 'auto', 'down' or 'up', got "
                 f"{self.unit!r} and {self.y_axis!r}"
             )
-        if self.first_pixel not in (0, 1):
-            raise InputError(f"local: expected first_pixel 0 or 1, got {self.first_pixel}")
-        if self.subset < 5 or self.subset % 2 == 0 or self.step < 1:
-            raise InputError(
-                "local: expected an odd subset >= 5 px and step >= 1 px, got "
-                f"{self.subset} and {self.step}"
-            )
+        require_within("local: expected a first_pixel", self.first_pixel, 0, 1)
+        SubsetOptions(self.subset, self.step)  # checks them
 
 
 @dataclass(frozen=True)
 class NoiseTable:
     """The camera's noise.
 
-    Parameters
-    ----------
-    sd
-        Standard deviation [grey levels of the files]; measured from the repeated exposures
-        otherwise, or estimated from the reference image.
+    ``sd``: standard deviation [grey levels of the files]; measured from the repeated exposures
+    otherwise, or estimated from the reference image.
     """
 
     sd: float | None = None
 
     def __post_init__(self) -> None:
-        if self.sd is not None and not self.sd > 0:
-            raise InputError(f"noise: expected sd above 0 grey levels, got {self.sd}")
+        if self.sd is not None:
+            require_within("noise: expected sd [grey levels]", self.sd, 0, above=True)
 
 
 @dataclass(frozen=True)
 class Images:
     """The photographs.
 
-    Parameters
-    ----------
-    reference
-        File of the undeformed state.
-    deformed
-        Files of the deformed states in the order of the test; a name may have wildcards, whose
-        matches come in the order of their names.
-    repeats
-        Further exposures of the undeformed state, from which the camera's noise is measured.
+    ``reference``: file of the undeformed state; ``deformed``: files of the deformed states in the
+    order of the test, a name may have wildcards, whose matches come in the order of their names;
+    ``repeats``: further exposures of the undeformed state, from which the noise is measured.
     """
 
     reference: str = ""
@@ -135,17 +108,9 @@ class Images:
 
 @dataclass(frozen=True)
 class ImageScale:
-    """How large a pixel is.
+    """How large a pixel is: ``pixel_size`` [mm/px], or a line in the reference and its length [mm].
 
-    Parameters
-    ----------
-    pixel_size
-        [mm/px].
-    line
-        Instead of it, the two ends ((column, row), (column, row)) of a line in the reference
-        image [px] ...
-    length
-        ... and its length [mm].
+    ``line``: its two ends ((column, row), (column, row)) [px].
     """
 
     pixel_size: float | None = None

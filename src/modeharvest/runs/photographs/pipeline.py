@@ -12,31 +12,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from modeharvest.idic.local.field import LocalField, read_field, write_field
+from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, warped_back
 from modeharvest.idic.result import Result
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import CaseModel
+from modeharvest.runs.photographs import prepare
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.photographs.prepare import (
-    Optics,
-    PreparedPhotographs,
-    all_files,
-    calibrate_lens,
-    calibrated_lens,
-    local_field,
-    named_files,
-    of_each_photograph,
-    prepare,
-    require_inputs,
-)
+from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.runs.photographs.results import (
     Harvest,
     HarvestTruth,
@@ -68,35 +58,26 @@ class _StartRecord:
 
 @dataclass(frozen=True)
 class HarvestRun(StagedRun[PhotographCase]):
-    """The stages of a harvest.
-
-    Parameters
-    ----------
-    case, folder, progress
-        As of every run.
-    source
-        The case's file, for the report.
-    """
+    """The stages of a harvest; ``source``: the case's file, for the report."""
 
     source: str = "EXPERIMENT.toml"
 
     @cached_property
     def optics(self) -> Optics:
         """The lens; a calibration leaves ``distortion.json`` and ``calibration.json``."""
-        table = self.case.distortion
+        table, base = self.case.distortion, self.case.base
         if table.file:
-            return Optics(read_distortion(self.case.base / table.file))
+            return Optics(read_distortion(base / table.file))
         if not table.calibration:
             return Optics()
-        base = self.case.base
-        files = named_files(base, table.calibration, unique=False)
+        files = prepare.named_files(base, table.calibration, unique=False)
 
         def work() -> tuple[Path, ...]:
-            calibrate_lens(table, base, self.folder, self.progress)
+            prepare.calibrate_lens(table, base, self.folder, self.progress)
             return self.folder / "distortion.json", self.folder / "calibration.json"
 
         key = stage_key([to_plain(table), [sha256_of(path) for path in files]], *_CODE)
-        return self.do("optics", key, work, lambda: calibrated_lens(self.folder))
+        return self.do("optics", key, work, lambda: prepare.calibrated_lens(self.folder))
 
     def prepared(self) -> PreparedPhotographs:
         """Make the photographs ready; leaves ``prepared/``."""
@@ -104,10 +85,11 @@ class HarvestRun(StagedRun[PhotographCase]):
 
         def work() -> tuple[Path, ...]:
             distortion = self.optics.distortion
-            return prepare(self.case, folder, distortion, self.progress).files
+            return prepare.prepare(self.case, folder, distortion, self.progress).files
 
-        key = self._prepared_key()
-        return self.do("prepare", key, work, lambda: PreparedPhotographs.read(folder))
+        return self.do(
+            "prepare", self._prepared_key(), work, lambda: PreparedPhotographs.read(folder)
+        )
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -119,19 +101,16 @@ class HarvestRun(StagedRun[PhotographCase]):
         """Correlate every photograph, each after the one before; leaves ``results/``.
 
         One that can't be measured is left out (see :meth:`failures`), and the next goes on from
-        the last that could.
-
-        Raises
-        ------
-        InputError
-            If none can be measured.
+        the last that could. Raises InputError if none can be measured.
         """
         prepared = self.prepared()
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
         found: dict[str, MeasuredPhotograph] = {}
-        key = digest([self._prepared_key(), self._how()])
+        how, local = self.case.plain(), self.case.local.files
+        key = digest([self._prepared_key(), [how["correlation"], how["local"]]])
+        fields = prepare.of_each_photograph(self.case, local, "local.files")
         for name in prepared.names:
-            key = digest([key, name, self._local_digest(name)])
+            key = digest([key, name, sha256_of(fields[name]) if name in fields else ""])
             measured = self._measured(prepared, name, found, key)
             if measured is not None:
                 found[name] = measured
@@ -170,7 +149,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             timeline=moments,
             buckling=find_buckling(moments),
             calibration=self.optics.calibration,
-            distortion=self.optics.distortion,
+            lens=self.optics.distortion,
             full_scale=prepared.full_scale,
             text=(*prepared.notes, *region.text),
             truth=truth,
@@ -182,11 +161,8 @@ class HarvestRun(StagedRun[PhotographCase]):
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
         """Do everything that is not finished; returns the content of ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            If another process works in the folder, it can't be written to, or no photograph can
-            be measured.
+        Raises InputError if another process works in the folder, it can't be written to, or no
+        photograph can be measured.
         """
         with exclusive(self.folder):
             require_writable(self.folder)
@@ -215,13 +191,14 @@ class HarvestRun(StagedRun[PhotographCase]):
         before = next(reversed(found), None)
 
         def work() -> tuple[Path, ...]:
+            case, lens = self.case, self.optics.distortion
             try:
                 measured = measure(
                     self._pair(prepared, name, before, found),
                     self.geometry,
-                    self.case.specimen.cell_size,
-                    self.case.correlation,
-                    self._local(prepared, name),
+                    case.specimen.cell_size,
+                    case.correlation,
+                    prepare.local_field(case, prepared, name, lens),
                     None if before is None else found[before],
                     self.progress,
                 )
@@ -230,8 +207,7 @@ class HarvestRun(StagedRun[PhotographCase]):
                 return (start,)
             write_field(field, measured.local)
             measured.result.write(result)
-            record = _StartRecord("", measured.fixed, measured.text)
-            write_json(start, to_plain(record))
+            write_json(start, to_plain(_StartRecord("", measured.fixed, measured.text)))
             return result, field, start
 
         def read() -> MeasuredPhotograph | None:
@@ -243,9 +219,6 @@ class HarvestRun(StagedRun[PhotographCase]):
 
         return self.do(f"correlate {name}", key, work, read)
 
-    def _local(self, prepared: PreparedPhotographs, name: str) -> LocalField | None:
-        return local_field(self.case, prepared, name, self.optics.distortion)
-
     def _pair(
         self,
         prepared: PreparedPhotographs,
@@ -254,12 +227,12 @@ class HarvestRun(StagedRun[PhotographCase]):
         found: dict[str, MeasuredPhotograph],
     ) -> ImagePair:
         """The photograph and what it is correlated with."""
-        reference, mask = prepared.image(), prepared.mask()
-        if self.case.correlation.formulation == "updated" and before is not None:
-            result = found[before].result
-            reference, inside = warped_back(prepared.image(before), result, result.order)
-            mask = mask & inside
-        return ImagePair(reference, prepared.image(name), prepared.grid, mask, prepared.mask(name))
+        pair = prepared.pair(name)
+        if self.case.correlation.formulation != "updated" or before is None:
+            return pair
+        result = found[before].result
+        reference, inside = warped_back(prepared.image(before), result, result.order)
+        return replace(pair, reference=reference, mask=prepared.mask() & inside)
 
     def _record(self, name: str) -> _StartRecord:
         return made(_StartRecord, read_json(self._paths(name)[2]))
@@ -269,17 +242,9 @@ class HarvestRun(StagedRun[PhotographCase]):
         return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
 
     def _prepared_key(self) -> str:
-        tables, files = self.case.plain(), all_files(self.case)
+        tables, files = self.case.plain(), prepare.all_files(self.case)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
         return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *_CODE)
-
-    def _how(self) -> list[Any]:
-        tables = self.case.plain()
-        return [tables["correlation"], tables["local"]]
-
-    def _local_digest(self, name: str) -> str:
-        path = of_each_photograph(self.case, self.case.local.files, "local.files").get(name)
-        return "" if path is None else sha256_of(path)
 
 
 def harvest(
@@ -287,26 +252,11 @@ def harvest(
 ) -> dict[str, Any]:
     """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
-    Parameters
-    ----------
-    case
-        The path of its TOML file, or the case itself.
-    folder
-        Where to leave the files.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
-
-    Raises
-    ------
-    InputError
-        If the case can't be used; before anything is computed, if a file is missing.
+    ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files.
+    Returns the content of ``summary.json``. Raises InputError if the case can't be used; before
+    anything is computed, if a file is missing.
     """
     found = PhotographCase.of(case)
-    require_inputs(found)
+    prepare.require_inputs(found)
     source = "CASE" if case is found else str(case)
     return HarvestRun(found, Path(folder), progress, source).all()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.typed import made, to_plain
+from modeharvest.util.typed import made, picked, to_plain
 
 PREPARED_FILE = "prepared.json"
 
@@ -67,8 +67,6 @@ class PreparedPhotographs:
         Of the deformed images that can be used, in the order of the test.
     skipped
         Name of each file that can't be used, and why.
-    noise
-        The camera's.
     grid
         The ideal pixels; the physical origin is the middle of the image.
     full_scale
@@ -114,12 +112,8 @@ class PreparedPhotographs:
 def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[Path, ...]:
     """The files that names, or patterns with wildcards, stand for.
 
-    ``unique``: no two may have the same stem, because results are named by it.
-
-    Raises
-    ------
-    InputError
-        If a pattern matches no file, or two files would leave results of the same name.
+    Raises InputError if a pattern matches no file, or, with ``unique``, two have the same stem:
+    results are named by it.
     """
     paths: list[Path] = []
     for name in names:
@@ -143,19 +137,8 @@ def named_files(base: Path, names: Sequence[str], unique: bool = True) -> tuple[
 def of_each_photograph(case: PhotographCase, names: Sequence[str], what: str) -> dict[str, Path]:
     """The file that goes with each deformed photograph, by the photograph's name.
 
-    Parameters
-    ----------
-    case
-        What there is.
-    names
-        Of the files, or patterns; none at all is all right.
-    what
-        They are, for the message.
-
-    Raises
-    ------
-    InputError
-        If there aren't as many as photographs.
+    ``names`` of the files, or patterns; none at all is all right. Raises InputError if there
+    aren't as many as photographs; ``what`` begins the message.
     """
     files = named_files(case.base, names, unique=False)
     photographs = named_files(case.base, case.images.deformed)
@@ -177,14 +160,10 @@ def all_files(case: PhotographCase) -> tuple[Path, ...]:
 
 
 def require_inputs(case: PhotographCase) -> None:
-    """Raise in one line unless all that a case names is there.
+    """Check that all is there that a case names.
 
-    Raises
-    ------
-    InputError
-        If a file is missing, or there aren't as many masks or fields as photographs.
-    MissingDependencyError
-        If pyvale is asked for and not installed.
+    Raises InputError if a file is missing, or there aren't as many masks or fields as photographs;
+    MissingDependencyError if pyvale is asked for and not installed.
     """
     local = case.local
     files = (*all_files(case), *named_files(case.base, local.files, unique=False))
@@ -200,23 +179,15 @@ def require_inputs(case: PhotographCase) -> None:
         pyvale_python()
 
 
-_ARRAYS = ("shifts", "shifts_sd", "angles", "angles_sd", "matches", "covariance")
-
-
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What is known of the lens.
-
-    Parameters
-    ----------
-    distortion
-        S of the paper's Eq. (r2); None for none.
-    calibration
-        How it was found, if it was not given.
-    """
+    """The lens: S of the paper's Eq. (r2), None for none; how it was found, if it wasn't given."""
 
     distortion: Distortion | None = None
     calibration: Calibration | None = None
+
+
+_ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"
 
 
 def calibrate_lens(
@@ -224,19 +195,14 @@ def calibrate_lens(
 ) -> None:
     """Calibrate from the images of a target; leaves ``distortion.json``, ``calibration.json``.
 
-    Raises
-    ------
-    InputError
-        If a file can't be used, or the images don't determine the distortion.
+    Raises InputError if a file can't be used, or the images don't determine the distortion.
     """
     images = [read_photograph(file).image for file in named_files(base, table.calibration)]
     shifts = [(row, col) for col, row in table.shifts] or None
     found = calibrate(images, shifts, progress=progress)
     write_distortion(folder / "distortion.json", found.distortion)
-    content: dict[str, Any] = {name: getattr(found, name).tolist() for name in _ARRAYS}
-    content["trials"] = [asdict(trial) for trial in found.trials]
-    content |= {"noise_sd": found.noise_sd, "fixed": found.model.fixed}
-    content["text"] = calibration_text(found)
+    content = to_plain(picked(found, f"{_ARRAYS} trials noise_sd"))
+    content |= {"fixed": found.model.fixed, "text": calibration_text(found)}
     write_json(folder / "calibration.json", content)
 
 
@@ -246,36 +212,25 @@ def calibration_text(found: Calibration) -> tuple[str, ...]:
     row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
     size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
     turned = np.abs(found.angles).max()
-    notes = [
+    text = (
         f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
         f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
         f"{chosen.sd_px:.4f} px rms over the image.",
-    ]
-    if chosen is found.trials[-1] and len(found.trials) > 1:
-        notes.append(
-            f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
-            f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
-        )
-    if found.model.fixed == 1:  # the shifts were known
-        notes.append(
-            "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
-            "constant part can't be observed and is zero at the polynomial's mean."
-        )
-    else:
-        notes.append(
-            "The shifts were not known, so the affine part of S can't be observed and is zero: "
-            "scale and skew of the image are open, as with any pixel size that isn't measured."
-        )
-    if turned > 0.0:
-        notes.append(
-            f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
-            f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
-        )
-    notes.append(
+        f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
+        f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
+        if chosen is found.trials[-1] and len(found.trials) > 1 else "",
+        "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
+        "constant part can't be observed and is zero at the polynomial's mean."
+        if found.model.fixed == 1 else
+        "The shifts were not known, so the affine part of S can't be observed and is zero: "
+        "scale and skew of the image are open, as with any pixel size that isn't measured.",
+        f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
+        f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
+        if turned > 0.0 else "",
         "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
-        "or a change of the distance to the lens would be taken for distortion."
-    )
-    return tuple(notes)
+        "or a change of the distance to the lens would be taken for distortion.",
+    )  # fmt: skip
+    return tuple(filter(None, text))
 
 
 def calibrated_lens(folder: Path) -> Optics:
@@ -286,7 +241,7 @@ def calibrated_lens(folder: Path) -> Optics:
         if not isinstance(distortion, PolynomialDistortion):  # that is what is calibrated
             raise InputError("expected a polynomial in distortion.json beside it, got another kind")
         fixed = int(content["fixed"])
-        arrays: dict[str, Any] = {name: np.array(content[name], np.float64) for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: np.array(content[name], float) for name in _ARRAYS.split()}
         calibration = Calibration(
             distortion=distortion,
             coefficients=distortion.coefficients[:, fixed:].ravel(),
@@ -306,24 +261,33 @@ def prepare(
 ) -> PreparedPhotographs:
     """Make a case's photographs ready; leaves them in ``folder``.
 
-    Raises
-    ------
-    InputError
-        If the reference can't be used, or none of the deformed images.
+    Raises InputError if the reference can't be used, or none of the deformed images.
     """
     images, table, base = case.images, case.specimen, case.base
+    options = material_options(table.cell_size / case.scale.mm_per_px)
+
+    def save(
+        name: str, photograph: Photograph, given: Path | None
+    ) -> tuple[BoolArray, Sequence[str]]:
+        """Write image and mask without distortion; returns the photograph's own :func:`_mask`."""
+        image, (mask, text) = photograph.image, _mask(photograph, given, options)
+        own = mask
+        if distortion is not None:
+            image, mask = undistorted(image, distortion), undistorted_mask(mask, distortion)
+        write_image(folder / f"{name}.tif", image)
+        write_image(folder / f"{name}_mask.tif", mask)
+        return own, text
+
     reference = read_reference(base / images.reference)
-    cell_px = table.cell_size / case.scale.mm_per_px
-    ready = _Maker(folder, distortion, material_options(cell_px))
-    mask = ready.save("reference", reference, _given(base, table.material))
+    mask, text = save("reference", reference, base / table.material if table.material else None)
     deformed = named_files(base, images.deformed)
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
-    names, skipped, notes = [], [], list(reference.notes) + ready.text
+    names, skipped, notes = [], [], [*reference.notes, *text]
     for k, path in enumerate(deformed):
         progress(k, len(deformed), "prepare photographs")
         try:
             frame = read_frame(path, reference)
-            ready.save(path.stem, frame, masks.get(path.stem))
+            save(path.stem, frame, masks.get(path.stem))
         except InputError as error:
             skipped.append((path.name, str(error)))
             continue
@@ -334,14 +298,12 @@ def prepare(
             f"expected a deformed image that can be used, got none of {len(deformed)}: "
             f"{skipped[0][1]}"
         )
-    rows, cols = reference.shape
-    grid = PixelGrid.centred(rows, cols, case.scale.mm_per_px)
     prepared = PreparedPhotographs(
         folder,
         tuple(names),
         tuple(skipped),
         _noise(case, reference, mask),
-        grid,
+        PixelGrid.centred(*reference.shape, case.scale.mm_per_px),
         float(reference.full_scale),
         tuple(notes),
     )
@@ -351,37 +313,16 @@ def prepare(
     return prepared
 
 
-class _Maker:
-    """Frees photographs from distortion and finds their material."""
-
-    def __init__(
-        self, folder: Path, distortion: Distortion | None, options: MaterialOptions
-    ) -> None:
-        self._folder, self._distortion, self._options = folder, distortion, options
-        self.text: list[str] = []
-
-    def save(self, name: str, photograph: Photograph, given: Path | None) -> BoolArray:
-        """Write image and mask under a name; returns the photograph's own mask."""
-        if given is not None:
-            mask = read_mask(given)
-            require_same_shape(photograph.image, mask, str(photograph.path), str(given))
-        else:
-            material = find_material(photograph.image, self._options)
-            mask = material.mask
-            self.text += [s for s in material.text if s not in self.text]
-        image, shown = photograph.image, mask
-        if self._distortion is not None:
-            image, shown = (
-                undistorted(image, self._distortion),
-                undistorted_mask(mask, self._distortion),
-            )
-        write_image(self._folder / f"{name}.tif", image)
-        write_image(self._folder / f"{name}_mask.tif", shown)
-        return mask
-
-
-def _given(base: Path, name: str) -> Path | None:
-    return base / name if name else None
+def _mask(
+    photograph: Photograph, given: Path | None, options: MaterialOptions
+) -> tuple[BoolArray, Sequence[str]]:
+    """Where a photograph shows material, as given or as found, and how it was found."""
+    if given is None:
+        found = find_material(photograph.image, options)
+        return found.mask, found.text
+    mask = read_mask(given)
+    require_same_shape(photograph.image, mask, str(photograph.path), str(given))
+    return mask, ()
 
 
 def _noise(case: PhotographCase, reference: Photograph, mask: BoolArray) -> CameraNoise:
@@ -404,29 +345,16 @@ def local_field(
     """The displacement field of one deformed photograph by a local DIC; None if there is none.
 
     Files are of the photographs before the lens was taken out of them; it is taken out here.
-
-    Raises
-    ------
-    InputError
-        If there aren't as many files as photographs, or this one's can't be used.
+    Raises InputError if there aren't as many files as photographs, or this one's can't be used.
     """
     table, grid = case.local, prepared.grid
     if table.code == "none":
         return None
     if table.code == "pyvale":
-        options = SubsetOptions(subset_px=table.subset, step_px=table.step)
-        return subset_field(prepared.pair(name), options)
+        return subset_field(prepared.pair(name), SubsetOptions(table.subset, table.step))
     path = of_each_photograph(case, table.files, "local.files")[name]
+    units, y_axis = (None if it == "auto" else it for it in (table.unit, table.y_axis))
     field = read_field(
-        path,
-        grid,
-        units=_or_none(table.unit),
-        y_axis=_or_none(table.y_axis),
-        first_pixel=table.first_pixel,
-        columns=table.columns,
+        path, grid, units=units, y_axis=y_axis, first_pixel=table.first_pixel, columns=table.columns
     )
     return field if distortion is None else without_distortion(field, grid, distortion)
-
-
-def _or_none(value: str) -> str | None:
-    return None if value == "auto" else value

@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
-from modeharvest.idic.photograph.measure import (
-    MeasuredPhotograph,
-    image_noise,
-    residual_test,
-)
+from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise, residual_test
 from modeharvest.idic.result import Result
 from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.residual_test import ResidualTest
@@ -39,14 +35,9 @@ from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
 
 @dataclass(frozen=True, eq=False)
 class PartSpectrum:
-    """What a part of the specimen shows that has modes of its own.
+    """Spectrum, and the pattern read off it, of a part of the specimen that has modes of its own.
 
-    Parameters
-    ----------
-    name
-        Of the part.
-    spectrum, pattern
-        Of the displacement there without its affine part, and what is read off it.
+    Of the displacement there without its affine part.
     """
 
     name: str
@@ -56,34 +47,26 @@ class PartSpectrum:
 
 @dataclass(frozen=True, eq=False)
 class HarvestedFrame:
-    """What was found in one deformed photograph.
+    """What was found in one deformed photograph; ``name`` differs from all others'.
 
     Parameters
     ----------
-    name
-        Of the photograph; differs from all others'.
     strain_x, strain_y
         Mean nominal compression of the cellular part [-].
-    image
-        (rows, cols) the photograph, free from distortion [grey levels]; may be memory-mapped.
-    mask
-        (rows, cols) True on its material; None if not known.
-    result, identifiability, residual_test
-        Of its correlation.
+    image, mask
+        (rows, cols) the photograph, free from distortion [grey levels], and True on its material;
+        None if not known. May be memory-mapped.
     error_x, error_y
         (p,) and (q,) axes [mm] of the error bars.
     by_noise, by_model_error
-        Error bars on these axes, arrays (q, p, ...), by the images' noise and by
-        model error; the latter None if they can't be had.
+        Error bars on these axes, arrays (q, p, ...), by the images' noise and by model error; the
+        latter None if they can't be had.
     noise_covariance, model_error_covariance
-        (n, n) of the unknowns by the images' noise and by model error: those that the error bars
-        are made of.
+        (n, n) of the unknowns: those that the error bars are made of.
     spectrum, pattern
         Of the displacement without its affine part, and what is read off it.
     parts
         The same of every part that has modes of its own, in one order for all photographs.
-    local
-        Of a local DIC.
     start_text, warnings
         Where the correlation started from, and what a user should know.
     """
@@ -126,18 +109,9 @@ class HarvestedFrame:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """One line of the table that sets what was found against the truth.
+    """What was obtained against what is expected, both in ``unit`` ("" for none) or in words.
 
-    Parameters
-    ----------
-    quantity
-        In words.
-    obtained, expected
-        Numbers, or words.
-    ok
-        Whether the first is as good as the second asks for.
-    unit
-        Of both; "" for none.
+    ``ok``: whether the first is as good as the second asks for.
     """
 
     quantity: str
@@ -151,12 +125,8 @@ class TruthCheck:
 class FrameTruth:
     """The truth of one frame, in the reference frame.
 
-    Parameters
-    ----------
-    displacement
-        (rows, cols, 2) [mm]; NaN off the material. May be memory-mapped.
-    best
-        The best fit of the frame's ansatz to it.
+    ``displacement``: (rows, cols, 2) [mm], NaN off the material, may be memory-mapped; ``best``:
+    the best fit of the frame's ansatz to it.
     """
 
     displacement: NDArray[Any]
@@ -167,14 +137,8 @@ class FrameTruth:
 class HarvestTruth:
     """The truth of photographs that were made by a simulation.
 
-    Parameters
-    ----------
-    frames
-        By the frames' names; some may be missing.
-    distortion
-        The optics' true distortion.
-    rows
-        What was found against what is true.
+    ``frames`` by their names, some may be missing; ``distortion`` of the optics; ``rows``: what was
+    found against what is true.
     """
 
     frames: Mapping[str, FrameTruth]
@@ -188,8 +152,6 @@ class Harvest:
 
     Parameters
     ----------
-    title
-        Of the page.
     experiment
         The experiment, as plain values.
     grid
@@ -197,32 +159,26 @@ class Harvest:
     reference, mask
         (rows, cols) the photograph of the undeformed state, free from distortion [grey levels],
         and where it shows material.
-    lattice
-        The holes that were found and the lattice fitted to them.
     cellular, domain
         The part that has holes, and the box of the material [mm].
-    frames
+    frames, timeline
         In the order of the test.
-    skipped
-        Names of photographs that were not used, and why.
-    timeline
-        In the order of the test.
-    buckling
-        When the pattern appeared.
-    calibration, distortion
-        Of the optics; the distortion alone if it was given.
     noise_sd, noise_source
         Of each photograph [grey levels], and where that is known from.
+    lattice
+        The holes that were found and the lattice fitted to them.
+    skipped
+        Names of photographs that were not used, and why.
+    buckling
+        When the pattern appeared.
+    calibration, lens
+        Of the optics; the lens alone if it was given.
     full_scale
         Largest grey level of the camera; None if not known.
     text
         What was done to the photographs and found in them, in words.
-    truth
-        Of photographs made by a simulation.
     command, toml
         That make this page again; the experiment's values are shown if ``toml`` is empty.
-    versions
-        Of software.
     """
 
     title: str
@@ -240,7 +196,7 @@ class Harvest:
     timeline: Sequence[ImageAmplitude] = ()
     buckling: Buckling | None = None
     calibration: Calibration | None = None
-    distortion: Distortion | None = None
+    lens: Distortion | None = None
     full_scale: float | None = None
     text: tuple[str, ...] = ()
     truth: HarvestTruth | None = None
@@ -249,14 +205,12 @@ class Harvest:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        shape = self.grid.shape
         images = {"reference": self.reference, "mask": self.mask}
-        images |= {frame.name: frame.image for frame in self.frames}
-        for name, image in images.items():
-            if image.shape != shape:
+        for name, image in (images | {frame.name: frame.image for frame in self.frames}).items():
+            if image.shape != self.grid.shape:
                 raise InputError(
-                    f"harvest: expected images of {shape} px like the grid, got {image.shape} for "
-                    f"{name}"
+                    f"harvest: expected images of {self.grid.shape} px like the grid, got "
+                    f"{image.shape} for {name}"
                 )
         if not self.frames:
             raise InputError("harvest: expected at least one deformed photograph, got none")
@@ -276,13 +230,6 @@ class Harvest:
         """Width of the rim of the material that was not compared [px]."""
         return int(self.experiment.get("correlation", {}).get("edge_px", 0))
 
-    @property
-    def lens(self) -> Distortion | None:
-        """The optics' distortion, given or calibrated."""
-        if self.distortion is None and self.calibration is not None:
-            return self.calibration.distortion
-        return self.distortion
-
 
 _ALONG = 120
 """Points of the error bars along the longer side: they are as smooth as the ansatz."""
@@ -296,14 +243,12 @@ def harvested_frame(
     measured: MeasuredPhotograph,
 ) -> HarvestedFrame:
     """One photograph's measurement, with its error bars and spectra."""
-    result, pair = measured.result, prepared.pair(name)
+    result, pair, cell = measured.result, prepared.pair(name), case.specimen.cell_size
     box = geometry.region.cellular
-    cell = case.specimen.cell_size
     x, y = _axes(geometry.region.domain)
     noise, edge_px = image_noise(pair, prepared.noise), case.correlation.edge_px
     found = covariance(result, pair, noise, cell, edge_px)
     by_model_error = found.by_model_error
-    identified = identifiability(result, pair.mask)
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
     pattern = read_pattern(spectrum)
@@ -314,7 +259,7 @@ def harvested_frame(
         image=pair.deformed,
         mask=pair.deformed_mask,
         result=result,
-        identifiability=identified,
+        identifiability=identifiability(result, pair.mask),
         residual_test=residual_test(result, pair, noise, edge_px),
         error_x=x,
         error_y=y,
@@ -345,23 +290,25 @@ def _parts(
 
 def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
     """A frame's place on the time line."""
-    identified, px = frame.identifiability, frame.result.grid.pixel_size
+    identified, noise = frame.identifiability, rms_errors(frame, frame.by_noise, cellular)
     return ImageAmplitude(
         name=frame.name,
         strain=frame.strain_x,
         amplitude_px=float(np.linalg.norm(identified.amplitude_px)),
         model_error_px=identified.model_error_px,
-        noise_px=_inside(frame.by_noise, frame.error_x, frame.error_y, cellular) / px,
+        noise_px=noise.get("fluctuation", 0.0),
     )
 
 
-def _inside(errors: FieldErrors, x: FloatArray, y: FloatArray, box: Box) -> float:
-    """Rms per component of the pattern's standard deviation over a box [mm]; 0 without a mode."""
-    if not len(errors.fluctuation):
-        return 0.0
-    cols, rows = (box.x_min <= x) & (x <= box.x_max), (box.y_min <= y) & (y <= box.y_max)
-    variance = (errors.fluctuation**2).sum(axis=0)[np.ix_(rows, cols)]
-    return float(np.sqrt(np.mean(variance)))
+def rms_errors(frame: HarvestedFrame, errors: FieldErrors, box: Box) -> dict[str, float]:
+    """Rms standard deviation per component over a box [px], by field; of the pattern with modes."""
+    rows = (box.y_min <= frame.error_y) & (frame.error_y <= box.y_max)
+    cols = (box.x_min <= frame.error_x) & (frame.error_x <= box.x_max)
+    inside, px = np.ix_(rows, cols), frame.result.grid.pixel_size
+    squares = {"v0": errors.v0**2, "displacement": errors.displacement**2}
+    if frame.modes:
+        squares["fluctuation"] = (errors.fluctuation**2).sum(axis=0)
+    return {name: float(np.sqrt(np.mean(part[inside]))) / px for name, part in squares.items()}
 
 
 def _axes(domain: Box) -> tuple[FloatArray, FloatArray]:
