@@ -11,7 +11,7 @@ with a folder that holds cal.xml, left_undist.png and left_dist.png (github dice
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from pathlib import Path
 
@@ -136,8 +136,13 @@ def report_pair(folder: Path) -> None:
 
 
 def main() -> None:
-    if len(sys.argv) > 1:
-        report_pair(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", nargs="?", type=Path, help="of a pair of images, see above")
+    folder = parser.parse_args().folder
+    if folder is not None:
+        report_pair(folder)
         return
     found = report_calibration("Polynomial of degree 5", polynomial_lens(15.0))
     report_calibration("OpenCV camera", camera_lens(15.0))

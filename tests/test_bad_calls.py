@@ -333,11 +333,13 @@ def test_a_polygon_has_an_area(table: str, polygon: str, said: str, tmp_path: Pa
 
 
 def test_wildcards_may_be_absolute(place: Path, tmp_path: Path) -> None:
-    from modeharvest.runs.photographs.prepare import require_inputs
+    from modeharvest.runs.photographs.prepare import all_files, require_inputs
 
     path = tmp_path / "experiment.toml"
     path.write_text(HARVEST.replace('"deformed', f'"{place}/def*').replace('"ref', f'"{place}/ref'))
-    require_inputs(PhotographCase.read(path))
+    case = PhotographCase.read(path)
+    require_inputs(case)
+    assert all_files(case) == (place / "reference.png", place / "deformed.png")
 
 
 # --- what is printed ----------------------------------------------------------------------
@@ -355,9 +357,10 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
     assert "out[/bold]/report.html" in text
 
 
-def test_a_bar_may_name_any_file() -> None:
+def test_a_bar_may_name_any_file(capsys: pytest.CaptureFixture[str]) -> None:
     with messages.bars() as progress:  # markup that closes nothing raises where it is drawn
         progress(0.0, 1.0, "score: [/bold].csv")
+    assert "score: [/bold].csv" in capsys.readouterr().err
 
 
 def test_names_that_look_like_markup_or_formulas_are_scored(

@@ -10,7 +10,17 @@ import pytest
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.speckle.pattern import Ink
-from modeharvest.runs.case import Case, case_text, shipped_cases
+from modeharvest.runs.case import (
+    Case,
+    CaseModel,
+    case_text,
+    read_tables,
+    shipped_cases,
+    table_of_kind,
+)
+from modeharvest.runs.lattice.case import LatticeCase
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 
 
@@ -98,9 +108,21 @@ def test_a_misspelt_case_name_is_met_with_the_nearest() -> None:
         Case.read("paper-virtal")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nothing\.toml"):
-        Case.read(tmp_path / "nothing.toml")
+@pytest.mark.parametrize(
+    ("kind", "start"),
+    [
+        (Case, "paper-virtual"),
+        (LatticeCase, "square-lattice"),
+        (PhotographCase, "photographs"),
+        (StudyCase, "noise"),
+    ],
+)
+def test_a_missing_file_is_named_and_what_it_could_begin_as(
+    tmp_path: Path, kind: type[CaseModel], start: str
+) -> None:
+    with pytest.raises(InputError, match=rf"nothing\.toml.*'modeharvest cases {start}'"):
+        kind.read(tmp_path / "nothing.toml")
+    assert table_of_kind(read_tables(start)) == kind.table
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
+import distortion
 import numpy as np
+import pytest
 from affine_aside import affine_aside
 from calibration_set import photographs, random_lens
 
@@ -15,6 +18,16 @@ from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDist
 
 PAGE = (Path(__file__).parents[1] / "docs" / "distortion.md").read_text("utf-8")
 SHAPE = (140, 170)
+
+
+def test_the_benchmark_says_what_it_takes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["distortion.py", "--help"])
+    with pytest.raises(SystemExit) as end:
+        distortion.main()
+    assert end.value.code == 0
+    assert "left_undist.png" in capsys.readouterr().out
 
 
 def test_the_printed_examples_find_the_lens(tmp_path: Path) -> None:

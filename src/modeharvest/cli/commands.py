@@ -48,19 +48,19 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
     from modeharvest.report.photographs import photographs_report
-    from modeharvest.runs.case import Case
 
-    checked = Case.read(case)  # before the heavy imports, so that a typo is reported at once
-    if checked.calibration is not None:
-        from modeharvest.runs.twin import TwinRun
-
-        with bars() as progress:
-            summary = TwinRun(checked, out, progress, solution).all()
-        print_report(photographs_report(summary), out / "harvest")
-        return
     with _stages(case, out, solution) as stages:
-        summary = stages.all()
-    print_report(experiment_report(summary), out)
+        is_twin = stages.case.calibration is not None
+        if is_twin:
+            from modeharvest.runs.twin import TwinRun
+
+            summary = TwinRun(stages.case, out, stages.progress, solution).all()
+        else:
+            summary = stages.all()
+    if is_twin:
+        print_report(photographs_report(summary), out / "harvest")
+    else:
+        print_report(experiment_report(summary), out)
 
 
 def fem(case: CaseName, out: OutFolder) -> None:

@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any
 
 import typer
@@ -61,11 +60,11 @@ _NOT_KEPT = (
 )
 
 
-class ProgressBars:
+class ProgressBars(RichProgress):
     """A progress listener that draws bars while it is open; use it in a ``with`` block."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = RichProgress(
+        super().__init__(
             TextColumn("{task.description:<28}", markup=False),  # it may name a user's file
             BarColumn(),
             TimeElapsedColumn(),
@@ -73,27 +72,15 @@ class ProgressBars:
             TimeRemainingColumn(),
             console=console,
         )
-        self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> ProgressBars:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bars.stop()
+        self._steps: dict[str, TaskID] = {}
 
     def __call__(self, done: float, total: float, what: str) -> None:
         """Draw the step ``what``; a step that begins finishes the one before."""
-        if what not in self._tasks:
-            for task in self._bars.tasks:
-                self._bars.update(task.id, completed=task.total)
-            self._tasks[what] = self._bars.add_task(what, total=total)
-        self._bars.update(self._tasks[what], completed=min(done, total), total=total)
+        if what not in self._steps:
+            for task in self.tasks:
+                self.update(task.id, completed=task.total)
+            self._steps[what] = self.add_task(what, total=total)
+        self.update(self._steps[what], completed=min(done, total), total=total)
 
 
 @contextmanager
@@ -116,12 +103,8 @@ def compilation_announced(console: Console) -> Iterator[None]:
             pass
 
     compiler: Any = event  # which has no types
-    notice = Notice()
-    compiler.register("numba:compile", notice)
-    try:
+    with compiler.install_listener("numba:compile", Notice()):
         yield
-    finally:
-        compiler.unregister("numba:compile", notice)
 
 
 console = Console(stderr=True)

@@ -13,20 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from modeharvest.cli import messages
-from modeharvest.cli.benchmark import make, resolution, score, star
-from modeharvest.cli.commands import (
-    bloch,
-    cases,
-    correlate,
-    fem,
-    harvest,
-    image,
-    modes,
-    run,
-    study,
-    validate,
-)
+from modeharvest.cli import benchmark, commands, messages
 from modeharvest.util import __version__
 from modeharvest.util.machine import is_first
 
@@ -56,12 +43,14 @@ benchmark_app = typer.Typer(
 )
 
 _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
-    "A virtual experiment": (run, fem, image, correlate, validate),
-    "An infinite lattice": (bloch, modes),
-    "Photographs of a test": (harvest,),
-    "How good a measurement is": (study, score),
-    "To begin with": (cases,),
-}
+    "A virtual experiment": (
+        commands.run, commands.fem, commands.image, commands.correlate, commands.validate,
+    ),
+    "An infinite lattice": (commands.bloch, commands.modes),
+    "Photographs of a test": (commands.harvest,),
+    "How good a measurement is": (commands.study, benchmark.score),
+    "To begin with": (commands.cases,),
+}  # fmt: skip
 
 
 def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
@@ -78,10 +67,10 @@ def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
     return run_command
 
 
-for family, commands in _FAMILIES.items():
-    for command in commands:
+for family, members in _FAMILIES.items():
+    for command in members:
         app.command(rich_help_panel=family)(_interruptible(command))
-for command in (make, star, resolution):
+for command in (benchmark.make, benchmark.star, benchmark.resolution):
     benchmark_app.command()(_interruptible(command))
 app.add_typer(benchmark_app, name="benchmark", rich_help_panel="How good a measurement is")
 

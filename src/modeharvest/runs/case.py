@@ -1,22 +1,10 @@
 """Cases: a TOML file turned into checked objects, each fault in one line.
 
 A case is a pydantic model whose fields are the project's frozen dataclasses, so a case file,
-``--help`` and the Python objects use the same names and units. A virtual experiment::
-
-    title = "..."
-    [experiment]              # fem.experiment.Experiment
-    strains = [0.078, 0.128]
-    [experiment.specimen]     # fem.specimen.Specimen
-    [experiment.material]     # kind = "ogden" or "two-term-I1", and its constants
-    [imaging]                 # imaging.spec.ImagingSpec
-    [imaging.speckle]         # imaging.speckle.SpeckleSpec
-    [imaging.distortion]      # imaging.distortion.CameraDistortion
-    [correlation]             # idic.setup.SquareLatticeOptions
-
-A table ``[calibration]`` (imaging.distortion.target.CalibrationTarget) makes it the twin of a
-real experiment: photographs through a lens that has to be calibrated first, to be harvested.
-What all kinds of cases share is here too; infinite lattices, photographs and studies have modules
-of their own.
+``--help`` and the Python objects use the same names and units. What all kinds of cases share is
+here, and the virtual experiment; with a table ``[calibration]`` that is the twin of a real one:
+photographs through a lens that has to be calibrated first, to be harvested. Infinite lattices,
+photographs and studies have modules of their own.
 """
 
 from __future__ import annotations
@@ -42,12 +30,17 @@ from modeharvest.util.typed import CHECKS, made, nearest, require_types, sentenc
 
 _SHIPPED = resources.files("modeharvest") / "cases"
 _KINDS = {
-    "lattice": ("an infinite lattice", "modeharvest modes {} --out DIR', or 'modeharvest bloch {}"),
-    "study": ("a study", "modeharvest study {}"),
-    "images": ("photographs of a test", "modeharvest harvest {}"),
-    "experiment": ("a virtual experiment", "modeharvest run {}"),
+    "lattice": (
+        "an infinite lattice",
+        "modeharvest modes {} --out DIR', or 'modeharvest bloch {}",
+        "square-lattice",
+    ),
+    "study": ("a study", "modeharvest study {}", "noise"),
+    "images": ("photographs of a test", "modeharvest harvest {}", "photographs"),
+    "experiment": ("a virtual experiment", "modeharvest run {}", "paper-virtual"),
 }
-"""By the table that only such a case has, looked for in this order: what it is, who runs it."""
+"""By the table that only such a case has, looked for in this order: what it is, who runs it, and
+which shipped case is a start for one's own."""
 
 
 class CaseModel(BaseModel):
@@ -63,21 +56,16 @@ class CaseModel(BaseModel):
     def read(cls, name: str | Path) -> Self:
         """Read a case by the name of a shipped one or by the path of a TOML file.
 
-        Raises
-        ------
-        InputError
-            If there is no such case, it is of another kind, it is not TOML, a key is unknown (the
-            nearest known one is suggested) or a value is out of its range.
+        Raises InputError if there is no such case, it is of another kind, it is not TOML, a key is
+        unknown (the nearest known one is suggested) or a value is out of its range.
         """
-        tables = read_tables(name)
+        wanted, _, start = _KINDS[cls.table]
+        tables = read_tables(name, start)
         got = table_of_kind(tables)
         if got not in ("", cls.table):
-            (wanted, _), (found, command) = _KINDS[cls.table], _KINDS[got]
-            raise InputError(
-                f"{name}: expected {wanted}, got {found}; run '{command} --out DIR'".replace(
-                    "{}", str(name)
-                )
-            )
+            found, command, _ = _KINDS[got]
+            command = f"{command} --out DIR".replace("{}", str(name))
+            raise InputError(f"{name}: expected {wanted}, got {found}; run '{command}'")
         return checked(cls, tables, name)
 
     @classmethod
@@ -109,10 +97,7 @@ def shipped_cases(kind: str = "") -> dict[str, str]:
 def case_text(name: str) -> str:
     """The TOML text of a shipped case, comments included: a start for one's own.
 
-    Raises
-    ------
-    InputError
-        If no case of that name is shipped; the nearest name is suggested.
+    Raises InputError, with the nearest name, if there is none of that name.
     """
     known = _shipped()
     if name not in known:
@@ -132,17 +117,15 @@ def _shipped() -> dict[str, Path]:
     return {p.stem: p for where in ("", "studies") for p in sorted((folder / where).glob("*.toml"))}
 
 
-def read_tables(name: str | Path) -> dict[str, Any]:
+def read_tables(name: str | Path, start: str = "NAME") -> dict[str, Any]:
     """The tables of a shipped case (by its name) or of a TOML file (by its path).
 
-    Raises
-    ------
-    InputError
-        If there is no such case or file, or it isn't TOML.
+    ``start``: the shipped case that a missing file could begin as. Raises InputError if there is
+    no such case or file, or it isn't TOML.
     """
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
-        with reading(path, "a case file", "'modeharvest cases NAME' prints one"):
+        with reading(path, "a case file", f"'modeharvest cases {start}' prints one"):
             return _tables(path)
     return tomllib.loads(case_text(str(name)))
 
@@ -163,13 +146,7 @@ def _tables(path: Path) -> dict[str, Any]:
 
 
 def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) -> CaseType:
-    """The case that tables describe.
-
-    Raises
-    ------
-    InputError
-        If a key is unknown (the nearest known one is suggested) or a value is out of its range.
-    """
+    """The case that tables describe; ``name`` begins the message of an InputError."""
     try:
         case = model.model_validate(dict(tables))
         require_types(tables, case)
@@ -187,11 +164,9 @@ def of_kind(kinds: Mapping[str, type[Any]], where: str, key: str = "") -> Before
     """
 
     def choose(table: Any) -> Any:
-        if not isinstance(table, Mapping):
-            return table
-        if key:
-            return {**table, key: choose_kind(table[key])} if key in table else table
-        return choose_kind(table)
+        if not key or not isinstance(table, Mapping):
+            return choose_kind(table)
+        return {**table, key: choose_kind(table[key])} if key in table else table
 
     def choose_kind(table: Any) -> Any:
         if not isinstance(table, Mapping):
@@ -216,10 +191,7 @@ def with_kind(thing: object, kinds: Mapping[str, type[Any]]) -> dict[str, Any]:
 
 
 class Case(CaseModel):
-    """A virtual experiment: what is simulated, how it is imaged, how it is correlated.
-
-    With a ``calibration`` it is the twin of a real experiment: photographs of it, and of a target.
-    """
+    """A virtual experiment: what is simulated, how it is imaged, how it is correlated; a twin."""
 
     table = "experiment"
 

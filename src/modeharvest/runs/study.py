@@ -1,20 +1,8 @@
 """A study from its case to its report, in one folder in which an interrupted run is continued.
 
-::
-
-    study.json               which kind of study has this folder
-    solution.h5              the exact displacements
-    subjects/ images/        pairs of images, and how they are correlated
-    cases/KEY.json           one file for each case, written when it is done
-    table.csv                one row for each case
-    timings.json             what it took; all else is the same after every run
-    *.csv                    the report's tables
-    summary.json report.html what was found
-
-Its TOML file has the tables of a virtual experiment and ``[study]``, with a kind ("robustness",
-"noise", "systematic", "modes" or "resolution") and that kind's options. In Python::
-
-    case = StudyCase(study=Robustness(initial_guesses=20, radius=0.2))
+Its files: docs/studies.md. Its TOML file has the tables of a virtual experiment and ``[study]``,
+with a kind ("robustness", "noise", "systematic", "modes" or "resolution") and that kind's options.
+In Python: ``StudyCase(study=RobustnessStudy(initial_guesses=20, radius=0.2))``.
 """
 
 from __future__ import annotations
@@ -71,7 +59,7 @@ class StudyCase(Case):
     @classmethod
     def read(cls, name: str | Path) -> Self:
         """Read a study as every other case; it has to ask something."""
-        if "study" not in read_tables(name):
+        if "study" not in read_tables(name, "noise"):
             raise InputError(
                 f"{name}: expected a table [study] with a kind among {list(KINDS)}, got none; a "
                 f"virtual experiment by itself is run with 'modeharvest run {name} --out DIR'"
@@ -82,12 +70,10 @@ class StudyCase(Case):
     def _consistent(self) -> Self:
         study: Study[Any] = self.study
         study.require(self.correlation)
-        strains = self.experiment.strains
+        strains = list(self.experiment.strains)
         if not any(abs(study.strain - e) < 1e-9 for e in strains):
-            raise InputError(
-                f"study: expected a strain among experiment.strains = {list(strains)}, got "
-                f"{study.strain}"
-            )
+            got = f"{strains}, got {study.strain}"
+            raise InputError(f"study: expected a strain among experiment.strains = {got}")
         if self.imaging.distortion is not None or self.calibration is not None:
             got = "calibration" if self.imaging.distortion is None else "imaging.distortion"
             raise InputError(
@@ -103,8 +89,7 @@ class StudyCase(Case):
     def quick(self) -> StudyCase:
         """A first look: fewer cases, on images of a quarter of the pixels."""
         imaging = replace(self.imaging, pixel_size=_QUICK * self.imaging.pixel_size)
-        changed = {"study": self.study.quick(), "imaging": imaging}
-        return StudyCase(**{n: getattr(self, n) for n in type(self).model_fields} | changed)
+        return self.model_copy(update={"study": self.study.quick(), "imaging": imaging})
 
     def plain(self) -> dict[str, Any]:
         """The case as plain JSON values, the study and materials by their kinds."""
@@ -123,18 +108,10 @@ FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
 
 @dataclass(frozen=True)
 class StudyAnalysis(StagedRun[StudyCase]):
-    """A study's work: images, cases run by workers, findings.
+    """A study's work: images, cases run by ``workers``, findings.
 
-    Parameters
-    ----------
-    case, folder, progress
-        As of every run.
-    workers
-        Who runs the cases.
-    solution
-        A solution file to use instead of simulating.
-    command
-        What makes it again, for the report.
+    ``solution``: a solution file to use instead of simulating; ``command``: what makes the report
+    again.
     """
 
     workers: Workers = field(default_factory=Workers)
@@ -156,11 +133,8 @@ class StudyAnalysis(StagedRun[StudyCase]):
     def all(self) -> dict[str, Any]:
         """Run what is missing of the study; returns the content of ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            If no case succeeded, the folder can't be written to, holds anything else or is
-            another process's, a scheduler is not there, or its workers can't do the work.
+        Raises InputError if no case succeeded, the folder can't be written to, holds anything else
+        or is another process's, a scheduler is not there, or its workers can't do the work.
         """
         folder, study = self.folder.resolve(), self.case.study
         with exclusive(folder):
@@ -185,10 +159,12 @@ class StudyAnalysis(StagedRun[StudyCase]):
     ) -> dict[str, Any]:
         """Leave tables, ``summary.json`` and ``report.html``."""
         tables = [*findings.tables, *findings.attachments]
-        files = {"table.csv": "every case: its values, error, result"}
-        files |= {table.file: table.title for table in tables}
-        files["summary.json"] = "the findings' numbers and text, and the failures"
-        files["timings.json"] = "what the stages took [s]"
+        files = {
+            "table.csv": "every case: its values, error, result",
+            **{table.file: table.title for table in tables},
+            "summary.json": "the findings' numbers and text, and the failures",
+            "timings.json": "what the stages took [s]",
+        }
         summary = self._summary(campaign, table, findings)
         write_tables(tables, self.folder)
         write_json(self.folder / "summary.json", summary)
@@ -221,15 +197,14 @@ class StudyAnalysis(StagedRun[StudyCase]):
 
 def _claim(folder: Path, kind: str) -> None:
     """Take a folder for a kind of study; InputError if it holds anything else."""
-    path, holds = folder / "study.json", f"a {kind} study"
-    if path.is_file():
-        holds = f"a {_kind_in(path, kind)} study"
-    elif (folder / "summary.json").exists():
+    path, wanted = folder / "study.json", f"a {kind} study"
+    holds = f"a {_kind_in(path, kind)} study" if path.is_file() else wanted
+    if not path.is_file() and (folder / "summary.json").exists():
         holds = "something that is no study (it has a summary.json, but no study.json)"
-    if holds != f"a {kind} study":
+    if holds != wanted:
         raise InputError(
-            f"expected an empty folder or one with a {kind} study, got {folder}, which holds "
-            f"{holds}; take another with --out"
+            f"expected an empty folder or one with {wanted}, got {folder}, which holds {holds}; "
+            "take another with --out"
         )
     write_json(path, {"kind": kind})
 
