@@ -52,20 +52,14 @@ def require_degrees(v0_degree: int, v_degree: int) -> None:
 
 @dataclass(frozen=True)
 class AnsatzOptions:
-    """Degrees of an ansatz; the paper's by default.
-
-    Parameters
-    ----------
-    v0_degree, v_degree
-        Total degrees of the Chebyshev polynomials of v0 and of every v_i.
-    gain_degree, offset_degree
-        Total degrees of a gain and of an offset between the images' grey levels; None for none.
-    """
+    """Degrees of an ansatz; the paper's by default."""
 
     v0_degree: int = 5
     v_degree: int = 6
+    """Total degrees of the Chebyshev polynomials of v0 and of every v_i."""
     gain_degree: int | None = None
     offset_degree: int | None = None
+    """Total degrees of a gain and of an offset between the images' grey levels; None for none."""
 
     def __post_init__(self) -> None:
         require_degrees(self.v0_degree, self.v_degree)
@@ -114,18 +108,10 @@ class Ansatz:
         cell_size: float,
         options: AnsatzOptions | None = None,
     ) -> Ansatz:
-        """Make an ansatz of mode families, each on a part of the domain.
+        """Make an ansatz of mode families, each on a part of the domain [mm].
 
-        Parameters
-        ----------
-        domain
-            The specimen [mm].
-        families
-            Each with the cellular part [mm] that its mode fades out of over half a unit cell.
-        cell_size
-            l [mm].
-        options
-            Degrees; the paper's by default.
+        Each family comes with the cellular part [mm] that its mode fades out of over half a unit
+        cell, ``cell_size`` being l [mm]; the options' degrees are the paper's by default.
         """
         how = options or AnsatzOptions()
         modes = tuple(
@@ -160,14 +146,12 @@ class Ansatz:
     ) -> Ansatz:
         """Make the ansatz with a specimen's modes; the paper's 77 unknowns in square stacking.
 
-        The modes start as those of the specimen's infinite lattice (``idic.modes.FAMILIES``),
-        with their phases anchored at its holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with
-        an even number of holes both ways.
+        The modes start as those of the specimen's infinite lattice (``idic.modes.FAMILIES``), with
+        their phases anchored at its holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with an even
+        number of holes both ways. The specimen's middle is the origin.
 
         Parameters
         ----------
-        specimen
-            Whose middle is the origin.
         fixed_mode
             Keep the modes at the ideal pattern, for images without a pattern to find them from.
         options
@@ -287,14 +271,12 @@ class Ansatz:
         return found
 
     def displacement(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Evaluate the whole displacement [mm].
+        """(..., 2): the whole displacement [mm] at unknowns ``a`` (size,).
 
         Parameters
         ----------
-        a
-            (size,) unknowns.
         x, y
-            Two axes, one-dimensional both (``grid.x`` and ``grid.y``), which give an array
+            Two axes [mm], one-dimensional both (``grid.x`` and ``grid.y``), which give an array
             (len(y), len(x), 2) fast; or arrays of any other shapes that broadcast together.
         """
         total = self.v0(a, x, y)
@@ -318,9 +300,7 @@ class Ansatz:
     def sensitivities(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2, size): derivatives of the displacement with respect to the unknowns.
 
-        Zero for gain and offset.
-
-        Meant for tests and for few points; the correlation itself never forms it.
+        Zero for gain and offset. For tests and few points; the correlation itself never forms it.
         """
         a, (x, y) = self.checked(a), open_grid(x, y)
         x, y = np.broadcast_arrays(x, y)

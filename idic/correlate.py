@@ -66,8 +66,8 @@ def correlate(
 ) -> Result:
     """Find the unknowns that make the deformed image match the reference.
 
-    Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show
-    material: the paper's Eqs. (r), (dof_opt) and (u_dic).
+    Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show material:
+    the paper's Eqs. (r), (dof_opt) and (u_dic).
 
     Parameters
     ----------
@@ -80,10 +80,8 @@ def correlate(
         [-]; by default the pair's, or 0 where that isn't known.
     guess
         (size,) unknowns to begin with, instead.
-    options
-        How to correlate.
-    progress
-        Listener.
+    options, progress
+        How to correlate; listener.
 
     Raises
     ------
@@ -130,20 +128,9 @@ def best_fit(
 ) -> Result:
     """Fit a result's ansatz to the true displacement: what the measurement could find at best.
 
-    The best that is reached from the result and from other guesses. Which that is, and most of
-    the way there, is found on some tens of thousands of pixels: the ansatz is smooth, and its
-    minima are far apart.
-
-    Parameters
-    ----------
-    truth
-        Whose displacement counts where it isn't NaN.
-    result
-        The measurement, of the same pixels.
-    guesses
-        (n,) unknowns each, besides the result's.
-    progress
-        Listener.
+    The best that is reached from the result and from other guesses, (n,) unknowns each. Which that
+    is, and most of the way there, is found on some tens of thousands of pixels: the ansatz is
+    smooth, and its minima are far apart. Where the truth's displacement is NaN it doesn't count.
     """
     grid, ansatz, displacement = result.grid, result.ansatz, truth.displacement
     mask = np.isfinite(displacement[..., 0])
@@ -188,16 +175,12 @@ def fit_displacement(
     ----------
     displacement
         (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
-    grid
-        Where the pixels are.
-    ansatz, guess
-        The kinematics, and (size,) unknowns to begin with.
+    grid, ansatz, guess
+        The pixels, the kinematics, and (size,) unknowns to begin with.
     mask
         (rows, cols) True where the displacement counts; everywhere by default.
-    options
-        Tolerances and limits.
-    progress
-        Listener.
+    options, progress
+        Tolerances and limits; listener.
 
     Returns
     -------

@@ -22,19 +22,13 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True)
 class Taper:
-    """The factor tau(x) = tau_x(x) tau_y(y) of a mode.
-
-    Parameters
-    ----------
-    cellular
-        Region where tau = 1 [mm].
-    width
-        Distance over which tau falls linearly to 0 outside it [mm]; the paper takes half the
-        size of the unit cell.
-    """
+    """The factor tau(x) = tau_x(x) tau_y(y) of a mode."""
 
     cellular: Box
+    """Region where tau = 1 [mm]."""
     width: float
+    """Distance over which tau falls linearly to 0 outside it [mm]; the paper takes half the size of
+    the unit cell."""
 
     def __post_init__(self) -> None:
         if not self.width > 0:
@@ -61,28 +55,19 @@ PER_WAVE = 5
 
 @dataclass(frozen=True, eq=False)
 class ModeFamily:
-    """A linear map from a mode's parameters to its waves.
-
-    Parameters
-    ----------
-    name
-        What to call the family, e.g. "square, origin at a junction".
-    matrix
-        (5 w, m): C, from the m parameters to A, B, kx, ky, c of each of the w waves.
-    offset
-        (5 w,): P0, what the parameters can't change.
-    start
-        (m,): where a correlation begins.
-    names, units
-        Of the parameters, m each; by default a1, a2, ... and "-".
-    """
+    """A linear map from a mode's parameters to its waves."""
 
     name: str
+    """What to call the family, e.g. "square, origin at a junction"."""
     matrix: FloatArray
+    """(5 w, m): C, from the m parameters to A, B, kx, ky, c of each of the w waves."""
     offset: FloatArray
+    """(5 w,): P0, what the parameters can't change."""
     start: FloatArray
+    """(m,): where a correlation begins."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    """Of the parameters, m each; by default a1, a2, ... and "-"."""
 
     def __post_init__(self) -> None:
         for key in ("matrix", "offset", "start"):
@@ -133,12 +118,8 @@ class ModeFamily:
     def moved(self, shift: ArrayLike) -> ModeFamily:
         """Make the family whose start is this one's moved by ``shift`` (2,) [mm].
 
-        For a specimen whose origin isn't where the mode was found to have its own.
-
-        Raises
-        ------
-        InputError
-            If the family's phases can't follow.
+        For a specimen whose origin isn't where the mode was found to have its own; raises
+        InputError if the family's phases can't follow.
         """
         change = np.zeros((self.wave_count, PER_WAVE))
         change[:, 4] = -self.waves(self.start)[:, 2:4] @ np.asarray(shift, dtype=np.float64)
@@ -152,20 +133,10 @@ class ModeFamily:
 def square_family(origin: str = "junction") -> ModeFamily:
     """Make the paper's Eq. (mode): two waves along the diagonals, seven parameters.
 
-    phi_x = a1 [-sin t1 - sin t2], phi_y = sin t1 - sin t2 with t1 = pi/l (a2 x + a3 y + a6) and
-    t2 = pi/l (a4 x + a5 y + a7); a6 and a7 are in mm.
-
-    Parameters
-    ----------
-    origin
-        What the physical origin is: "junction", the solid between four holes, where a mode
-        starts from [1, 1, 1, -1, 1, 0, 0], or "hole", the centre of a hole,
-        [1, 1, 1, 1, -1, 0, 0].
-
-    Raises
-    ------
-    InputError
-        If the origin is neither.
+    phi_x = a1 [-sin t1 - sin t2], phi_y = sin t1 - sin t2 with t1 = pi/l (a2 x + a3 y + a6) and t2
+    = pi/l (a4 x + a5 y + a7); a6 and a7 are in mm. The origin is a "junction", the solid between
+    four holes, where a mode starts from [1, 1, 1, -1, 1, 0, 0], or the centre of a "hole": [1, 1,
+    1, 1, -1, 0, 0]; anything else raises InputError.
     """
     starts = {"junction": [1, 1, 1, -1, 1, 0, 0], "hole": [1, 1, 1, 1, -1, 0, 0]}
     if origin not in starts:
@@ -266,20 +237,8 @@ FAMILIES: dict[str, Callable[[Specimen], tuple[ModeFamily, ...]]] = {
 def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
     """Make the family in which every wave has its own five parameters.
 
-    An amplitude common to all waves is what v_i already describes, so the largest amplitude
-    of the start is fixed.
-
-    Parameters
-    ----------
-    waves
-        (w, 5): A, B, kx, ky, c to start from.
-    name
-        What to call the family.
-
-    Raises
-    ------
-    InputError
-        If the waves are not of shape (w, 5).
+    An amplitude common to all waves is what v_i already describes, so the largest amplitude of the
+    start, (w, 5) A, B, kx, ky, c, is fixed. Raises InputError if the waves are not of that shape.
     """
     full = np.atleast_2d(np.asarray(waves, dtype=np.float64))
     if full.ndim != 2 or full.shape[1] != PER_WAVE:
@@ -304,23 +263,14 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
 
 @dataclass(frozen=True, eq=False)
 class FourierMode:
-    """A mode phi: a family, its length, its scale and its support.
-
-    Parameters
-    ----------
-    family
-        How the mode's parameters make its waves.
-    half_wavelength
-        l [mm], half the wavelength at k = 1; the paper takes the size of the unit cell.
-    scale
-        s [-].
-    taper
-        Where the mode lives.
-    """
+    """A mode phi: a family, its length, its scale and its support."""
 
     family: ModeFamily
+    """How the mode's parameters make its waves."""
     half_wavelength: float
+    """l [mm], half the wavelength at k = 1; the paper takes the size of the unit cell."""
     scale: float
+    """s [-]."""
     taper: Taper
 
     def __post_init__(self) -> None:
@@ -336,21 +286,8 @@ class FourierMode:
     ) -> FourierMode:
         """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start.
 
-        Parameters
-        ----------
-        family
-            What is free of the waves.
-        half_wavelength
-            l [mm].
-        taper
-            The mode's support.
-        maximum
-            max ||phi|| [-]; the paper's is 0.04.
-
-        Raises
-        ------
-        InputError
-            If that start gives a mode that is zero.
+        The paper's maximum is 0.04, ``half_wavelength`` is l [mm], ``taper`` the mode's support.
+        Raises InputError if the start gives a mode that is zero.
         """
         unit = cls(family, half_wavelength, 1.0, taper)
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family

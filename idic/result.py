@@ -160,20 +160,15 @@ class Result:
     def covariance(self, noise: ImageNoise | float | None = None) -> FloatArray:
         """(n, n) covariance of the unknowns under white noise: for weak noise the Cramer-Rao bound.
 
-        Parameters
-        ----------
-        noise
-            Of the images, or the standard deviation of both [grey levels]; by default
-            :attr:`noise_sd` in both, which makes the residual nothing but noise.
+        The noise is that of the images, or the standard deviation of both [grey levels]; by default
+        :attr:`noise_sd` in both, which makes the residual nothing but noise.
 
-        Notes
-        -----
         s_f^2 + s_g^2/det F, the mean of 1/det F over the pixels, times :attr:`inverse`. Of higher
-        order are two things that noise in the gradient does. The noise of an image is
-        uncorrelated with its own slope at the same pixel and anticorrelated elsewhere, which
-        takes back what that slope seems to scatter. And J'J holds the slope of g's noise: where
-        it is the matrix (least squares), that is taken out. Where the noise isn't given, these
-        are counted if the residual is noise.
+        order are two things that noise in the gradient does. The noise of an image is uncorrelated
+        with its own slope at the same pixel and anticorrelated elsewhere, which takes back what
+        that slope seems to scatter. And J'J holds the slope of g's noise: where it is the matrix
+        (least squares), that is taken out. Where the noise isn't given, these are counted if the
+        residual is noise.
         """
         known = ImageNoise.of(self.noise_sd if noise is None else noise)
         in_f = known.reference**2
@@ -210,11 +205,8 @@ class Result:
     def residual_test(self, noise: ImageNoise | float | None = None) -> ResidualTest:
         """Whether the residual is noise: what the standard errors rest on.
 
-        Parameters
-        ----------
-        noise
-            Of the images, or the standard deviation of both [grey levels], if known; then chi
-            squared is given, too.
+        With the noise of the images, or the standard deviation of both [grey levels], chi squared,
+        too.
         """
         return ResidualTest.of(
             self.residual_rms,
@@ -256,14 +248,8 @@ class Result:
     def residual(self, pair: ImagePair, order: int = 5) -> FloatArray:
         """(rows, cols): f - g(x + u) [grey levels] in the reference frame; NaN off the image.
 
-        Gain and offset are applied to g if they were unknowns.
-
-        Parameters
-        ----------
-        pair
-            Of images on :attr:`grid`.
-        order
-            Of the spline.
+        Of a pair on :attr:`grid`; gain and offset are applied to g if they were unknowns. The order
+        is the spline's.
         """
         if pair.grid.shape != self.grid.shape:
             raise InputError(f"expected images of {self.grid.shape} px, got {pair.grid.shape}")
@@ -279,13 +265,7 @@ class Result:
 
     @classmethod
     def read(cls, path: Path | str) -> Result:
-        """Read what :meth:`write` wrote.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, cut short or of another format.
-        """
+        """Read what :meth:`write` wrote; raises InputError of a missing, cut or foreign file."""
         what, remedy = f"a complete {FORMAT} file", "correlate again"
         with reading(path, what, remedy):
             return cls(**result_fields(read_record(path, FORMAT, what, remedy)))

@@ -82,26 +82,18 @@ FORMULATIONS = ("total", "updated")
 
 @dataclass(frozen=True)
 class PhotographOptions(AnsatzOptions):
-    """Table ``[correlation]`` of an experiment with photographs.
-
-    Parameters
-    ----------
-    family
-        "auto" reads the modes off the spectrum; "square" is the paper's Eq. (mode).
-    fixed_mode
-        Keep phi1 as it is found at first; "auto" does so where no pattern is observable.
-    edge_px, order
-        As in :class:`CorrelationOptions`.
-    formulation
-        "total": every image against the reference. "updated": against the one before, pulled
-        back to the reference's frame; for speckles that change on the way.
-    """
+    """Table ``[correlation]`` of an experiment with photographs."""
 
     family: str = "auto"
+    """Of modes: "auto" reads them off the spectrum; "square" is the paper's Eq. (mode)."""
     fixed_mode: bool | str = "auto"
+    """Keep phi1 as it is found at first; "auto" does so where no pattern is observable."""
     edge_px: int = 3
     order: int | None = None
+    """As in :class:`CorrelationOptions`."""
     formulation: str = "total"
+    """Each image is measured against the reference ("total"), or against the one before, pulled back
+    to the reference's frame ("updated"), for speckles that change on the way."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,26 +122,19 @@ class SquareLatticeOptions(AnsatzOptions):
     """Table ``[correlation]`` of a virtual experiment.
 
     The defaults are the paper's (section "Virtual Experiments"): in square stacking 42 + 28
-    unknowns of v0 and v1, and the mode's 7 make 77.
-
-    Parameters
-    ----------
-    start_amplitude
-        The small constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a
-        pattern of 40 um.
-    camera
-        Correlate the quantised images instead of the float ones.
-    fixed_mode
-        Keep phi1 at the ideal pattern, for images without a pattern to find it from.
-    edge_px, order, gradient, gradient_blur_px
-        As in :class:`CorrelationOptions`.
+    unknowns of v0 and v1, and the mode's 7 make 77. Those without a word are as in
+    :class:`CorrelationOptions`.
     """
 
     start_amplitude: float = 1.0
+    """The small constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a pattern of
+    40 um."""
     edge_px: int = 2
     order: int | None = None
     camera: bool = False
+    """Correlate the quantised images instead of the float ones."""
     fixed_mode: bool = False
+    """Keep phi1 at the ideal pattern, for images without a pattern to find it from."""
     gradient: str | None = None
     gradient_blur_px: float | None = None
 

@@ -1,10 +1,8 @@
-"""Slow fields: Chebyshev polynomials on a box, and gain and offset of the grey levels made of them.
+"""Chebyshev polynomials on a box, and gain and offset of the grey levels made of them.
 
-A field of total degree D is the sum of c_ij T_i(xi) T_j(eta) over i + j <= D, where xi and eta
-run from -1 to 1 across the box: 21 terms for D = 5, 28 for D = 6.
-
-f(x) = (1 + b(x)) g(x + u(x)) + c(x): the gain 1 + b and the offset c vary slowly, as Chebyshev
-polynomials of a total degree over the ansatz's domain.
+A field of total degree D is the sum of c_ij T_i(xi) T_j(eta) over i + j <= D, where xi and eta run
+from -1 to 1 across the box: 21 terms for D = 5, 28 for D = 6. So vary v0, every v_i, and the gain 1
++ b and offset c in f(x) = (1 + b(x)) g(x + u(x)) + c(x).
 """
 
 from __future__ import annotations
@@ -21,17 +19,10 @@ from modeharvest.util.errors import InputError
 def sum_of_products(
     along_x: FloatArray, along_y: FloatArray, out: FloatArray | None = None
 ) -> FloatArray:
-    """Sum over k the products along_x[k] * along_y[k], which broadcast together.
+    """Sum over k the products along_x[k] * along_y[k], (n, ...) each, which broadcast together.
 
-    On an open grid, along_x of shape (n, 1, cols) and along_y of shape (n, rows, 1), it is a
-    matrix product, and some ten times faster than going through all pixels n times.
-
-    Parameters
-    ----------
-    along_x, along_y
-        (n, ...) factors.
-    out
-        Where the sum goes; by default into an array of its own.
+    On an open grid, along_x of shape (n, 1, cols) and along_y of shape (n, rows, 1), it is a matrix
+    product, and some ten times faster than going through all pixels n times.
     """
     if along_x.ndim == 3 and along_x.shape[1] == 1 and along_y.shape[2:] == (1,):
         return np.matmul(along_y[:, :, 0].T, along_x[:, 0, :], out=out)

@@ -27,27 +27,17 @@ from modeharvest.util.files import atomic
 
 @dataclass(frozen=True, eq=False)
 class LocalField:
-    """Displacements at points of the reference image.
-
-    Parameters
-    ----------
-    x, y
-        (n,) positions in the physical frame, y up [mm].
-    u
-        (n, 2) displacements along x and y [mm]; anything where not ``valid``.
-    valid
-        (n,) True where the displacement counts; by default wherever it is finite.
-    sd
-        (n, 2) standard deviations of u [mm]; None if not known.
-    source
-        Where the field comes from.
-    """
+    """Displacements at points of the reference image."""
 
     x: FloatArray
     y: FloatArray
+    """(n,) positions in the physical frame, y up [mm]."""
     u: FloatArray
+    """(n, 2) displacements along x and y [mm]; anything where not ``valid``."""
     valid: BoolArray | None = None
+    """(n,) True where the displacement counts; by default wherever it is finite."""
     sd: FloatArray | None = None
+    """(n, 2) standard deviations of u [mm]; None if not known."""
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -145,11 +135,8 @@ class LocalField:
     def less(self, displacement: Callable[[FloatArray], FloatArray]) -> LocalField:
         """The microfluctuation field w = u − model, with the field's own standard deviations.
 
-        Parameters
-        ----------
-        displacement
-            From (n, 2) points to (n, 2) displacements [mm], as
-            ``partial(ansatz.displacement_at, unknowns)``.
+        The model maps (n, 2) points to (n, 2) displacements [mm], as
+        ``partial(ansatz.displacement_at, unknowns)`` does.
         """
         points = np.column_stack([self.x, self.y])
         where = np.isfinite(points).all(axis=1)
@@ -159,9 +146,7 @@ class LocalField:
 
     @property
     def rms_beyond_noise(self) -> float:
-        """√(rms² − sd²) [mm]: the rms without the field's own errors, at least 0.
-
-        NaN if the standard deviations are not known.
+        """√(rms² − sd²) [mm]: rms without the field's own errors, at least 0; NaN without any sd.
         """
         return float(np.sqrt(np.maximum(0.0, self.rms**2 - self.sd_rms**2)))
 
@@ -169,14 +154,7 @@ class LocalField:
 def without_distortion(field: LocalField, grid: PixelGrid, distortion: Distortion) -> LocalField:
     """The field that an ideal lens would have shown: both ends of every displacement corrected.
 
-    Parameters
-    ----------
-    field
-        Measured on photographs that are not undistorted.
-    grid
-        Their pixels.
-    distortion
-        Of the lens.
+    For fields measured on photographs that are not undistorted; the grid is of their pixels.
     """
     u = np.where(field.good[:, None], field.u, 0.0)
     ideal = field_between(
@@ -275,10 +253,7 @@ def _from_pixels(
 def write_field(path: Path | str, field: LocalField) -> None:
     """Write a field as CSV or NPZ, which :func:`read_field` reads without any options.
 
-    Raises
-    ------
-    InputError
-        If the name does not end in .csv or .npz.
+    Raises InputError if the name does not end in .csv or .npz.
     """
     sd = np.full_like(field.u, np.nan) if field.sd is None else field.sd
     data = np.column_stack([field.x, field.y, field.u, sd, field.good])

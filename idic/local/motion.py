@@ -41,32 +41,20 @@ _ROUNDS = 30
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
-    """Coefficients, and how well they fit.
-
-    Parameters
-    ----------
-    coefficients
-        (c,) or as the unknowns of the ansatz.
-    sd
-        Robust standard deviation of a component's residual (1.4826 times the median) [mm].
-    outliers
-        Number of points more than 5 of these off.
-    """
+    """Coefficients, and how well they fit."""
 
     coefficients: FloatArray
+    """(c,) or as the unknowns of the ansatz."""
     sd: float
+    """Robust standard deviation of a component's residual (1.4826 times the median) [mm]."""
     outliers: int
+    """Number of points more than 5 of these off."""
 
 
 def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
     """Fit linear unknowns so that stray points hardly count (Huber's weights, iterated).
 
-    Parameters
-    ----------
-    matrix
-        (n, c) with n > c.
-    values
-        (n,) what matrix times coefficients should be [mm].
+    The matrix (n, c), n > c, times the coefficients should be the values (n,) [mm].
     """
     weights = np.ones(len(values))
     for _ in range(_ROUNDS):
@@ -93,22 +81,9 @@ def fit_unknowns(
 ) -> RobustFit:
     """Fit v0, and every v_i, to displacements at points; the modes are fixed.
 
-    Parameters
-    ----------
-    ansatz
-        The kinematics.
-    a
-        (size,) unknowns, of which the modes' parameters are taken.
-    field
-        The displacements.
-    v0_degree, v_degree
-        Total degrees that are fitted, at most those of the ansatz; the rest is zero. A negative
-        ``v_degree`` leaves every v_i as it is in ``a``.
-
-    Raises
-    ------
-    InputError
-        If there are fewer components than coefficients.
+    The unknowns ``a`` (size,) are those of the modes' parameters. Higher degrees than those given
+    are zero; a negative ``v_degree`` leaves every v_i as it is in ``a``. Raises InputError if there
+    are fewer components than coefficients.
     """
     a = ansatz.checked(a).copy()
     x, y, u = field.valid_points()
@@ -143,22 +118,10 @@ Slow = Callable[[FloatArray], FloatArray]
 
 
 def first_motion(domain: Box, pair: ImagePair, holes: LocalField | None) -> tuple[Slow, str]:
-    """Find the slow motion from what the images' geometry shows.
+    """Find the slow motion from what the images' geometry shows, and a sentence about it.
 
-    Parameters
-    ----------
-    pair
-        Whose masks are looked at.
-    domain
-        Of the polynomial [mm].
-    pair
-        Images, of which the masks are used.
-    holes
-        Displacements of the holes' centres.
-
-    Returns
-    -------
-    From (..., 2) points to (..., 2) displacements [mm], and a sentence.
+    From the displacements of the holes' centres, by polynomials over the domain [mm], or from the
+    outlines in the masks.
     """
     found = None if holes is None else _through_holes(domain, holes)
     if found is not None:
@@ -198,13 +161,9 @@ def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
 def outline_motion(mask: BoolArray, deformed_mask: BoolArray, grid: PixelGrid) -> FloatArray | None:
     """Affine motion that takes one outline to the other, by centre and second moments.
 
-    The holes are filled, so that it doesn't matter how they close. A rotation or a shear isn't
-    observable in these moments and is taken to be none.
-
-    Returns
-    -------
     (2, 3) u_i = affine[i] · (1, x, y) [mm], [-], [-]; None if material reaches the image's border,
-    where an outline is unknown.
+    where an outline is unknown. The holes are filled, so that it doesn't matter how they close. A
+    rotation or a shear isn't observable in these moments and is taken to be none.
     """
     moments = []
     for inside in (mask, deformed_mask):
@@ -239,25 +198,9 @@ and what it gives instead would spread."""
 def coarse_field(pair: ImagePair, cell_size: float, known: Slow) -> LocalField:
     """Find the displacement between two images roughly, near to what is known of it.
 
-    Parameters
-    ----------
-    pair
-        Images and masks.
-    cell_size
-        l [mm]; limits the blur.
-    known
-        From (..., 2) points to (..., 2) displacements [mm]; the rest should be within some
-        speckles.
-
-    Returns
-    -------
-    LocalField
-        Points on material alone, without standard deviations.
-
-    Raises
-    ------
-    InputError
-        If the known part leads out of the image altogether.
+    At points on material alone, without standard deviations. The cell size l [mm] limits the blur;
+    the motion beyond the known one should be within some speckles. Raises InputError if the known
+    part leads out of the image altogether.
     """
     factor = max(1, round(cell_size / (CELL_PX * pair.grid.pixel_size)))
     level = level_pair(pair, Level(factor, BLUR), 0, 3, normalised=True)

@@ -44,25 +44,11 @@ def predicted_sd(
 ) -> FloatArray:
     """Standard deviations that the residual predicts, (n, 2) [mm].
 
-    The zero-normalised correlation C of a subset gives its residual, 2 (1 − C) of the images'
-    variance. Were it white noise, the displacement's covariance would be that times
-    (Σ ∇f ∇fᵀ)⁻¹ over the subset. Much of it is model error, which is correlated over a speckle: it
-    counts as one independent value per ``speckle_area`` pixels, the area of f's autocorrelation.
-
-    Parameters
-    ----------
-    reference
-        (rows, cols) f.
-    mask
-        (rows, cols) True on material.
-    grid
-        The pixels.
-    field
-        The subsets' centres.
-    correlation
-        (n,) C of each [-]; NaN where lost.
-    subset_px
-        Edge of a subset [px].
+    The zero-normalised correlation C (n,) of a subset gives its residual, 2 (1 − C) of the images'
+    variance. Were it white noise, the displacement's covariance would be that times (Σ ∇f ∇fᵀ)⁻¹
+    over the subset. Much of it is model error, which is correlated over a speckle: it counts as one
+    independent value per ``speckle_area`` pixels, the area of f's autocorrelation. C is NaN where a
+    subset is lost; the mask (rows, cols) is True on material.
     """
     f = np.where(mask, np.asarray(reference, np.float64) - float(reference[mask].mean()), 0.0)
 
@@ -114,36 +100,25 @@ _SIDE = Path(__file__).with_name("pyvale_side.py")
 
 @dataclass(frozen=True)
 class SubsetOptions:
-    """How to correlate subsets.
-
-    Parameters
-    ----------
-    subset_px
-        Edge of a subset, odd [px]: at least three speckles across.
-    step_px
-        Distance of the subsets [px].
-    shape
-        Shape function: "affine", "quad" or "rigid".
-    threshold
-        Least zero-normalised correlation of a subset that counts [-].
-    filling
-        Least share of a subset that is material [-]. pyvale takes the pixels of a hole for
-        speckle, so at less than 1 there are more subsets at holes, and they are worse.
-    largest_px
-        Largest motion along either axis [px]; None: looked up in a rough field of the images
-        (``coarse_field``). pyvale's first windows are twice as large, and fail if they are much
-        larger than need be.
-    threads
-        For pyvale; None: all cores.
-    """
+    """How to correlate subsets."""
 
     subset_px: int = 21
+    """Edge of a subset, odd [px]: at least three speckles across."""
     step_px: int = 5
+    """Distance of the subsets [px]."""
     shape: str = "affine"
+    """Shape function: "affine", "quad" or "rigid"."""
     threshold: float = 0.9
+    """Least zero-normalised correlation of a subset that counts [-]."""
     filling: float = 1.0
+    """Least share of a subset that is material [-]. pyvale takes the pixels of a hole for speckle,
+    so at less than 1 there are more subsets at holes, and they are worse."""
     largest_px: int | None = None
+    """Largest motion along either axis [px]; None: looked up in a rough field of the images
+    (``coarse_field``). pyvale's first windows are twice as large, and fail if they are much larger
+    than need be."""
     threads: int | None = None
+    """For pyvale; None: all cores."""
 
     def __post_init__(self) -> None:
         if self.subset_px < 5 or self.subset_px % 2 == 0 or not 1 <= self.step_px <= self.subset_px:
@@ -176,27 +151,11 @@ def pyvale_python() -> str:
 
 
 def subset_field(pair: ImagePair, options: SubsetOptions | None = None) -> LocalField:
-    """Measure a displacement field by subsets.
+    """Measure a displacement field by subsets, with standard deviations by :func:`predicted_sd`.
 
-    Parameters
-    ----------
-    pair
-        Images; the deformed one's mask only helps to find the largest motion.
-    options
-        Subsets.
-
-    Returns
-    -------
-    LocalField
-        Subsets below the threshold are kept as not valid. The standard deviations are those of
-        :func:`predicted_sd`.
-
-    Raises
-    ------
-    MissingDependencyError
-        If pyvale is not installed.
-    InputError
-        If no subset fits into the material, or pyvale fails.
+    Subsets below the threshold are kept as not valid; the deformed image's mask only helps to find
+    the largest motion. Raises MissingDependencyError if pyvale is not installed, InputError if no
+    subset fits into the material, or pyvale fails.
     """
     options = options or SubsetOptions()
     python = pyvale_python()

@@ -38,16 +38,9 @@ _LOGICAL = {"true": 1.0, "false": 0.0}
 def read_table(path: Path | str) -> Table:
     """Read all the numeric variables of a file, each under its name.
 
-    Parameters
-    ----------
-    path
-        ``.csv``, ``.txt``, ``.dat`` or ``.tsv`` with columns; ``.npz``; ``.h5`` or ``.hdf5``;
-        ``.mat`` of any version. Variables in groups or structures are found by their last name.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, not of its kind, or holds no numbers.
+    ``.csv``, ``.txt``, ``.dat`` or ``.tsv`` with columns; ``.npz``; ``.h5`` or ``.hdf5``; ``.mat``
+    of any version. Variables in groups or structures are found by their last name. Raises
+    InputError if the file is missing, not of its kind, or holds no numbers.
     """
     path = Path(path)
     with reading(path, f"{_WHAT} ({path.suffix})", _REMEDY):
@@ -234,27 +227,17 @@ _UNITS = {"px": "px", "pixel": "px", "pixels": "px", "pix": "px", "mm": "mm"}
 
 @dataclass(frozen=True)
 class Column:
-    """The meaning of a column's name.
-
-    Parameters
-    ----------
-    name
-        As in the file.
-    role
-        "x", "y", "u", "v", "sd_u", "sd_v", "sigma" or "valid"; None for any other.
-    unit
-        "px" or "mm", None if the name doesn't state it.
-    y_axis
-        "up" or "down", None if the name doesn't state it.
-    of_image_code
-        Whether only codes that measure everything in pixels use this name.
-    """
+    """The meaning of a column's name."""
 
     name: str
     role: str | None
+    """One of :data:`ALL_ROLES`; None for any other."""
     unit: str | None
+    """Stated by the name, "px" or "mm"; else None."""
     y_axis: str | None
+    """Stated by the name, "up" or "down"; else None."""
     of_image_code: bool = False
+    """Whether only codes that measure everything in pixels use this name."""
 
 
 def column(name: str) -> Column:
@@ -289,12 +272,10 @@ def _as_x(base: str) -> str:
 def choose(
     names: list[str], given: Mapping[str, str | int], units: str | None, where: str
 ) -> dict[str, Column]:
-    """Decide which column plays which role.
+    """Decide which of a file's columns plays which role.
 
     Parameters
     ----------
-    names
-        All columns of the file.
     given
         Names, or numbers from 1, of roles that the user knows.
     units

@@ -56,18 +56,11 @@ def _require_area(corners: Corners, where: str) -> None:
 
 @dataclass(frozen=True)
 class RegionTable:
-    """A part of the specimen with a pattern, and modes, of its own.
-
-    Parameters
-    ----------
-    name
-        In the report.
-    polygon
-        Corners (column, row) in the reference image [px]; the modes live in the box around them.
-    """
+    """A part of the specimen with a pattern, and modes, of its own."""
 
     name: str = ""
     polygon: Corners = ()
+    """Corners (column, row) in the reference image [px]; the modes live in the box around them."""
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -77,31 +70,21 @@ class RegionTable:
 
 @dataclass(frozen=True)
 class SpecimenTable:
-    """What is known of the specimen beforehand.
-
-    Parameters
-    ----------
-    cell_size
-        l [mm], the distance of neighbouring holes.
-    polygon
-        Corners (column, row) of the cellular part in the reference image [px]; found from the
-        holes otherwise.
-    cells
-        Or a mask image of the cellular part, white inside.
-    material
-        Mask image of the reference's material, white on it; found from the image otherwise.
-    deformed_material
-        The same of each deformed image, in their order; names may hold wildcards.
-    regions
-        Parts of the cellular part whose patterns differ; by default it has one pattern.
-    """
+    """What is known of the specimen beforehand."""
 
     cell_size: float = math.nan
+    """l [mm], the distance of neighbouring holes."""
     polygon: Corners = ()
+    """Corners (column, row) of the cellular part in the reference image [px]; found from the holes
+    otherwise."""
     cells: str = ""
+    """Or a mask image of the cellular part, white inside."""
     material: str = ""
+    """Mask image of the reference's material, white on it; found from the image otherwise."""
     deformed_material: tuple[str, ...] = ()
+    """The same of each deformed image, in their order; names may hold wildcards."""
     regions: tuple[RegionTable, ...] = ()
+    """Parts of the cellular part whose patterns differ; by default it has one pattern."""
 
     def __post_init__(self) -> None:
         if not self.cell_size > 0:
@@ -130,43 +113,26 @@ _OVERLAP = 0.5
 
 @dataclass(frozen=True)
 class Part:
-    """Where modes live.
-
-    Parameters
-    ----------
-    name
-        Of a part with a pattern of its own; "" for the whole cellular part.
-    box
-        Around it [mm].
-    """
+    """Where modes live."""
 
     name: str
+    """Of a part with a pattern of its own; "" for the whole cellular part."""
     box: Box
+    """Around it [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The specimen as the reference shows it.
-
-    Parameters
-    ----------
-    grid
-        The pixels.
-    mask
-        (rows, cols) True on material.
-    lattice
-        Of the holes; None where there is none and the region was given.
-    region
-        The cellular part.
-    parts
-        Of the cellular part, each with modes of its own; one by default.
-    """
+    """The specimen as the reference shows it."""
 
     grid: PixelGrid
     mask: BoolArray
+    """(rows, cols) True on material."""
     lattice: HoleLattice | None
+    """Of the holes; None where there is none and the region was given."""
     region: Region
     parts: tuple[Part, ...]
+    """Of the cellular part, each with modes of its own; one by default."""
 
     @property
     def lattice_mm(self) -> FloatArray | None:
@@ -189,12 +155,8 @@ class Geometry:
         """How the holes may have moved in a deformed image, the likeliest first.
 
         Nothing where they can't be followed, and why. See
-        :func:`modeharvest.idic.photograph.matching.possible_motions`.
-
-        Parameters
-        ----------
-        mask
-            (rows, cols) True on material of the deformed image.
+        :func:`modeharvest.idic.photograph.matching.possible_motions`; the mask (rows, cols) is True
+        on material of the deformed image.
         """
         if self.lattice is None:
             return (), "The reference shows no lattice of holes to follow."
@@ -207,11 +169,8 @@ class Geometry:
 def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: Path) -> Geometry:
     """Find holes, lattice and cellular part in the reference's material (rows, cols).
 
-    Raises
-    ------
-    InputError
-        If the holes contradict the cell size, there is no lattice and no region is given, or
-        given parts lie outside the image or on one another.
+    Raises InputError if the holes contradict the cell size, there is no lattice and no region is
+    given, or given parts lie outside the image or on one another.
     """
     lattice: HoleLattice | None = None
     try:
@@ -276,13 +235,8 @@ def _require_apart(parts: tuple[Part, ...], cell_size: float) -> None:
 def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | None, str]:
     """How the holes have moved, and a text about it; None where they can't be followed.
 
-    Where a column of holes has left the image, the holes alone allow several answers; the
-    speckle between them decides.
-
-    Raises
-    ------
-    InputError
-        If the images don't show the same surface.
+    Where a column of holes has left the image, the holes alone allow several answers; the speckle
+    between them decides. Raises InputError if the images don't show the same surface.
     """
     motions, why_not = geometry.motions_in(pair.masks[1])
     if not motions:
@@ -298,10 +252,7 @@ def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | Non
 def confirmed_by_speckle(pair: ImagePair, expected: Expected) -> str:
     """A text about blocks of the reference that were found where they are expected.
 
-    Raises
-    ------
-    InputError
-        If the images don't show the same surface.
+    Raises InputError if the images don't show the same surface.
     """
     blocks = match_blocks(pair.reference, pair.deformed, pair.mask, expected)
     require_same_surface(blocks, "the reference", "the deformed one")

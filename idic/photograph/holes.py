@@ -25,24 +25,16 @@ _MUCH_SMALLER = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Holes:
-    """Holes of one image.
-
-    Parameters
-    ----------
-    centres
-        (n, 2) centroids, (row, col) [px].
-    areas
-        (n,) [px^2].
-    too_small
-        Number of openings left out because the others are much larger.
-    at_border
-        Number of openings that reach the image's border: background, or holes cut off.
-    """
+    """Holes of one image."""
 
     centres: FloatArray
+    """(n, 2) centroids, (row, col) [px]."""
     areas: FloatArray
+    """(n,) [px^2]."""
     too_small: int
+    """Number of openings left out because the others are much larger."""
     at_border: int
+    """Number of openings that reach the image's border: background, or holes cut off."""
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -54,19 +46,10 @@ class Holes:
 
 
 def find_holes(mask: ArrayLike, smallest_px2: float | None = None) -> Holes:
-    """Find the holes in a mask.
+    """Find the holes in a mask (rows, cols), True on material.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material.
-    smallest_px2
-        Least area of a hole [px^2]; by default a quarter of the typical one.
-
-    Raises
-    ------
-    InputError
-        If the mask is not plane, or has no material or nothing else in it.
+    Holes have at least ``smallest_px2`` [px^2], by default a quarter of the typical area. Raises
+    InputError if the mask is not plane, or has no material or nothing else in it.
     """
     material = np.asarray(mask, dtype=np.bool_)
     if material.ndim != 2:
@@ -105,18 +88,10 @@ locally, strain differs from the mean by 10 %, and holes are moulded a little of
 
 
 def spanning_vectors(spots: FloatArray) -> FloatArray | None:
-    """The two shortest vectors that span the lattice on which most of some points lie.
+    """The two shortest vectors that span the lattice on which most of some points (n, 2) lie.
 
-    Parameters
-    ----------
-    spots
-        (n, 2) positions, (up, right) [px].
-
-    Returns
-    -------
-    ndarray or None
-        (2, 2) vectors as rows, (up, right) [px], the first to the right and the second upwards;
-        None if the points lie in one row.
+    (2, 2) vectors as rows, the first to the right and the second upwards, like the points (up,
+    right) [px]; None if the points lie in one row.
     """
     tree = KDTree(spots)
     distance, neighbour = tree.query(spots, k=min(9, len(spots)))
@@ -188,39 +163,24 @@ class HoleLattice:
     """Holes and the lattice they lie on.
 
     The centre of hole (i, j) is ``origin + i vectors[0] + j vectors[1]`` within ``misfit_px``.
-
-    Parameters
-    ----------
-    centres
-        (n, 2) hole centres on the lattice, (row, col) [px].
-    index
-        (n, 2) integers (i, j) from 0: i to the right, j upwards.
-    vectors
-        (2, 2) lattice vectors as rows, each (row, col) [px], of the best straight lattice.
-    origin
-        (2,) (row, col) of (0, 0) [px].
-    diameters
-        (n,) of circles with the holes' areas [px].
-    missing
-        (m, 2) indices of lattice points amid the others without a hole.
-    extra
-        (k, 2) centres of holes that are not on the lattice, (row, col) [px].
-    misfit_px
-        Rms distance of the centres from the straight lattice [px].
-    kind
-        "square", "hexagonal", "rectangular" or "oblique".
-    text
-        What was found.
     """
 
     centres: FloatArray
+    """(n, 2) hole centres on the lattice, (row, col) [px]."""
     index: IntArray
+    """(n, 2) integers (i, j) from 0: i to the right, j upwards."""
     vectors: FloatArray
+    """(2, 2) lattice vectors as rows, each (row, col) [px], of the best straight lattice."""
     origin: FloatArray
+    """(2,) (row, col) of (0, 0) [px]."""
     diameters: FloatArray
+    """(n,) of circles with the holes' areas [px]."""
     missing: IntArray
+    """(m, 2) indices of lattice points amid the others without a hole."""
     extra: FloatArray
+    """(k, 2) centres of holes that are not on the lattice, (row, col) [px]."""
     misfit_px: float
+    """Rms distance of the centres from the straight lattice [px]."""
     kind: Kind
     text: tuple[str, ...]
 
@@ -250,19 +210,10 @@ class HoleLattice:
 
 
 def find_hole_lattice(mask: ArrayLike, cell_px: float | None = None) -> HoleLattice:
-    """Find the lattice in a mask.
+    """Find the lattice in a mask (rows, cols), True on material.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material.
-    cell_px
-        The cell size if it is known [px], to be compared with what is found.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than four holes, no lattice in them, or another cell size.
+    The cell size [px], if it is known, is compared with what is found. Raises InputError if there
+    are fewer than four holes, no lattice in them, or another cell size.
     """
     return lattice_of(find_holes(mask), cell_px)
 

@@ -53,37 +53,24 @@ FIXED_AMPLITUDE = 1.0
 
 @dataclass(frozen=True, eq=False)
 class InitialMode:
-    """A mode of an initial guess.
-
-    Parameters
-    ----------
-    family
-        Its start is the pattern.
-    amplitude
-        What the family's waves at its start are to be multiplied by, with sign [mm].
-    box
-        The region [mm].
-    """
+    """A mode of an initial guess."""
 
     family: ModeFamily
+    """Its start is the pattern."""
     amplitude: float
+    """What the family's waves at its start are to be multiplied by, with sign [mm]."""
     box: Box
+    """The region [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegionPattern:
-    """The pattern of a part of the specimen, and the modes made of it.
-
-    Parameters
-    ----------
-    pattern
-        What the spectrum of the field there shows.
-    modes
-        Of the ansatz; those of all regions follow one another.
-    """
+    """The pattern of a part of the specimen, and the modes made of it."""
 
     pattern: WavePattern
+    """What the spectrum of the field there shows."""
     modes: tuple[InitialMode, ...]
+    """Of the ansatz; those of all regions follow one another."""
 
     @property
     def text(self) -> tuple[str, ...]:
@@ -99,29 +86,15 @@ class RegionPattern:
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Where a correlation begins, and how that was found.
-
-    Parameters
-    ----------
-    ansatz
-        With the modes found.
-    unknowns
-        (size,) for :func:`modeharvest.idic.correlate.correlate`.
-    regions
-        One or more, with their patterns.
-    local
-        The field that it was found from.
-    fixed
-        Whether the modes are fixed because no pattern is observable.
-    text
-        What was found.
-    """
+    """Where a correlation begins, and how that was found."""
 
     ansatz: Ansatz
     unknowns: FloatArray
+    """(size,) for :func:`modeharvest.idic.correlate.correlate`."""
     regions: tuple[RegionPattern, ...]
     local: LocalField
     fixed: bool
+    """Whether the modes are fixed because no pattern is observable."""
     text: tuple[str, ...]
 
     @property
@@ -150,8 +123,6 @@ def initial_guess(
 
     Parameters
     ----------
-    pair
-        The images.
     cell_size
         l, the distance of neighbouring holes [mm].
     cellular

@@ -35,21 +35,13 @@ _RIVAL = 0.8
 
 @dataclass(frozen=True, eq=False)
 class HoleMotion:
-    """The same holes in two images.
-
-    Parameters
-    ----------
-    before, after
-        (n, 2) centres in the reference and in the deformed image, (row, col) [px].
-    rivals
-        Number of other ways to lay the lattices on each other that match as many holes.
-    text
-        What was matched.
-    """
+    """The same holes in two images."""
 
     before: FloatArray
     after: FloatArray
+    """(n, 2) centres in the reference and in the deformed image, (row, col) [px]."""
     rivals: int
+    """Number of other ways to lay the lattices on each other that match as many holes."""
     text: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -60,10 +52,9 @@ class HoleMotion:
         return field_between(self.before, self.after, grid, "centres of holes")
 
     def at(self, points: ArrayLike) -> FloatArray:
-        """Where positions (n, 2) (row, col) of the reference have moved to, from the holes around.
+        """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px].
 
-        Between the holes the displacement is interpolated by linear radial functions and a plane
-        [px].
+        Between the holes the displacement is interpolated by linear radial functions and a plane.
         """
         where = np.asarray(points, dtype=np.float64)
         between = RBFInterpolator(self.before, self.after - self.before, kernel="linear", degree=1)
@@ -73,14 +64,10 @@ class HoleMotion:
 def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[HoleMotion, ...]:
     """All ways to lay the deformed lattice on the reference's, the likeliest first.
 
-    Lattices look alike when moved by a whole cell; what decides is how many holes find a
-    partner, then the shorter mean displacement. If the outer rows of a specimen leave the
-    image, several ways match as many, and only the speckle can decide.
-
-    Raises
-    ------
-    InputError
-        If the lattices can't be the same specimen's.
+    Lattices look alike when moved by a whole cell; what decides is how many holes find a partner,
+    then the shorter mean displacement. If the outer rows of a specimen leave the image, several
+    ways match as many, and only the speckle can decide. Raises InputError if the lattices can't be
+    the same specimen's.
     """
     index = _in_basis_of(reference, deformed)
     steps = Counter(
@@ -167,26 +154,18 @@ _CLEAR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class BlockMatch:
-    """Blocks of the reference, found in the deformed image or not.
-
-    Parameters
-    ----------
-    before, after
-        (n, 2) block centres in the reference and where they correlate best, (row, col) whole
-        pixels.
-    correlation
-        (n,) normalised cross-correlation there [-].
-    chance
-        Correlation that 95 % of the blocks stay below where they can't be [-].
-    block_px
-        Edge of a block [px].
-    """
+    """Blocks of the reference, found in the deformed image or not."""
 
     before: FloatArray
     after: FloatArray
+    """(n, 2) block centres in the reference and where they correlate best, (row, col) whole pixels.
+    """
     correlation: FloatArray
+    """(n,) normalised cross-correlation there [-]."""
     chance: float
+    """Correlation that 95 % of the blocks stay below where they can't be [-]."""
     block_px: int
+    """Edge of a block [px]."""
 
     @property
     def found(self) -> BoolArray:
@@ -224,12 +203,10 @@ def match_blocks(
     expected: Expected | None = None,
     reach_px: int = REACH_PX,
 ) -> BlockMatch:
-    """Look for blocks of the reference in the deformed image.
+    """Look for blocks of the reference in the deformed image, (rows, cols) both.
 
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels.
     mask
         (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
     expected
@@ -327,11 +304,8 @@ def _turned(f: FloatImage, centre: NDArray[np.int64], half: int) -> FloatImage:
 def _correlation(window: FloatImage, blocks: FloatImage) -> FloatArray:
     """Normalised cross-correlation of blocks (n, k, k) everywhere in a window (rows, cols).
 
-    As ``skimage.feature.match_template``, which would transform the window anew for each block.
-
-    Returns
-    -------
-    (n, rows - k + 1, cols - k + 1); 0 where a block or what it lies on is of one grey.
+    As ``skimage.feature.match_template``, which would transform the window anew for each block: (n,
+    rows - k + 1, cols - k + 1), 0 where a block or what it lies on is of one grey.
     """
     k = blocks.shape[-1]
     shape = tuple(next_fast_len(size, real=True) for size in window.shape)

@@ -92,20 +92,14 @@ _SLIGHTEST = 0.02
 
 @dataclass(frozen=True)
 class MaterialOptions:
-    """How material is distinguished from background.
-
-    Parameters
-    ----------
-    window_px
-        Size of the square in which the speckle's contrast is looked at [px]: two to three
-        speckles across, and well below a hole's diameter.
-    reach_px
-        Radius that a hole is at least as round as [px]. Where the background is as dark or as
-        bright as some speckles, nothing but this keeps such speckles at its edge apart from it.
-    """
+    """How material is distinguished from background."""
 
     window_px: int = 25
+    """Size of the square in which the speckle's contrast is looked at [px]: two to three speckles
+    across, and well below a hole's diameter."""
     reach_px: float = 10.0
+    """Radius that a hole is at least as round as [px]. Where the background is as dark or as bright
+    as some speckles, nothing but this keeps such speckles at its edge apart from it."""
 
     def __post_init__(self) -> None:
         if self.window_px < 5 or not 1.0 <= self.reach_px <= 0.5 * self.window_px:
@@ -117,41 +111,23 @@ class MaterialOptions:
 
 @dataclass(frozen=True, eq=False)
 class MaterialMask:
-    """The material found in an image.
-
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material.
-    contrast_ratio
-        Contrast of the speckle over what varies in the background [-]; infinity without one.
-    alike_share
-        Share of the material whose grey level could be the background's [-]: there the edge is
-        a guess by its neighbourhood.
-    text
-        How it was found.
-    """
+    """The material found in an image."""
 
     mask: BoolArray
+    """(rows, cols) True on material."""
     contrast_ratio: float
+    """Contrast of the speckle over what varies in the background [-]; infinity without one."""
     alike_share: float
+    """Share of the material whose grey level could be the background's [-]: there the edge is a
+    guess by its neighbourhood."""
     text: tuple[str, ...]
 
 
 def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> MaterialMask:
-    """Find the material in an image of a speckled specimen.
+    """Find the material in an image (rows, cols) of a speckled specimen, grey levels in any unit.
 
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels, in any unit.
-    options
-        How.
-
-    Raises
-    ------
-    InputError
-        If the image is not a finite plane one larger than the window, or shows no speckle.
+    Raises InputError if the image is not a finite plane one larger than the window, or shows no
+    speckle.
     """
     options = options or MaterialOptions()
     grey = _checked(image, options)

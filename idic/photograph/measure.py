@@ -57,12 +57,7 @@ def image_noise(pair: ImagePair, camera: CameraNoise) -> ImageNoise:
 def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: int) -> ResidualTest:
     """Test the residual of the unfiltered photographs against their noise.
 
-    Parameters
-    ----------
-    result, pair, noise
-        What was measured on photographs, and their noise.
-    edge_px
-        Pixels so near to a hole are left out [px].
+    Pixels closer than ``edge_px`` to a hole are left out.
     """
     if result.final_smoothing is None or result.final_smoothing.blur_px == 0.0:
         return result.residual_test(noise)
@@ -82,22 +77,11 @@ def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: i
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPhotograph:
-    """What came out of one photograph.
-
-    Parameters
-    ----------
-    result
-        Of the correlation.
-    local
-        The displacement field behind the initial guess, a local DIC's if there is one.
-    fixed
-        Whether the mode was fixed.
-    text
-        Initial guess and final smoothing.
-    """
+    """What came out of one photograph."""
 
     result: Result
     local: LocalField
+    """The displacement field behind the initial guess, a local DIC's if there is one."""
     fixed: bool
     text: tuple[str, ...]
 
@@ -115,10 +99,6 @@ def measure(
 
     Parameters
     ----------
-    pair
-        Of images.
-    geometry
-        Of the specimen.
     cell_size
         l [mm].
     how
@@ -129,8 +109,6 @@ def measure(
         What came out of the photograph before. If it shows all waves that are observed now, its
         ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
         found anew.
-    progress
-        Listener.
 
     Raises
     ------
@@ -225,21 +203,11 @@ _BAND = 64
 def warped_back(
     deformed: NDArray[Any], result: Result, order: int = 5
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Show a deformed image in the frame of the reference.
+    """Show a deformed image g (rows, cols) in the frame of the reference.
 
-    Parameters
-    ----------
-    deformed
-        (rows, cols) g [grey levels].
-    result
-        The measured displacement, and gain and offset if they were unknowns.
-    order
-        Of the spline, 3 or 5.
-
-    Returns
-    -------
-    image, inside
-        (rows, cols) (1 + b) g(x + u) + c, and where x + u lies inside the image.
+    (rows, cols) (1 + b) g(x + u) + c [grey levels] with a result's displacement, and gain and
+    offset if they were unknowns; and where x + u lies inside the image. The order is the spline's,
+    3 or 5.
     """
     grid, ansatz, a = result.grid, result.ansatz, result.unknowns
     spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)

@@ -32,34 +32,20 @@ _SOME = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The cellular part of a specimen.
-
-    Parameters
-    ----------
-    cellular
-        Smallest axis-parallel box around the cellular part [mm].
-    domain
-        Box around all material in the image [mm].
-    text
-        Where the region comes from, and what is odd about it.
-    """
+    """The cellular part of a specimen."""
 
     cellular: Box
+    """Smallest axis-parallel box around the cellular part [mm]."""
     domain: Box
+    """Box around all material in the image [mm]."""
     text: tuple[str, ...]
+    """Where the region comes from, and what is odd about it."""
 
 
 def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) -> Region:
     """Make the region from the holes: every hole's cell, half a lattice vector each way.
 
-    Parameters
-    ----------
-    lattice
-        In the reference image.
-    mask
-        (rows, cols) True on material of the reference.
-    grid
-        Its pixels.
+    Lattice and mask, (rows, cols) True on material, are of the reference.
     """
     reach = 0.5 * np.abs(lattice.vectors).max(axis=0)  # rows and columns of a cell
     low, high = lattice.centres.min(axis=0) - reach, lattice.centres.max(axis=0) + reach
@@ -71,21 +57,9 @@ def region_of_lattice(lattice: HoleLattice, mask: ArrayLike, grid: PixelGrid) ->
 
 
 def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
-    """Make the region from a polygon drawn by hand.
+    """Make the region from a polygon drawn by hand, (n, 2) corners in order, (row, col) [px].
 
-    Parameters
-    ----------
-    polygon
-        (n, 2) corners in order, (row, col) [px], at least three.
-    mask
-        (rows, cols) True on material of the reference.
-    grid
-        Its pixels.
-
-    Raises
-    ------
-    InputError
-        If it has no area, leaves the image, or holds hardly any material.
+    Raises InputError if it has no area, leaves the image, or holds hardly any material.
     """
     corners = np.asarray(polygon, dtype=np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -108,21 +82,9 @@ def region_of_polygon(polygon: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> R
 
 
 def region_of_mask(region: ArrayLike, mask: ArrayLike, grid: PixelGrid) -> Region:
-    """Make the region from a mask image: True where the specimen is cellular, holes or not.
+    """Make the region from a mask image (rows, cols): True where the specimen is cellular.
 
-    Parameters
-    ----------
-    region
-        (rows, cols) True on the cellular part.
-    mask
-        (rows, cols) True on material of the reference.
-    grid
-        Its pixels.
-
-    Raises
-    ------
-    InputError
-        If it has another size, or holds hardly any material.
+    Raises InputError if it has another size, or holds hardly any material.
     """
     inside = np.asarray(region, dtype=np.bool_)
     if inside.shape != grid.shape:
@@ -220,24 +182,16 @@ _SMALLEST_HOLE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The lattice of holes.
-
-    Parameters
-    ----------
-    cell_size
-        l, the distance of neighbouring holes [mm].
-    vectors
-        (2, 2) lattice vectors as rows [mm].
-    given
-        Whether they were given, or are square for want of better knowledge.
-    hole
-        (2,) centre of one hole [mm].
-    """
+    """The lattice of holes."""
 
     cell_size: float
+    """l, the distance of neighbouring holes [mm]."""
     vectors: FloatArray
+    """(2, 2) lattice vectors as rows [mm]."""
     given: bool
+    """Whether they were given, or are square for want of better knowledge."""
     hole: FloatArray
+    """(2,) centre of one hole [mm]."""
 
     @classmethod
     def found(
@@ -308,10 +262,8 @@ def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
 def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
 
-    Raises
-    ------
-    InputError
-        If the lattice given isn't one, or its shortest distance isn't the cell size within 7 %.
+    Raises InputError if the lattice given isn't one, or its shortest distance isn't the cell size
+    within 7 %.
     """
     if lattice is None:
         return cell_size * np.eye(2)

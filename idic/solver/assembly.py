@@ -40,27 +40,18 @@ BANDS = 64
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """The quadratic model of the cost 1/2 sum r^2 around some unknowns.
-
-    Parameters
-    ----------
-    matrix
-        (n, n): J'J, where J is minus the derivative of the residual; zero if not asked for.
-    gradient
-        (n,): -J'r, the derivative of the cost.
-    cost
-        1/2 sum r^2 over the pixels used.
-    pixels
-        Number of pixels used; a displacement fit counts its two components as two.
-    outside_image
-        Number of pixels whose deformed position is outside the image.
-    """
+    """The quadratic model of the cost 1/2 sum r^2 around some unknowns."""
 
     matrix: FloatArray
+    """(n, n): J'J, where J is minus the derivative of the residual; zero if not asked for."""
     gradient: FloatArray
+    """(n,): -J'r, the derivative of the cost."""
     cost: float
+    """1/2 sum r^2 over the pixels used."""
     pixels: int
+    """Number of pixels used; a displacement fit counts its two components as two."""
     outside_image: int
+    """Number of pixels whose deformed position is outside the image."""
 
     @property
     def mean_square(self) -> float:
@@ -79,25 +70,15 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """What stays the same from one iteration to the next: ansatz, pixels and tables.
-
-    Parameters
-    ----------
-    ansatz
-        The kinematics.
-    grid
-        Where the pixels are.
-    mask
-        (rows, cols) True where there is material.
-    outside
-        Number of further pixels that were mapped outside the deformed image when the pixels were
-        chosen: they take no part, but count as having left.
-    """
+    """What stays the same from one iteration to the next: ansatz, pixels and tables."""
 
     ansatz: Ansatz
     grid: PixelGrid
     mask: BoolArray
+    """(rows, cols) True where there is material."""
     outside: int = 0
+    """Number of further pixels that were mapped outside the deformed image when the pixels were
+    chosen: they take no part, but count as having left."""
 
     def __post_init__(self) -> None:
         if self.mask.shape != self.grid.shape:
@@ -176,18 +157,14 @@ class Assembly:
 
         Parameters
         ----------
-        a
-            (size,) unknowns.
-        reference
-            (rows, cols): f, float32 or float64.
-        deformed
-            g.
+        a, reference, deformed
+            (size,) unknowns, f (rows, cols) in float32 or float64, and g.
         with_matrix
             Without the matrix the pass costs about half as much.
         instrument
-            (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and
-            y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
-            being its products with the derivatives of the displacement and of the gain.
+            (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and y
+            [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h being
+            its products with the derivatives of the displacement and of the gain.
         share
             How much of h is the instrument; the rest is g's own [-].
         """
@@ -199,14 +176,7 @@ class Assembly:
     ) -> NormalEquations:
         """Assemble the normal equations of r = target - u(a), both components.
 
-        Parameters
-        ----------
-        a
-            (size,) unknowns.
-        target
-            (rows, cols, 2) displacement [mm].
-        with_matrix
-            Whether the matrix is wanted.
+        The target is a displacement (rows, cols, 2) [mm].
         """
 
         def along(component: int) -> NormalEquations:
@@ -263,23 +233,8 @@ def valid_pixels(
 ) -> tuple[BoolArray, int]:
     """Keep the pixels that the unknowns map onto material of the deformed image.
 
-    Parameters
-    ----------
-    assembly
-        Ansatz and pixels.
-    a
-        (size,) unknowns.
-    reference, deformed
-        f and g.
-    valid
-        (rows, cols) where g may be sampled.
-
-    Returns
-    -------
-    kept
-        (rows, cols).
-    outside
-        Number of the others that are mapped outside the deformed image.
+    Returns (rows, cols) True on those kept of the assembly's, ``valid`` being where g may be
+    sampled, and the number of the others that are mapped outside the deformed image.
     """
     kept = assembly.mask.copy()
     nothing = np.zeros((0, 0, 0), dtype=np.float32)
@@ -312,16 +267,8 @@ def warped_back(
 def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32]) -> None:
     """Turn slopes at X into those at x = X + u of what moves along: F^-T times them, in place.
 
-    F by central differences of u between neighbouring pixels.
-
-    Parameters
-    ----------
-    assembly
-        Ansatz and grid; pixels beyond those that count are turned, too.
-    a
-        (size,) unknowns.
-    slopes
-        (2 or more, rows, cols) along x and y.
+    F by central differences of u between neighbouring pixels; pixels beyond those that count are
+    turned, too. The slopes are (2 or more, rows, cols), along x and y first.
     """
     everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)

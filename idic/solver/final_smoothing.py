@@ -1,10 +1,10 @@
 """Final smoothing: the last level's blur where the model error is large for the speckle size.
 
-A correlation weighs the model error w by the grey-level gradient, as long as w is
-short against a speckle: beyond that the grey levels have nothing more to tell, parts of the image
-that match badly lose their weight, and the result moves away from the best fit of the ansatz.
-Speckles that are much finer than w is long have to be blurred first. What that costs is noise,
-of which there is little against w.
+A correlation weighs the model error w by the grey-level gradient, as long as w is short against a
+speckle: beyond that the grey levels have nothing more to tell, parts of the image that match badly
+lose their weight, and the result moves away from the best fit of the ansatz. Speckles that are much
+finer than w is long have to be blurred first. What that costs is noise, of which there is little
+against w.
 """
 
 from __future__ import annotations
@@ -31,17 +31,8 @@ _LINES = 256
 def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     """Full width at half maximum of the autocorrelation of an image's material [px].
 
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels.
-    mask
-        (rows, cols) True on material; None for everywhere.
-
-    Returns
-    -------
-    float
-        At most twice the largest lag looked at, 128 px; that for an image without contrast, too.
+    The mask (rows, cols) is True on material; None for everywhere. At most twice the largest lag
+    looked at, 128 px; that for an image without contrast, too.
     """
     mask = np.ones(image.shape, dtype=np.bool_) if mask is None else mask
     inner = eroded(mask, _SPECKLE_EDGE_PX)
@@ -86,21 +77,14 @@ _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 @dataclass(frozen=True)
 class FinalSmoothing:
-    """Which images the last level compares.
-
-    Parameters
-    ----------
-    speckle_size_px
-        Full width at half maximum of the speckle's autocorrelation [px].
-    model_error_px
-        Estimate of w on a coarser level, rms per component [px].
-    blur_px
-        Standard deviation of the blur [px]; 0 for none.
-    """
+    """Which images the last level compares."""
 
     speckle_size_px: float
+    """Full width at half maximum of the speckle's autocorrelation [px]."""
     model_error_px: float
+    """Estimate of w on a coarser level, rms per component [px]."""
     blur_px: float
+    """Standard deviation of the blur [px]; 0 for none."""
 
     @classmethod
     def of(cls, pair: ImagePair, model_error_px: float) -> FinalSmoothing:
@@ -134,12 +118,7 @@ class FinalSmoothing:
 def smoothed_pair(pair: ImagePair, blur_px: float) -> ImagePair:
     """Both images blurred over their material and locally normalised, in f's grey levels.
 
-    Parameters
-    ----------
-    pair
-        Of images.
-    blur_px
-        Standard deviation [px]; 0 for the pair itself.
+    The blur's standard deviation is in px; 0 gives the pair itself.
     """
     if blur_px == 0.0:
         return pair

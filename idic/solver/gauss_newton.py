@@ -74,32 +74,21 @@ _EXPLANATIONS = {
 
 @dataclass(frozen=True)
 class GaussNewtonOptions:
-    """When to stop, and how patient to be.
-
-    Parameters
-    ----------
-    tolerance_px
-        Converged once a step changes the displacement by less than this, rms [px]. The error
-        left is no larger than about the last step. 1e-4 px is a hundredth of the best noise
-        floor of DIC.
-    coarse_tolerance_px
-        The same in *binned* px on the coarse levels, which only have to lead to the next.
-    tolerance_errors
-        Converged, too, where no step lowers the cost any more and the last one was that short,
-        rms over the unknowns in standard errors, the residual being taken for noise: the
-        relative offset of Bates & Watts, Technometrics 23 (1981), doi
-        10.1080/00401706.1981.10486254.
-    max_iterations
-        On each level.
-    max_outside
-        Fraction of the pixels that may be mapped outside the deformed image [-].
-    """
+    """When to stop, and how patient to be."""
 
     tolerance_px: float = 1e-4
+    """Converged once a step changes the displacement by less than this, rms [px]. The error left is
+    no larger than about the last step. 1e-4 px is a hundredth of the best noise floor of DIC."""
     coarse_tolerance_px: float = 1e-2
+    """The same in *binned* px on the coarse levels, which only have to lead to the next."""
     tolerance_errors: float = 0.01
+    """Converged, too, where no step lowers the cost any more and the last one was that short, rms
+    over the unknowns in standard errors, the residual being taken for noise: the relative offset of
+    Bates & Watts, Technometrics 23 (1981), doi 10.1080/00401706.1981.10486254."""
     max_iterations: int = 50
+    """On each level."""
     max_outside: float = 0.2
+    """Fraction of the pixels that may be mapped outside the deformed image [-]."""
 
     def __post_init__(self) -> None:
         if not (self.tolerance_px > 0 and self.coarse_tolerance_px > 0):
@@ -116,55 +105,32 @@ class GaussNewtonOptions:
 
 @dataclass(frozen=True)
 class Iteration:
-    """One accepted (or the last refused) step.
-
-    Parameters
-    ----------
-    factor
-        Binning of the level [px].
-    number
-        From 1 on each level, and again whenever the pixels used are chosen anew.
-    mean_square
-        Mean of r^2 after the step.
-    step_px
-        Rms change of the displacement [px of the full image].
-    damping
-        Levenberg's damping of the scaled matrix [-]; 0 is a full step.
-    pixels
-        Pixels used.
-    """
+    """One accepted (or the last refused) step."""
 
     factor: int
+    """Binning of the level [px]."""
     number: int
+    """From 1 on each level, and again whenever the pixels used are chosen anew."""
     mean_square: float
+    """Mean of r^2 after the step."""
     step_px: float
+    """Rms change of the displacement [px of the full image]."""
     damping: float
+    """Levenberg's damping of the scaled matrix [-]; 0 is a full step."""
     pixels: int
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the iteration ended, and how.
-
-    Parameters
-    ----------
-    unknowns
-        (n,): the best ones found.
-    equations
-        The normal equations there.
-    outcome
-        Why it ended.
-    history
-        Every step.
-    curvature
-        (n, n): J'J corrected by what the steps did to the gradient; see :func:`minimise`.
-    """
+    """Where the iteration ended, and how."""
 
     unknowns: FloatArray
+    """(n,): the best ones found."""
     equations: NormalEquations
     outcome: Outcome
     history: tuple[Iteration, ...]
     curvature: FloatArray
+    """(n, n): J'J corrected by what the steps did to the gradient; see :func:`minimise`."""
 
 
 Evaluate = Callable[[FloatArray, bool], NormalEquations]
@@ -203,7 +169,7 @@ def minimise(
         Rms difference of the displacement between two sets of unknowns [px].
     start
         (n,) unknowns.
-    options, tolerance_px
+    options
         When to stop.
     factor
         Binning.

@@ -41,34 +41,19 @@ _PLENTY, _STRIDE = 1000, 4
 
 @dataclass(frozen=True, eq=False)
 class LevelSearch:
-    """One level of a correlation.
-
-    Parameters
-    ----------
-    pair
-        Its images.
-    ansatz
-        The kinematics.
-    level
-        Its binning and blur.
-    eigenvalue_cutoff
-        Directions less determined than this share of the best one stay as they are [-].
-    tolerance_px, rough_px
-        Steps to stop at, with all pixels and with every few rows [px].
-    options
-        Limits.
-    on_iteration
-        Called with the number of each finished iteration.
-    """
+    """One level of a correlation."""
 
     pair: LevelPair
     ansatz: Ansatz
     level: Level
     eigenvalue_cutoff: float
+    """Directions less determined than this share of the best one stay as they are [-]."""
     tolerance_px: float
     rough_px: float
+    """Steps to stop at, with all pixels and with every few rows [px]."""
     options: GaussNewtonOptions
     on_iteration: Callable[[int], None]
+    """Called with the number of each finished iteration."""
 
     def lower_cost(self, a: FloatArray, before: FloatArray) -> FloatArray:
         """Choose what has the lower cost: the last level's unknowns, or those it began with.
@@ -112,12 +97,8 @@ class LevelSearch:
     ) -> tuple[Minimum, Propagation]:
         """Move on from the minimum to where an instrument weighs the residual to zero.
 
-        Parameters
-        ----------
-        found, used
-            The minimum and its pixels.
-        instrument
-            (3, rows, cols) as for :meth:`Assembly.images`.
+        ``used`` are the minimum's pixels, the instrument is (3, rows, cols) as for
+        :meth:`Assembly.images`.
         """
         images = self.pair.reference, self.pair.deformed
 
@@ -194,14 +175,8 @@ class LevelSearch:
 def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
     """Rms difference of two displacements over some 10^4 of the pixels [px of the full image].
 
-    Parameters
-    ----------
-    ansatz, grid
-        The kinematics, and where the pixels are.
-    mask
-        (rows, cols) pixels that count.
-    factor
-        Binning: a binned px is so many px.
+    The mask (rows, cols) says which pixels count; ``factor`` is the binning: a binned px is so many
+    px.
     """
     rows, cols, some = subsampled(mask)
     x, y = grid.x[cols], grid.y[rows]

@@ -36,37 +36,21 @@ GIVEN = "given"
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """White noise of each photograph.
-
-    Parameters
-    ----------
-    sd
-        Standard deviation over the material [grey levels].
-    source
-        Where it is known from, in words.
-    """
+    """White noise of each photograph."""
 
     sd: float
+    """Standard deviation over the material [grey levels]."""
     source: str
+    """Where it is known from, in words."""
 
 
 def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> CameraNoise:
-    """Measure the noise from exposures of one and the same state.
+    """Measure the noise from exposures of one and the same state, the reference first.
 
-    Half the variance of what is left of one when the other has been fitted to it by a gain and
-    an offset (the lamp may have flickered), pooled over neighbours in the series.
-
-    Parameters
-    ----------
-    images
-        Two or more of (rows, cols) [grey levels], the reference first.
-    mask
-        (rows, cols) True on material.
-
-    Raises
-    ------
-    InputError
-        If two exposures have so little in common that they are of different states.
+    Half the variance of what is left of one when the other has been fitted to it by a gain and an
+    offset (the lamp may have flickered), pooled over neighbours in the series. Images and mask,
+    True on material, are (rows, cols); raises InputError if two exposures have so little in common
+    that they are of different states.
     """
     halves = []
     for number, (a, b) in enumerate(pairwise(images), start=1):
@@ -95,21 +79,13 @@ def _residual_variance(a: NDArray[Any], b: NDArray[Any]) -> float:
 
 
 def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise:
-    """Estimate the noise from a single image, by what no smooth pattern shows.
+    """Estimate the noise from a single image (rows, cols), by what no smooth pattern shows.
 
     The difference of two Laplacians weighs white noise by 6 and a pattern by (k_x k_y)^2, k its
-    wave number in rad/px. Too large where the speckles are of 2 px or so themselves.
+    wave number in rad/px. Too large where the speckles are of 2 px or so themselves. The mask is
+    True on material.
 
-    Parameters
-    ----------
-    image
-        (rows, cols) [grey levels].
-    mask
-        (rows, cols) True on material.
-
-    References
-    ----------
-    J. Immerkaer, Comput. Vis. Image Underst. 64 (1996), doi 10.1006/cviu.1996.0060.
+    Source: J. Immerkaer, Comput. Vis. Image Underst. 64 (1996), doi 10.1006/cviu.1996.0060.
     """
     second = np.array([1.0, -2.0, 1.0])
     details = ndimage.convolve(image.astype(np.float64), np.outer(second, second))
@@ -130,21 +106,11 @@ _PHASES = 64
 
 @dataclass(frozen=True)
 class ImageNoise:
-    """White noise of the two images.
-
-    Parameters
-    ----------
-    reference, deformed
-        Standard deviations in f and in g [grey levels].
-
-    Raises
-    ------
-    InputError
-        If one is negative or not finite.
-    """
+    """White noise of the two images; InputError if one is negative or not finite."""
 
     reference: float
     deformed: float
+    """Standard deviations in f and in g [grey levels]."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.reference < np.inf and 0.0 <= self.deformed < np.inf):
@@ -164,36 +130,20 @@ class NoiseTransfer:
     """What reaches the residual f(x) - g(x + u) of white noise of variance 1 in g.
 
     Means over the pixels compared. The defaults are those of g sampled at its pixels.
-
-    Parameters
-    ----------
-    value
-        Variance of the interpolated noise [-].
-    slope
-        Variance of its slope along an axis [1/px^2].
-    density
-        1/det F: pixels of the reference that share a pixel of g [-].
     """
 
     value: float = 1.0
+    """Variance of the interpolated noise [-]."""
     slope: float = 0.0
+    """Variance of its slope along an axis [1/px^2]."""
     density: float = 1.0
+    """1/det F: pixels of the reference that share a pixel of g [-]."""
 
     @classmethod
     def of(
         cls, ansatz: Ansatz, a: FloatArray, grid: PixelGrid, mask: BoolArray, order: int
     ) -> NoiseTransfer:
-        """Look where the pixels are mapped.
-
-        Parameters
-        ----------
-        ansatz, a
-            The kinematics and its (size,) unknowns.
-        grid, mask
-            The pixels, and (rows, cols) True on those compared.
-        order
-            Of the spline.
-        """
+        """Look where the compared pixels, True in ``mask`` (rows, cols), are mapped."""
         rows, cols, some = subsampled(mask)
         if not some.any():
             return cls()
@@ -226,12 +176,8 @@ def subsampled(mask: BoolArray) -> tuple[NDArray[np.intp], NDArray[np.intp], Boo
 def slope_noise(order: int, blur_px: float) -> float:
     """Variance at a pixel of the slope of white noise of variance 1, blurred first [1/px^2].
 
-    Parameters
-    ----------
-    order
-        Of the spline whose slope it is.
-    blur_px
-        Standard deviation of a Gaussian blur; from 0.6 px on that is 1/(8 pi s^4).
+    The order is that of the spline whose slope it is. Of a Gaussian blur of standard deviation s,
+    from 0.6 px on, that is 1/(8 pi s^4).
     """
     if blur_px > 0.0:
         return float(1.0 / (8.0 * np.pi * blur_px**4))
@@ -239,14 +185,9 @@ def slope_noise(order: int, blur_px: float) -> float:
 
 
 def _variances(order: int, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variances of interpolated noise of variance 1 and of its slope, along one axis.
+    """Variances along an axis of interpolated noise of variance 1 and of its slope.
 
-    Parameters
-    ----------
-    order
-        Of the spline.
-    phase
-        Where between two pixels, 0 ... 1.
+    The phase, 0 ... 1, is where between two pixels.
     """
     at = np.arange(_PHASES + 1) / _PHASES
     value, slope = _table(order)

@@ -122,57 +122,39 @@ def _mark_valid(n: int, own: Any, valid: Any, kept: Any) -> int:
 
 
 class Runs(NamedTuple):
-    """The pixels that count, as runs of neighbours along the rows.
-
-    Parameters
-    ----------
-    first, stop
-        (runs,) column of the first pixel of each and of the one after its last, row after row.
-    row_start
-        (rows + 1,) number of the first run of each row.
-    """
+    """The pixels that count, as runs of neighbours along the rows."""
 
     first: NDArray[Any]
     stop: NDArray[Any]
+    """(runs,) column of the first pixel of each and of the one after its last, row after row."""
     row_start: NDArray[Any]
+    """(rows + 1,) number of the first run of each row."""
 
 
 class Tables(NamedTuple):
-    """The ansatz at some unknowns, as one-dimensional tables along the rows and columns.
-
-    Parameters
-    ----------
-    eta
-        (rows,): normalised coordinate.
-    along_x
-        (1 + 2 w + n, cols): xi, then for each wave sin and cos of pi/l kx x, then for each mode
-        s tau_x.
-    v0, v
-        (2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm].
-    brightness
-        (2, D + 1, D + 1): those of the gain b [-] and of the offset c [grey levels].
-    gain_field, offset_field
-        Numbers of their base fields; 0 where they are no unknowns.
-    waves, mode_of_wave
-        (w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to.
-    sin_y, cos_y
-        (w, rows) of pi/l (ky y + c).
-    taper_y
-        (n, rows) tau_y.
-    """
+    """The ansatz at some unknowns, as one-dimensional tables along the rows and columns."""
 
     eta: NDArray[Any]
+    """(rows,): normalised coordinate."""
     along_x: NDArray[Any]
+    """(1 + 2 w + n, cols): xi, then for each wave sin and cos of pi/l kx x, then for each mode s
+    tau_x."""
     v0: NDArray[Any]
     v: NDArray[Any]
+    """(2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm]."""
     brightness: NDArray[Any]
+    """(2, D + 1, D + 1): those of the gain b [-] and of the offset c [grey levels]."""
     gain_field: int
     offset_field: int
+    """Numbers of their base fields; 0 where they are no unknowns."""
     waves: NDArray[Any]
     mode_of_wave: NDArray[Any]
+    """(w, 6): A, B, kx, ky, c, pi/l; (w,): the mode each belongs to."""
     sin_y: NDArray[Any]
     cos_y: NDArray[Any]
+    """(w, rows) of pi/l (ky y + c)."""
     taper_y: NDArray[Any]
+    """(n, rows) tau_y."""
 
 
 def runs_of(mask: BoolArray) -> Runs:
@@ -303,10 +285,9 @@ def accumulate(
         (pairs, 3): numbers of two base fields and the sum of their degrees.
     fields
         Number of base fields.
-    moments
-        (bands, pairs, K + 1, K + 1), zero on entry: the sums of each band of rows.
-    left
-        (bands,), zero on entry: how many pixels are mapped outside the image.
+    moments, left
+        (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how many pixels are
+        mapped outside the image; both zero on entry.
     first, every
         The bands to look at: each ``every``-th from ``first`` on.
     """

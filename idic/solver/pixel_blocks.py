@@ -28,36 +28,25 @@ BLOCK = 256
 
 
 class Target(NamedTuple):
-    """What the ansatz is fitted to: a pair of images, or one component of a displacement.
-
-    Parameters
-    ----------
-    component
-        IMAGES: residual f - (1 + b) g(x + u) - c. 0 or 1: residual ``displacement`` - u_x or
-        u_y, and (1, 0) or (0, 1) in place of the gradient.
-    reference
-        (rows, cols) f; of no account for a displacement.
-    coefficients, order
-        Spline of g.
-    displacement
-        (rows, cols) [mm]; of no account for images.
-    instrument
-        (3, rows, cols) what weighs the residual in place of (1 + b) times the gradient of g at
-        x + u, along x and y [grey levels/mm], and of g there; (3, 0, 0) for these themselves.
-    share
-        How much of what weighs is the instrument; the rest is g's own [-].
-    pixel_size
-        [mm/px].
-    """
+    """What the ansatz is fitted to: a pair of images, or one component of a displacement."""
 
     component: int
+    """IMAGES: residual f - (1 + b) g(x + u) - c. 0 or 1: residual ``displacement`` - u_x or u_y,
+    and (1, 0) or (0, 1) in place of the gradient."""
     reference: NDArray[Any]
+    """(rows, cols) f; of no account for a displacement."""
     coefficients: NDArray[Any]
     order: int
+    """Spline of g."""
     displacement: NDArray[Any]
+    """(rows, cols) [mm]; of no account for images."""
     instrument: NDArray[Any]
+    """(3, rows, cols) what weighs the residual in place of (1 + b) times the gradient of g at x +
+    u, along x and y [grey levels/mm], and of g there; (3, 0, 0) for these themselves."""
     share: float
+    """How much of what weighs is the instrument; the rest is g's own [-]."""
     pixel_size: float
+    """[mm/px]."""
 
     @classmethod
     def images(
@@ -98,32 +87,23 @@ class PixelBlock(NamedTuple):
     """Some pixels of a row, and what the passes know of them; every last axis is the pixels'.
 
     Few arrays with numbered rows, because the compiler counts references to each of them.
-
-    Parameters
-    ----------
-    own
-        (15, BLOCK): column [px]; f, or the known displacement; u_x, u_y [mm]; b [-] and c [grey
-        levels]; x + u as row and column [px]; g there and its derivatives; 1, or 0 outside g;
-        the three of the instrument.
-    along_x
-        (1 + 2 w + n, BLOCK): those of the tables.
-    T, eta_T
-        (K + 1, BLOCK) T_a(xi); (K + 1,) T_b(eta) of the row.
-    modes
-        (n, 3, BLOCK): phi_x, phi_y [-] and v [mm] of each.
-    waves
-        (w, 2, BLOCK): S sin theta and S cos theta pi/l of each.
-    E
-        (fields, BLOCK) base fields: gx and gy first, the residual last.
     """
 
     own: NDArray[Any]
+    """(15, BLOCK): column [px]; f, or the known displacement; u_x, u_y [mm]; b [-] and c [grey
+    levels]; x + u as row and column [px]; g there and its derivatives; 1, or 0 outside g; the three
+    of the instrument."""
     along_x: NDArray[Any]
+    """(1 + 2 w + n, BLOCK): those of the tables."""
     T: NDArray[Any]
     eta_T: NDArray[Any]
+    """(K + 1, BLOCK) T_a(xi); (K + 1,) T_b(eta) of the row."""
     modes: NDArray[Any]
+    """(n, 3, BLOCK): phi_x, phi_y [-] and v [mm] of each."""
     waves: NDArray[Any]
+    """(w, 2, BLOCK): S sin theta and S cos theta pi/l of each."""
     E: NDArray[Any]
+    """(fields, BLOCK) base fields: gx and gy first, the residual last."""
 
 
 @compiled(relaxed=True)

@@ -29,21 +29,10 @@ _ENDS = 4.0
 def binned(
     image: FloatImage, weight: BoolArray | None, factor: int
 ) -> tuple[FloatImage, FloatImage]:
-    """Means over blocks; incomplete blocks at the right and at the bottom are dropped.
+    """Means over blocks of ``factor`` px; incomplete ones at the right and bottom are dropped.
 
-    Parameters
-    ----------
-    image
-        (rows, cols) float32 grey levels.
-    weight
-        (rows, cols) True where they count; None for everywhere.
-    factor
-        Edge of the blocks [px].
-
-    Returns
-    -------
-    mean, share
-        (rows // factor, cols // factor): mean of grey level times weight, and mean of weight.
+    The image is float32, ``weight`` (rows, cols) True where grey levels count, None for everywhere.
+    Returns the means of grey level times weight and of weight, (rows // factor, cols // factor).
     """
     weight = np.ones(image.shape, dtype=np.bool_) if weight is None else weight
     shape = image.shape[0] // factor, image.shape[1] // factor
@@ -53,15 +42,7 @@ def binned(
 
 
 def blurred(image: FloatImage, sigma: float) -> FloatImage:
-    """Blur with a Gaussian; the outermost pixels are repeated beyond the border.
-
-    Parameters
-    ----------
-    image
-        (rows, cols) float32.
-    sigma
-        Standard deviation [px]; 0 gives the image as it is.
-    """
+    """Blur a float32 image with a Gaussian of ``sigma`` px; the outermost pixels are repeated."""
     if sigma == 0:
         return image
     reach = int(_ENDS * sigma + 0.5)
@@ -116,18 +97,12 @@ def _blur(image: Any, weights: Any, out: Any) -> None:
 
 @dataclass(frozen=True)
 class Level:
-    """One step from coarse to fine.
-
-    Parameters
-    ----------
-    factor
-        Edge of the blocks of pixels that are averaged [px].
-    blur
-        Standard deviation of the Gaussian blur after that [binned px]; 0 for none.
-    """
+    """One step from coarse to fine."""
 
     factor: int
+    """Edge of the blocks of pixels that are averaged [px]."""
     blur: float
+    """Standard deviation of the Gaussian blur after that [binned px]; 0 for none."""
 
     def __post_init__(self) -> None:
         if self.factor < 1 or self.blur < 0:
@@ -156,27 +131,17 @@ _AROUND = 3.0
 
 @dataclass(frozen=True, eq=False)
 class LevelPair:
-    """Reference, deformed image and masks on one level.
-
-    Parameters
-    ----------
-    grid
-        The pixels of both images.
-    reference
-        (rows, cols) float32: f.
-    deformed
-        g, ready to be sampled.
-    mask
-        (rows, cols): pixels of f that count.
-    valid
-        (rows, cols) where g may be sampled; None for everywhere.
-    """
+    """Reference, deformed image and masks on one level."""
 
     grid: PixelGrid
     reference: FloatImage
+    """(rows, cols) float32: f."""
     deformed: SplineImage
+    """g, ready to be sampled."""
     mask: BoolArray
+    """(rows, cols): pixels of f that count."""
     valid: BoolArray | None
+    """(rows, cols) where g may be sampled; None for everywhere."""
 
 
 def level_pair(
@@ -184,13 +149,11 @@ def level_pair(
 ) -> LevelPair:
     """Make one level of a pair of images.
 
+    Holes are kept out of the blur only if both masks are known: they have to look alike in the two
+    images.
+
     Parameters
     ----------
-    pair
-        Holes are kept out of the blur only if both masks are known: they have to look alike in
-        the two images.
-    level
-        Binning and blur.
     edge_px
         Pixels closer than this to the mask's edge are left out on the finest level [px].
     order
@@ -279,17 +242,7 @@ def _locally_normalised(image: FloatImage, blur: float, around: float = _AROUND)
 
 
 def smoothed(image: FloatImage, mask: BoolArray | None, blur: float) -> FloatImage:
-    """Blur an image over its material, and continue it beyond.
-
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels.
-    mask
-        (rows, cols) True on material; None for everywhere.
-    blur
-        Standard deviation [px].
-    """
+    """Blur an image by ``blur`` px over its material, True in the mask, and continue it beyond."""
     return _smooth(np.asarray(image, np.float32), mask, Level(1, blur))
 
 
@@ -298,18 +251,8 @@ def locally_normalised(
 ) -> NDArray[np.float32]:
     """Blur an image over its material, and give it a local mean of 0 and a local contrast of 1.
 
-    Where all speckles count alike, the model error weighs alike everywhere.
-
-    Parameters
-    ----------
-    image
-        (rows, cols) grey levels.
-    mask
-        (rows, cols) True on material; what is elsewhere has no part in it.
-    blur
-        Standard deviation [px].
-    around
-        How far the local mean and contrast reach [blurs].
+    Where all speckles count alike, the model error weighs alike everywhere. What is outside the
+    mask has no part in it. The blur is in px, how far the local mean and contrast reach in blurs.
     """
     smooth = smoothed(image, mask, blur)
     return np.asarray(_locally_normalised(smooth, blur, around), dtype=np.float32)

@@ -25,16 +25,10 @@ from modeharvest.util.errors import InputError
 
 @compiled(parallel=True, relaxed=True)
 def lagged_products(residual: Any, lags: Any, products: Any, counts: Any) -> None:
-    """Sum residual times residual a lag further on, row by row.
+    """Sum residual (rows, cols) times residual ``lags`` (k,) further on [px], row by row.
 
-    Parameters
-    ----------
-    residual
-        (rows, cols).
-    lags
-        (k,) [px].
-    products, counts
-        (rows, 2, k) to fill: sums and numbers of pairs, down the columns and along the rows.
+    Fills ``products`` and ``counts`` (rows, 2, k): sums and numbers of pairs, down the columns and
+    along the rows.
     """
     rows, cols = residual.shape
     for i in prange(rows):
@@ -66,17 +60,10 @@ def _products(one: Any, other: Any, n: int, products: Any, counts: Any, k: int) 
 
 @compiled(parallel=True, relaxed=True)
 def block_moments(f: Any, residual: Any, size: int, sums: Any) -> None:
-    """Sum 1, f, g, f g, f f and g g with g = f - residual over blocks of pixels.
+    """Sum 1, f, g, f g, f f and g g with g = f - residual over blocks of ``size`` pixels.
 
-    Parameters
-    ----------
-    f, residual
-        (rows, cols).
-    size
-        Edge of the blocks [px].
-    sums
-        (block rows, block columns, 6) to fill; blocks at the right and at the bottom may be
-        incomplete.
+    Fills ``sums`` (block rows, block columns, 6); blocks at the right and at the bottom may be
+    incomplete.
     """
     rows, cols = f.shape
     for block_row in prange(sums.shape[0]):
@@ -116,25 +103,17 @@ _SIGMAS, _MODEL = 4.0, 0.03
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """The residual against the noise of the images.
-
-    Parameters
-    ----------
-    correlation
-        Rms autocorrelation of the residual at ``lags_px`` along rows and columns [-].
-    pixels
-        In the residual.
-    chi_square
-        Sum of squares of the residual over what the noise predicts; 1 is agreement [-]. NaN
-        where the noise is not known.
-    lags_px
-        Distances at which the residual was compared with itself [px].
-    """
+    """The residual against the noise of the images."""
 
     correlation: float
+    """Rms autocorrelation of the residual at ``lags_px`` along rows and columns [-]."""
     pixels: int
+    """In the residual."""
     chi_square: float = float("nan")
+    """Sum of squares of the residual over what the noise predicts; 1 is agreement [-]. NaN where
+    the noise is not known."""
     lags_px: tuple[int, ...] = LAGS_PX
+    """Distances at which the residual was compared with itself [px]."""
 
     @classmethod
     def of(
@@ -146,24 +125,18 @@ class ResidualTest:
         noise_sd: float | None = None,
         lags_px: tuple[int, ...] = LAGS_PX,
     ) -> ResidualTest:
-        """Test a residual.
+        """Test a residual of rms [grey levels], :func:`autocorrelation` and number of pixels.
 
         Parameters
         ----------
-        residual_rms, correlation, pixels
-            Of the residual: rms [grey levels], :func:`autocorrelation`, number of pixels.
         unknowns
             Number of fitted unknowns.
         noise_sd
             Standard deviation of the residual that the images' noise predicts [grey levels], if
-            known; see :meth:`modeharvest.idic.result.Result.residual_noise`.
+            known; see :meth:`modeharvest.idic.result.Result.residual_noise`. InputError unless
+            positive.
         lags_px
             Where the autocorrelation was taken.
-
-        Raises
-        ------
-        InputError
-            If the noise is not positive.
         """
         if noise_sd is None:
             return cls(correlation, pixels, lags_px=lags_px)
@@ -205,13 +178,8 @@ class ResidualTest:
 def lags_for(speckle_size_px: float) -> tuple[int, ...]:
     """Distances over which a model error shows, and noise doesn't [px].
 
-    From a third of a speckle to a whole one, but no closer than what the spline correlates.
-
-    Parameters
-    ----------
-    speckle_size_px
-        Full width at half maximum of the speckle's autocorrelation [px]; see
-        :func:`modeharvest.idic.solver.final_smoothing.speckle_size`.
+    From a third of a speckle (see :func:`modeharvest.idic.solver.final_smoothing.speckle_size`) to
+    a whole one, but no closer than what the spline correlates.
     """
     first, last = max(_SPARED_PX, speckle_size_px / 3.0), max(_SPARED_PX + 1, speckle_size_px)
     return tuple(sorted({round(lag) for lag in np.linspace(first, last, 5)}))
@@ -220,12 +188,7 @@ def lags_for(speckle_size_px: float) -> tuple[int, ...]:
 def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) -> float:
     """Rms autocorrelation of a residual at some lags along rows and columns [-].
 
-    Parameters
-    ----------
-    residual
-        (rows, cols) f - g(x + u), NaN where no pixel counts.
-    lags_px
-        Which; see :func:`lags_for`.
+    The residual is f - g(x + u) (rows, cols), NaN where no pixel counts.
     """
     lags = np.array([0, *lags_px])
     sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
@@ -243,16 +206,9 @@ def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) 
 def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> float:
     """Fraction of the image whose two grey levels are decorrelated [-].
 
-    Over blocks of ``BLOCK_PX``: those in which the reference and the deformed image pulled
-    back to it have a zero-normalised cross-correlation below ``CORRELATED``. At a local minimum a
-    speckle or more off, it is about 0.
-
-    Parameters
-    ----------
-    reference
-        (rows, cols) f.
-    residual
-        (rows, cols) f - g(x + u), NaN where no pixel counts.
+    Over blocks of ``BLOCK_PX``: those in which the reference f (rows, cols) and the deformed image
+    pulled back to it, f less the residual (NaN where no pixel counts), have a zero-normalised
+    cross-correlation below ``CORRELATED``. At a local minimum a speckle or more off, it is about 0.
     """
     blocks = [-(-size // BLOCK_PX) for size in residual.shape]
     sums = np.empty((*blocks, 6))

@@ -71,22 +71,14 @@ class Gradient(Enum):
 
 @dataclass(frozen=True)
 class Weighting:
-    """What weighs the residual.
-
-    Parameters
-    ----------
-    gradient
-        Of which image.
-    blur_px
-        Standard deviation of the blur of the image that the gradient is taken of [px]; 0 for
-        none.
-    speckle_size_px
-        Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known.
-    """
+    """What weighs the residual."""
 
     gradient: Gradient = Gradient.DEFORMED
     blur_px: float = 0.0
+    """Standard deviation of the blur of the image that the gradient is taken of [px]; 0 for none.
+    """
     speckle_size_px: float = np.inf
+    """Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known."""
 
     def __post_init__(self) -> None:
         if not (self.blur_px >= 0 and self.speckle_size_px > 0):
@@ -104,16 +96,10 @@ class Weighting:
         """Relative excess of the unknowns' variance over the Cramer-Rao bound [-].
 
         With the same noise in both images, the reference's gradient, and a speckle whose
-        autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost,
-        (1 + t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the
-        noise of an image has nothing in common with its own gradient.
-
-        Parameters
-        ----------
-        noise
-            Variance of the noise over the mean square of the speckle's slope [px^2].
-        order
-            Of the spline.
+        autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost, (1 +
+        t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the noise
+        of an image has nothing in common with its own gradient. ``noise`` is its variance over the
+        mean square of the speckle's slope [px^2], ``order`` the spline's.
         """
         noise *= slope_noise(order, self.blur_px)
         if self.blur_px == 0.0:
@@ -139,14 +125,9 @@ class Weighting:
 def best_blur(noise: float, size_px: float, order: int = 5, worth: float = WORTH_IT) -> float:
     """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
 
-    Parameters
-    ----------
-    noise, order
-        As for :meth:`Weighting.excess`.
-    size_px
-        Full width at half maximum of the speckle's autocorrelation [px].
-    worth
-        Share of the variance that a blur has to spare at least [-].
+    ``noise`` and ``order`` as for :meth:`Weighting.excess`, the speckle's autocorrelation having a
+    full width at half maximum of ``size_px``; a blur has to spare the share ``worth`` of the
+    variance at least [-].
     """
     candidates = [Weighting(Gradient.REFERENCE, blur, size_px) for blur in (0.0, *_BLURS_PX)]
     excess = [weighting.excess(noise, order) for weighting in candidates]
@@ -171,18 +152,10 @@ def instrument(
 ) -> NDArray[np.float32]:
     """Make what weighs the residual: (3, rows, cols), slopes along x and y, and grey levels.
 
-    In the reference's frame, at the pixels that count. The grey levels, for a gain among the
-    unknowns, are those of f around each pixel without the pixel itself: so their noise has
+    In the reference's frame, at the pixels ``used``; ``a`` are the unknowns of the least-squares
+    minimum, ``level`` is the pair prepared for the finest level. The grey levels, for a gain among
+    the unknowns, are those of f around each pixel without the pixel itself: so their noise has
     nothing in common with the residual's.
-
-    Parameters
-    ----------
-    weighting
-        Which gradient.
-    pair, level
-        f and g, whole and prepared for the finest level.
-    used, a
-        The pixels that count, and the (size,) unknowns of the least-squares minimum.
     """
     order = level.deformed.order
     # As in the pyramid: what is beyond the material is only left out if both masks are known.
@@ -216,29 +189,18 @@ def _neighbours(
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """How a perturbation of h'r moves its root.
-
-    Parameters
-    ----------
-    slope
-        (n, n) A = h'J, made symmetric.
-    weight
-        (n, n) h'h.
-    """
+    """How a perturbation of h'r moves its root."""
 
     slope: FloatArray
+    """(n, n) A = h'J, made symmetric."""
     weight: FloatArray
+    """(n, n) h'h."""
 
     @classmethod
     def of(cls, matrix: Callable[[float], FloatArray], least_squares: FloatArray) -> Propagation:
         """From matrices of squares alone: for the mean m of h and J, 4 m'm = h'h + J'J + A + A'.
 
-        Parameters
-        ----------
-        matrix
-            (n, n) m'm of weights that are a mixture: so much of h, the rest of J.
-        least_squares
-            (n, n) J'J.
+        ``matrix`` makes the (n, n) m'm of weights that are a mixture: so much of h, the rest of J.
         """
         pure, mixed = matrix(1.0), matrix(0.5)
         return cls(2.0 * mixed - 0.5 * (pure + least_squares), pure)
@@ -260,14 +222,8 @@ def root(
         -h'r at some unknowns, as the gradient of normal equations.
     curvature
         (n, n) A = h'J.
-    step_length
-        Rms difference of the displacement between two sets of unknowns [px].
-    found
-        The minimum.
-    options
-        When to stop.
-    on_iteration
-        Called with the number of each finished iteration.
+    step_length, options, on_iteration
+        As for :func:`~modeharvest.idic.solver.gauss_newton.minimise`.
 
     Returns
     -------

@@ -38,27 +38,18 @@ POLARISED = 0.1
 
 @dataclass(frozen=True)
 class RealWave:
-    """A wave (L n + T m) sin(π/l (k·x + c)) of the field.
-
-    Parameters
-    ----------
-    k
-        Wave vector [π/l].
-    amplitude
-        (L, T) along n = k/|k| and along m = n turned by +90 degrees, signed [unit of the field].
-    phase
-        c [l], above −1/2 and up to 1/2; the rest is in the signs.
-    star
-        Which star of waves it belongs to.
-    shares_k
-        Whether its wave vector is that of the wave before: one of two that are out of phase.
-    """
+    """A wave (L n + T m) sin(π/l (k·x + c)) of the field."""
 
     k: tuple[float, float]
+    """Wave vector [π/l]."""
     amplitude: tuple[float, float]
+    """(L, T) along n = k/|k| and along m = n turned by +90 degrees, signed [unit of the field]."""
     phase: float
+    """c [l], above −1/2 and up to 1/2; the rest is in the signs."""
     star: int
+    """Which star of waves it belongs to."""
     shares_k: bool = False
+    """Whether its wave vector is that of the wave before: one of two that are out of phase."""
 
     @property
     def frame(self) -> FloatArray:
@@ -86,21 +77,14 @@ class RealWave:
 
 @dataclass(frozen=True)
 class Tie:
-    """Amplitudes of one component that are one parameter, or fixed.
-
-    Parameters
-    ----------
-    component
-        0 for L, along the wave vector, 1 for T, across.
-    waves
-        Numbers of the waves, from 0.
-    value
-        Their common magnitude [unit of the field]; 0: they are fixed at zero.
-    """
+    """Amplitudes of one component that are one parameter, or fixed."""
 
     component: int
+    """0 for L, along the wave vector, 1 for T, across."""
     waves: tuple[int, ...]
+    """Numbers of the waves, from 0."""
     value: float
+    """Their common magnitude [unit of the field]; 0: they are fixed at zero."""
 
     @property
     def name(self) -> str:
@@ -170,19 +154,7 @@ def fixed_tie(ties: list[Tie]) -> Tie:
 
 
 def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
-    """Make the family: amplitudes first, then wave vectors, then phases.
-
-    Parameters
-    ----------
-    name
-        What to call it.
-    waves
-        Of the field.
-    ties
-        From :func:`find_ties`.
-    pitch
-        l [mm].
-    """
+    """Make the family: amplitudes first, then wave vectors, then phases; ``pitch`` is l [mm]."""
     rows = PER_WAVE * len(waves)
     columns, start, names, units = [], [], [], []
     fixed = fixed_tie(ties)

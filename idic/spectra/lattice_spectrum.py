@@ -32,25 +32,16 @@ from modeharvest.util.errors import InputError
 
 
 class MeshQuadrature:
-    """Points and weights over the material of a mesh.
+    """Points and weights over the material of any isoparametric mesh [mm].
 
-    Parameters
-    ----------
-    mesh
-        Any isoparametric mesh [mm].
-    points
-        Per direction and element. A wave whose phase turns by p rad across the largest element
-        is integrated to 1e-10 by 4 + p of them, see :func:`points_for`.
+    A wave whose phase turns by p rad across the largest element is integrated to 1e-10 by 4 + p
+    points per direction and element, see :func:`points_for`. Raises InputError if an element is
+    turned inside out.
 
     Attributes
     ----------
     positions : (q, 2) points in the material [mm].
     weights : (q,) area that each stands for [mm^2], positive.
-
-    Raises
-    ------
-    InputError
-        If an element is turned inside out.
     """
 
     def __init__(self, mesh: Mesh, points: int = 8) -> None:
@@ -99,13 +90,9 @@ def points_for(mesh: Mesh, wave_number: float) -> int:
 def gauss_rule(triangular: bool, points: int) -> tuple[FloatArray, FloatArray]:
     """Local points (p, 2) and weights (p,) on the reference triangle or square.
 
-    Parameters
-    ----------
-    triangular
-        Triangle xi, eta >= 0, xi + eta <= 1; else the square from -1 to 1.
-    points
-        Per direction: p is its square, and polynomials up to the degree 2 ``points`` - 1 (on the
-        square in each coordinate) are integrated exactly.
+    The triangle is xi, eta >= 0, xi + eta <= 1, the square goes from -1 to 1. ``points`` are those
+    per direction: p is its square, and polynomials up to the degree 2 ``points`` - 1 (on the square
+    in each coordinate) are integrated exactly.
     """
     s, ws = np.polynomial.legendre.leggauss(points)
     if not triangular:
@@ -132,52 +119,34 @@ the number is the mesh's."""
 
 @dataclass(frozen=True)
 class LatticePeak:
-    """A wave vector of a periodic field and its mirror image −ξ.
-
-    Parameters
-    ----------
-    xi
-        (ξ1, ξ2) Cartesian [1/l], of the two the one with ξ2 > 0, or ξ1 > 0 on the axis.
-    density
-        S_xx + S_yy [mm⁶].
-    share
-        Share of the energy ∫ |u|² dA in ξ and −ξ together [-].
-    """
+    """A wave vector of a periodic field and its mirror image −ξ."""
 
     xi: tuple[float, float]
+    """(ξ1, ξ2) Cartesian [1/l], of the two the one with ξ2 > 0, or ξ1 > 0 on the axis."""
     density: float
+    """S_xx + S_yy [mm⁶]."""
     share: float
+    """Share of the energy ∫ |u|² dA in ξ and −ξ together [-]."""
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeSpectrum:
-    """The Fourier coefficients of a periodic field up to some wave number.
-
-    Parameters
-    ----------
-    xi
-        (n, 2) reciprocal vectors of the cell, Cartesian [1/l], by length; ξ and −ξ both.
-    coefficients
-        (n, 2) û of u_x and u_y [mm³]; the phase origin is x = 0.
-    pitch
-        l [mm].
-    lattice
-        (2, 2) vectors of the cell as rows [mm].
-    energy
-        ∫ |u|² dA over the material of the cell, translation taken out [mm⁴].
-    material
-        Area of the material of the cell [mm²].
-    translation
-        (2,) mean over the material that was taken out [mm].
-    """
+    """The Fourier coefficients of a periodic field up to some wave number."""
 
     xi: FloatArray
+    """(n, 2) reciprocal vectors of the cell, Cartesian [1/l], by length; ξ and −ξ both."""
     coefficients: ComplexArray
+    """(n, 2) û of u_x and u_y [mm³]; the phase origin is x = 0."""
     pitch: float
+    """l [mm]."""
     lattice: FloatArray
+    """(2, 2) vectors of the cell as rows [mm]."""
     energy: float
+    """∫ |u|² dA over the material of the cell, translation taken out [mm⁴]."""
     material: float
+    """Area of the material of the cell [mm²]."""
     translation: tuple[float, float]
+    """(2,) mean over the material that was taken out [mm]."""
 
     @property
     def S_xx(self) -> FloatArray:
@@ -203,10 +172,7 @@ class LatticeSpectrum:
     def at(self, xi: ArrayLike) -> ComplexArray:
         """(2,) û of u_x and u_y [mm³] at a wave vector; 0 where the cell has none of them.
 
-        Raises
-        ------
-        InputError
-            If it is beyond the reach.
+        Raises InputError if it is beyond the reach.
         """
         wanted = np.asarray(xi, dtype=np.float64)
         farthest = float(np.linalg.norm(self.xi, axis=1).max())
@@ -252,8 +218,8 @@ def lattice_spectrum(
     Raises
     ------
     InputError
-        If the field has another shape than the nodes, is not finite, not periodic, or nothing
-        but a translation; if the mesh is larger than the cell; if pitch or reach aren't positive.
+        If the field has another shape than the nodes, is not finite, not periodic, or nothing but a
+        translation; if the mesh is larger than the cell; if pitch or reach aren't positive.
     """
     u, vectors = _checked_field(mesh, lattice, values, pitch)
     if not 0 < reach < np.inf:

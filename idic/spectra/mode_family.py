@@ -59,23 +59,9 @@ def overlap(
 ) -> float:
     """Normalised overlap of a nodal field with a family's waves [-], between 0 and 1.
 
-    Parameters
-    ----------
-    mesh
-        Of the field [mm].
-    values
-        (n, 2) field at the nodes [any unit].
-    family
-        Whose waves to compare with; the taper is left out.
-    pitch
-        l [mm].
-    parameters
-        (m,) of the mode; by default the family's start.
-
-    Raises
-    ------
-    InputError
-        If the field's shape differs from the nodes', or one of the two is only a translation.
+    The field (n, 2) is in any unit; the waves are those of the mode's parameters (m,), by default
+    the family's start, without the taper. Raises InputError if the field's shape differs from the
+    nodes', or one of the two is only a translation.
     """
     u = np.asarray(values, dtype=np.float64)
     if u.shape != mesh.nodes.shape or not np.isfinite(u).all():
@@ -98,12 +84,7 @@ def wave_values(rule: MeshQuadrature, waves: FloatArray, pitch: float) -> FloatA
 def best_amplitude(rule: MeshQuadrature, u: FloatArray, phi: FloatArray) -> tuple[float, float]:
     """Factor a that makes a φ nearest to u, and the share of ∫ |u|² that a φ is.
 
-    The share is the square of the normalised overlap.
-
-    Raises
-    ------
-    InputError
-        If one of the two is zero.
+    The share is the square of the normalised overlap. Raises InputError if one of the two is zero.
     """
     mixed, uu, pp = rule.product(u, phi), rule.product(u, u), rule.product(phi, phi)
     if not (uu > 0 and pp > 0):
@@ -121,33 +102,21 @@ class FoundFamily:
     """A mode family, where it came from, and how much of the field it is.
 
     The field is about ``amplitude`` times the sum of the family's waves at its start.
-
-    Parameters
-    ----------
-    family
-        The family; its start is the field.
-    pitch
-        l [mm], the half-wavelength of :class:`modeharvest.idic.modes.FourierMode`.
-    amplitude
-        [unit of the field], with sign.
-    captured
-        Share of ∫ |u|² over the material, translation apart, that ``amplitude`` and the start
-        describe [-].
-    growth
-        (number of waves, share captured by as many, nothing tied); goes on beyond those taken.
-    text
-        What was found.
-    info
-        Plain JSON values of the caller: lattice, material, loading, critical strain.
     """
 
     family: ModeFamily
     pitch: float
+    """l [mm], the half-wavelength of :class:`modeharvest.idic.modes.FourierMode`."""
     amplitude: float
+    """[unit of the field], with sign."""
     captured: float
+    """Share of ∫ |u|² over the material, translation apart, that ``amplitude`` and the start
+    describe [-]."""
     growth: tuple[tuple[int, float], ...]
+    """(number of waves, share captured by as many, nothing tied); goes on beyond those taken."""
     text: tuple[str, ...]
     info: Mapping[str, Any] = field(default_factory=dict)
+    """Plain JSON values of the caller: lattice, material, loading, critical strain."""
 
     def __post_init__(self) -> None:
         if not (0 < self.pitch < np.inf and np.isfinite([self.amplitude, self.captured]).all()):
@@ -176,25 +145,15 @@ def mode_family(
 
     Parameters
     ----------
-    mesh
-        One cell of the lattice [mm].
-    lattice
-        (2, 2) its lattice vectors as rows [mm].
-    values
-        (n, 2) field at the nodes, periodic, affine part removed [any unit].
-    pitch
-        l [mm].
+    mesh, lattice, values, pitch
+        As for :func:`~modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum`; the field in any
+        unit.
     shared
         Look for constraints; otherwise every wave has five parameters of its own (but one).
     growth
         Least share of the energy that a further star of waves must add [-]; larger for fewer waves.
     info
         To keep with the family.
-
-    Raises
-    ------
-    InputError
-        As :func:`modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum`.
     """
     spectrum = lattice_spectrum(mesh, lattice, values, pitch)
     rule = MeshQuadrature(mesh, points_for(mesh, 6.0 * np.pi / pitch))
@@ -221,18 +180,10 @@ def _family(waves: list[RealWave], ties: list[Tie], pitch: float, shared: bool) 
 
 
 def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
-    """The paper's Eq. (mode) with these two waves as its start, if it has them; else None.
+    """The paper's Eq. (mode) with these waves (w, 5) as its start, if it has them; else None.
 
-    Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component
-    and opposite in the other. The origin is at a junction or at a hole's centre, whichever is
-    nearer.
-
-    Parameters
-    ----------
-    waves
-        (w, 5) A, B, kx, ky [-] and c [mm].
-    pitch
-        l [mm].
+    Two waves near the two diagonals, |A| equal, |B| equal, and signs the same in one component and
+    opposite in the other. The origin is at a junction or at a hole's centre, whichever is nearer.
     """
     if len(waves) != 2:
         return None
@@ -265,23 +216,11 @@ def write_family(
     info: Mapping[str, Any] | None = None,
     spectrum: LatticeSpectrum | None = None,
 ) -> None:
-    """Write a family, atomically.
+    """Write a family as JSON, atomically.
 
-    Parameters
-    ----------
-    path
-        Of the JSON file.
-    found
-        The family.
-    info
-        Plain JSON values to add to the family's own ``info``, such as the critical strain.
-    spectrum
-        Fourier coefficients of the same field, to keep beside it.
-
-    Raises
-    ------
-    InputError
-        If ``info`` can't be written as JSON, or the file can't be written.
+    ``info`` are plain JSON values to add to the family's own, such as the critical strain; a
+    spectrum of the same field is kept beside it. Raises InputError if ``info`` can't be written as
+    JSON, or the file can't be written.
     """
     content: dict[str, Any] = {
         "format": FORMAT,

@@ -37,20 +37,10 @@ REFERENCE_MODE: tuple[float, ...] = (1.0, 1.0, 1.0, -1.0, 1.0, 0.0, 0.0)
 def mode_equivalent(
     mode: ArrayLike, pitch: float, nearest_to: ArrayLike = REFERENCE_MODE
 ) -> tuple[FloatArray, int]:
-    """Find the equivalent parameters nearest to a given mode.
+    """Find the equivalent parameters (7,) nearest to a given mode, a₁ … a₅ [-], a₆ and a₇ [mm].
 
-    Parameters
-    ----------
-    mode
-        (7,) a₁ … a₅ [-], a₆ and a₇ [mm].
-    pitch
-        Unit cell size l [mm].
-    nearest_to
-        (7,) what to be near to; distance is Euclidean, with the phases in units of l.
-
-    Returns
-    -------
-    (7,) parameters, and the sign that v₁ takes so that v₁φ stays the same field.
+    Distance is Euclidean, with the phases in units of the pitch l [mm]. The sign is what v₁ takes
+    so that v₁φ stays the same field.
     """
     target = _checked(nearest_to)
     scale = np.array([1, 1, 1, 1, 1, 1 / pitch, 1 / pitch])
@@ -66,11 +56,9 @@ def mode_equivalent(
 def mode_deviation(
     mode: ArrayLike, pitch: float, expected: ArrayLike = REFERENCE_MODE
 ) -> FloatArray:
-    """Deviation of a mode from the expected one [%], equivalents resolved.
+    """(7,) deviation of a mode from the expected one [%], equivalents resolved.
 
-    Returns
-    -------
-    (7,) differences: of a₁ … a₅ in % of 1, of the phases a₆ and a₇ in % of l.
+    Of a₁ … a₅ in % of 1, of the phases a₆ and a₇ in % of l.
     """
     nearest, _ = mode_equivalent(mode, pitch, expected)
     difference = nearest - _checked(expected)
@@ -81,9 +69,7 @@ def mode_deviation(
 def nearest_origin(mode: ArrayLike, pitch: float) -> tuple[ModeFamily, int]:
     """Eq. (mode) with the start that is a given mode, its origin where the phases are smaller.
 
-    Returns
-    -------
-    The family, and the sign that v₁ takes.
+    The sign is what v₁ takes.
     """
     found = []
     for origin in ("junction", "hole"):
@@ -165,33 +151,22 @@ SQUARE = "square, 7 parameters"
 
 @dataclass(frozen=True)
 class WavePattern:
-    """The pattern found in a spectrum.
-
-    Parameters
-    ----------
-    waves
-        Those of the pattern, from right to left by direction; empty if there is none.
-    largest
-        The largest peak outside the edges' lines, pattern or not; None if there is no maximum.
-    family
-        "square, 7 parameters" if Eq. (mode) of the paper describes it: two waves near the
-        diagonals, equal amplitudes in x and in y, the same sign in x and the opposite in y (or
-        the reverse); else "unknown", or "none" without waves.
-    start
-        (7,) start for the mode [-, and mm for a₆, a₇], equivalents resolved; None if the family
-        is not the square one.
-    start_amplitude
-        Amplitude to start v₁φ₁ with: mean amplitude of the waves' y components, with the sign
-        that belongs to ``start`` [mm].
-    text
-        What was found.
-    """
+    """The pattern found in a spectrum."""
 
     waves: tuple[PlaneWave, ...]
+    """Those of the pattern, from right to left by direction; empty if there is none."""
     largest: Peak | None
+    """The largest peak outside the edges' lines, pattern or not; None if there is no maximum."""
     family: str
+    """Is "square, 7 parameters" if Eq. (mode) of the paper describes it: two waves near the diagonals,
+    equal amplitudes in x and in y, the same sign in x and the opposite in y (or the reverse); else
+    "unknown", or "none" without waves."""
     start: tuple[float, ...] | None
+    """(7,) start for the mode [-, and mm for a₆, a₇], equivalents resolved; None if the family is
+    not the square one."""
     start_amplitude: float
+    """Amplitude to start v₁φ₁ with: mean amplitude of the waves' y components, with the sign that
+    belongs to ``start`` [mm]."""
     text: tuple[str, ...]
 
 

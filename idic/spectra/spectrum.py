@@ -1,19 +1,18 @@
 """Energy spectral densities of displacement fields, known at pixels or measured at points.
 
-The paper reads the family of the mode off S_xx and S_yy by eye; ``pattern`` reads it by
-program. Transform and wave vectors, with l the unit cell size::
+The paper reads the family of the mode off S_xx and S_yy by eye; ``pattern`` reads it by program.
+Transform and wave vectors, with l the unit cell size::
 
     û(ξ) = ∫ u(x) exp(−2πi ξ·x/l) dA   [mm³]      S_xx = |û_x|², S_yy = |û_y|²   [mm⁶]
 
-where u is the displacement without its affine part, and zero where there is no material. A
-wave of wavelength λ peaks at |ξ| = l/λ: the square pattern at ξ = (±1/2, ±1/2).
+where u is the displacement without its affine part, and zero where there is no material. A wave of
+wavelength λ peaks at |ξ| = l/λ: the square pattern at ξ = (±1/2, ±1/2).
+
+The points of a subset DIC lie on a regular grid with gaps, at holes and where subsets failed; they
+take the place of pixels, and gaps that of holes. Scattered points are interpolated to such a grid.
 
 Source: M. Grigoriu, Stochastic Calculus (2002), and the paper's Section "Parametrization and
 Initial Guess of the Patterning Modes".
-
-The points of a subset DIC lie on a regular grid with gaps, at holes and where subsets failed; in
-:func:`spectral_density` they take the place of pixels, and gaps that of holes.
-Scattered points are interpolated to such a grid first.
 """
 
 from __future__ import annotations
@@ -36,38 +35,26 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """The Fourier transform of a displacement field without its affine part.
-
-    Parameters
-    ----------
-    xi1, xi2
-        (m,), (n,) wave-vector components [1/l], ascending.
-    u_hat
-        (n, m, 2) transform [mm³] at (xi2, xi1), of u_x and u_y, for the phase origin x = 0.
-    pitch
-        Unit cell size l [mm].
-    x, y
-        (p,), (q,) centres of the bins, both ascending [mm].
-    source
-        (q, p, 2) what was transformed: bin averages of the displacement [mm], zeros included.
-    coverage
-        (q, p) share of each bin that is material [-].
-    affine
-        (2, 3) removed part, u_i = affine[i] · (1, x, y): [mm], [-], [-].
-    extent
-        (2,) width and height of the material's bounding box [mm].
-    """
+    """The Fourier transform of a displacement field without its affine part."""
 
     xi1: FloatArray
     xi2: FloatArray
+    """(m,), (n,) wave-vector components [1/l], ascending."""
     u_hat: ComplexArray
+    """(n, m, 2) transform [mm³] at (xi2, xi1), of u_x and u_y, for the phase origin x = 0."""
     pitch: float
+    """Unit cell size l [mm]."""
     x: FloatArray
     y: FloatArray
+    """(p,), (q,) centres of the bins, both ascending [mm]."""
     source: FloatArray
+    """(q, p, 2) what was transformed: bin averages of the displacement [mm], zeros included."""
     coverage: FloatArray
+    """(q, p) share of each bin that is material [-]."""
     affine: FloatArray
+    """(2, 3) removed part, u_i = affine[i] · (1, x, y): [mm], [-], [-]."""
     extent: tuple[float, float]
+    """(2,) width and height of the material's bounding box [mm]."""
 
     @property
     def S_xx(self) -> FloatArray:
@@ -90,17 +77,7 @@ class Spectrum:
         return float(np.sum(self.source**2) * self.cell)
 
     def at(self, xi: ArrayLike) -> ComplexArray:
-        """Evaluate the transform at any wave vector, not only on the axes' values.
-
-        Parameters
-        ----------
-        xi
-            (2,) wave vector (ξ1, ξ2) [1/l].
-
-        Returns
-        -------
-        (2,) of u_x and u_y [mm³].
-        """
+        """(2,) transform of u_x and u_y [mm³] at any wave vector (ξ1, ξ2) [1/l]."""
         xi1, xi2 = np.asarray(xi, dtype=np.float64) / self.pitch
         along_x = np.exp(-2j * np.pi * xi1 * self.x)
         along_y = np.exp(-2j * np.pi * xi2 * self.y)
@@ -123,24 +100,21 @@ def spectral_density(
     bins_per_cell: int = 24,
     padding: int = 4,
 ) -> Spectrum:
-    """Transform a displacement field given at pixels.
+    """Transform a displacement field (rows, cols, 2) [mm], along x and y (up), given at pixels.
 
     Parameters
     ----------
-    displacement
-        (rows, cols, 2) [mm], components along x and y (up); anything outside the material.
-    grid
-        Pixels to millimetres.
     mask
-        (rows, cols) True where there is material.
+        (rows, cols) True where there is material; what the displacement is elsewhere doesn't
+        matter.
     pitch
         Unit cell size l [mm].
     bins_per_cell
         Pixels are averaged in blocks of at most l / ``bins_per_cell``. At the pattern's wave
         vectors this lowers û by (π/2/24)²/6 = 0.07 % per direction.
     padding
-        The bounding box of the material is padded with zeros to this many times its size, for
-        the resolution of ξ; no information is added.
+        The bounding box of the material is padded with zeros to this many times its size, for the
+        resolution of ξ; no information is added.
 
     Raises
     ------
@@ -233,26 +207,11 @@ MOST_POINTS = 4e7
 
 
 def measured_spectrum(field: LocalField, pitch: float, region: Box | None = None) -> Spectrum:
-    """Transform a displacement field measured at points.
+    """Transform a displacement field measured at points; those that are not valid count as gaps.
 
-    Parameters
-    ----------
-    field
-        What was measured; points that are not valid count as gaps.
-    pitch
-        Unit cell size l [mm].
-    region
-        Only the points in this box: for parts of a specimen with patterns of their own.
-
-    Returns
-    -------
-    Spectrum
-        The affine part of the field removed, over this region alone.
-
-    Raises
-    ------
-    InputError
-        If no valid point is in the region, or the points are too sparse for the unit cell.
+    With a region only the points in this box, for parts of a specimen with patterns of their own,
+    and the affine part over it alone; ``pitch`` is l [mm]. Raises InputError if no valid point is
+    in the region, or the points are too sparse for the unit cell.
     """
     if region is not None:
         field = field.within(region)
@@ -271,15 +230,9 @@ def measured_spectrum(field: LocalField, pitch: float, region: Box | None = None
 def gridded(field: LocalField) -> tuple[FloatArray, PixelGrid, BoolArray]:
     """Put a field on a regular grid of its own spacing.
 
-    Returns
-    -------
     (rows, cols, 2) displacements [mm], 0 in gaps; the grid, whose "pixels" are the points; and
-    (rows, cols) True where there is a point.
-
-    Raises
-    ------
-    InputError
-        If the points spread over far more than they fill.
+    (rows, cols) True where there is a point. Raises InputError if the points spread over far more
+    than they fill.
     """
     x, y, u = field.valid_points()
     step = field.spacing

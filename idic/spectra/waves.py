@@ -49,44 +49,29 @@ specimen before buckling less than 3."""
 
 @dataclass(frozen=True)
 class Peak:
-    """A maximum of S_xx + S_yy outside the edges' lines.
-
-    Parameters
-    ----------
-    xi
-        Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since
-        S(−ξ) = S(ξ).
-    density
-        S_xx + S_yy there [mm⁶].
-    contrast
-        That density over the median of all the wave vectors searched [-].
-    """
+    """A maximum of S_xx + S_yy outside the edges' lines."""
 
     xi: tuple[float, float]
+    """Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since S(−ξ) =
+    S(ξ)."""
     density: float
+    """S_xx + S_yy there [mm⁶]."""
     contrast: float
+    """That density over the median of all the wave vectors searched [-]."""
 
 
 @dataclass(frozen=True)
 class PlaneWave:
-    """One plane wave, A sin(π/l (k·x + c)), directed upwards (k_y > 0) or, if level, to the right.
-
-    Parameters
-    ----------
-    k
-        Wave vector [π/l]; (1, 1) is a wavelength of 2l along both axes.
-    amplitude
-        (x, y) amplitudes with their signs [mm], averaged under the Hann taper.
-    phase
-        Shift c [mm], between −l/2 and l/2; the rest is in the signs.
-    out_of_phase
-        Share of the wave that no common phase of x and y describes [-]; 0 for a plain sine.
-    """
+    """A plane wave A sin(π/l (k·x + c)), directed upwards (k_y > 0) or, if level, to the right."""
 
     k: tuple[float, float]
+    """Wave vector [π/l]; (1, 1) is a wavelength of 2l along both axes."""
     amplitude: tuple[float, float]
+    """(x, y) amplitudes with their signs [mm], averaged under the Hann taper."""
     phase: float
+    """Shift c [mm], between −l/2 and l/2; the rest is in the signs."""
     out_of_phase: float
+    """Share of the wave that no common phase of x and y describes [-]; 0 for a plain sine."""
 
     @property
     def xi(self) -> tuple[float, float]:
@@ -178,8 +163,6 @@ def explained_share(spectrum: Spectrum, waves: Sequence[PlaneWave | Peak]) -> fl
 def common_phase(z: ComplexArray) -> tuple[float, FloatArray, float]:
     """Split the phase off that both of two complex amplitudes have.
 
-    Returns
-    -------
     The angle [rad], the (2,) real amplitudes, and the share of z that is out of phase.
     """
     angle = 0.5 * float(np.angle(np.sum(z**2)))
@@ -211,8 +194,6 @@ def _amplitudes(
 ) -> tuple[ComplexArray, float]:
     """Weighted least squares for given wave vectors.
 
-    Returns
-    -------
     (n, 2) complex amplitudes z [mm], the wave being Im(z exp(2πi ξ·x/l)), and the share of the
     field's weighted square that they explain.
     """
@@ -268,27 +249,18 @@ MOST_WAVES = 12
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The waves chosen, and how the energy explained grew with their number.
-
-    Parameters
-    ----------
-    xi
-        (w, 2) wave vectors [1/l].
-    amplitudes
-        (w, 2) complex z [unit of the field]: the waves' sum is Im Σ z exp(2πi ξ·x/l).
-    star
-        (w,) which of the stars each belongs to, from 0.
-    captured
-        Share of ∫ |u|² over the material that they explain [-].
-    growth
-        (number of waves, share), also beyond those chosen.
-    """
+    """The waves chosen, and how the energy explained grew with their number."""
 
     xi: FloatArray
+    """(w, 2) wave vectors [1/l]."""
     amplitudes: ComplexArray
+    """(w, 2) complex z [unit of the field]: the waves' sum is Im Σ z exp(2πi ξ·x/l)."""
     star: tuple[int, ...]
+    """(w,) which of the stars each belongs to, from 0."""
     captured: float
+    """Share of ∫ |u|² over the material that they explain [-]."""
     growth: tuple[tuple[int, float], ...]
+    """(number of waves, share), also beyond those chosen."""
 
     @property
     def next_gain(self) -> float:
@@ -300,16 +272,8 @@ class Selection:
 class WaveFit:
     """Least squares over the material with any of some plane waves.
 
-    Parameters
-    ----------
-    rule
-        Quadrature over the material.
-    field
-        (q, 2) what to fit, at its points, without mean.
-    xi
-        (c, 2) wave vectors of all candidates [1/l].
-    pitch
-        l [mm].
+    The field (q, 2), without mean, is given at the points of the quadrature; the candidates' wave
+    vectors are (c, 2) [1/l], and l is ``pitch`` [mm].
     """
 
     def __init__(
@@ -342,21 +306,8 @@ def select_waves(
 ) -> Selection:
     """Add stars of waves until the next would explain less than ``growth`` of the energy.
 
-    Parameters
-    ----------
-    spectrum
-        Of the field.
-    rule
-        Quadrature over the material.
-    field
-        (q, 2) the field at its points, without mean.
-    growth
-        Least share of the energy that a further star must add [-].
-
-    Raises
-    ------
-    InputError
-        If ``growth`` is not between 0 and 1.
+    The field (q, 2), without mean, is given at the points of the quadrature. Raises InputError if
+    ``growth`` is not between 0 and 1.
     """
     if not 0 < growth < 1:
         raise InputError(f"mode family: expected a growth between 0 and 1, got {growth}")

@@ -3,9 +3,9 @@
 Linear propagation of the unknowns' covariance, at any positions. Two causes are kept apart:
 
 * the images' noise, from :meth:`modeharvest.idic.result.Result.covariance`;
-* the model error w: its residual moves the unknowns, cell by cell. Taking the cells for
-  independent gives the sandwich covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ of robust statistics, with the
-  block gradients g_b = Σ_{x in b} Jᵀr and one block for a unit cell.
+* the model error w: its residual moves the unknowns, cell by cell. Taking the cells for independent
+  gives the sandwich covariance H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹ of robust statistics, with the block
+  gradients g_b = Σ_{x in b} Jᵀr and one block for a unit cell.
 
 How far a gradient moves the unknowns is a matter of the cost's Hessian H. Gauss and Newton's JᵀJ is
 that without residual; with a large w the curvature is smaller, and the same noise does more.
@@ -45,38 +45,23 @@ _EXAMPLES = 4
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """The (n, n) covariances of a result's unknowns by their causes.
-
-    Parameters
-    ----------
-    by_noise
-        By the images' noise.
-    by_model_error
-        By the residual, cell by cell; None where there are too few cells.
-    warnings
-        Why, one sentence each.
-    """
+    """The (n, n) covariances of a result's unknowns by their causes."""
 
     by_noise: FloatArray
+    """By the images' noise."""
     by_model_error: FloatArray | None
+    """By the residual, cell by cell; None where there are too few cells."""
     warnings: tuple[str, ...] = ()
+    """Why, one sentence each."""
 
 
 def covariance(
     result: Result, pair: ImagePair, noise: ImageNoise, block: float, edge_px: int
 ) -> Covariance:
-    """Find the covariances of the unknowns of a correlation.
+    """Find the covariances of the unknowns of a correlation, by the images without final smoothing.
 
-    Parameters
-    ----------
-    result, pair
-        Of the correlation, and the images without final smoothing.
-    noise
-        Of the images.
-    block
-        Edge of the blocks that are taken for independent [mm]: the unit cell.
-    edge_px
-        Of :class:`~modeharvest.idic.setup.CorrelationOptions`.
+    Blocks of edge ``block`` [mm], the unit cell, are taken for independent; ``edge_px`` as in
+    :class:`~modeharvest.idic.setup.CorrelationOptions`.
     """
     blur_px = result.final_smoothing.blur_px if result.final_smoothing else 0.0
     matched = MatchedImages.of(result, smoothed_pair(pair, blur_px), edge_px)
@@ -107,35 +92,19 @@ def _smoothed_noise(
 
 @dataclass(frozen=True, eq=False)
 class MatchedImages:
-    """A result and the images as the last level of the correlation compared them.
-
-    Parameters
-    ----------
-    result
-        Of the correlation.
-    reference, deformed
-        (rows, cols) f, and g continued into its holes [grey levels]: without that
-        g has edges at its holes, whose curvature is none of the cost's.
-    used
-        (rows, cols) True on the pixels that count.
-    """
+    """A result and the images as the last level of the correlation compared them."""
 
     result: Result
     reference: FloatImage
     deformed: FloatImage
+    """(rows, cols) f, and g continued into its holes [grey levels]: without that g has edges at its
+    holes, whose curvature is none of the cost's."""
     used: BoolArray
+    """(rows, cols) True on the pixels that count."""
 
     @classmethod
     def of(cls, result: Result, pair: ImagePair, edge_px: int) -> MatchedImages:
-        """Prepare the images once more as the last level of a correlation did.
-
-        Parameters
-        ----------
-        result, pair
-            Of the correlation.
-        edge_px
-            Of :class:`~modeharvest.idic.setup.CorrelationOptions`.
-        """
+        """Prepare the images of a result once more as the last level of its correlation did."""
         level = level_pair(pair, FULL, edge_px, result.order)
         used = level.mask
         if level.valid is not None:
@@ -184,11 +153,6 @@ class MatchedImages:
 
         H⁻¹ V H⁻¹, where V = M C M, C = ``result.covariance(noise)`` and M is Gauss and Newton's
         curvature. Where the residual is noise there is no such difference, and C itself is given.
-
-        Parameters
-        ----------
-        noise
-            Of the images, or the standard deviation of both [grey levels].
         """
         result = self.result
         found = result.covariance(noise)
@@ -203,20 +167,11 @@ class MatchedImages:
         return found
 
     def sandwich_covariance(self, block: float) -> FloatArray:
-        """(n, n) covariance of the unknowns by the model error.
+        """(n, n) covariance of the unknowns by the model error, by blocks of edge ``block`` [mm].
 
-        The images' noise is in it, too: it is in the residual. Where w has the lattice's own
-        period the block gradients are alike, and their independence is an assumption.
-
-        Parameters
-        ----------
-        block
-            Edge of the blocks [mm]: the unit cell.
-
-        Raises
-        ------
-        InputError
-            If there are fewer than eight blocks.
+        The images' noise is in it, too: it is in the residual. Where w has the lattice's own period
+        the block gradients are alike, and their independence is an assumption. Raises InputError if
+        there are fewer than eight blocks.
         """
         gradients = self._block_gradients(self._blocks(block), self.reference, self.deformed)
         return _sandwich(self.inverse_hessian, gradients)
@@ -231,17 +186,9 @@ class MatchedImages:
 
         For images that were filtered before they were correlated: their noise is not white any
         more, and :meth:`modeharvest.idic.result.Result.covariance` does not hold. Every example
-        gives each block a gradient; the covariance is their mean square. What the noise does to
-        the gradient that w is seen with is in it.
-
-        Parameters
-        ----------
-        examples
-            Of the noise in f and in g, (rows, cols) each, filtered as they were.
-        block
-            As for :meth:`sandwich_covariance`.
-        inverse
-            (n, n) in place of :attr:`inverse_hessian`.
+        gives each block a gradient; the covariance is their mean square. What the noise does to the
+        gradient that w is seen with is in it. The examples are of the noise in f and in g, (rows,
+        cols) each, filtered as they were; ``inverse`` (n, n) stands for :attr:`inverse_hessian`.
         """
         blocks, f, g = self._blocks(block), self.reference, self.deformed
         without = self._block_gradients(blocks, f, g)
@@ -290,24 +237,16 @@ def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class FieldErrors:
-    """Standard deviations at positions that broadcast to a shape (...).
-
-    Parameters
-    ----------
-    v0
-        (..., 2) of the slow field's components [mm].
-    v
-        (modes, ...) of the amplitudes v_i [mm].
-    fluctuation
-        (modes, ..., 2) of the components of v_i phi_i [mm].
-    displacement
-        (..., 2) of the whole displacement [mm].
-    """
+    """Standard deviations at positions that broadcast to a shape (...)."""
 
     v0: FloatArray
+    """(..., 2) of the slow field's components [mm]."""
     v: FloatArray
+    """(modes, ...) of the amplitudes v_i [mm]."""
     fluctuation: FloatArray
+    """(modes, ..., 2) of the components of v_i phi_i [mm]."""
     displacement: FloatArray
+    """(..., 2) of the whole displacement [mm]."""
 
 
 def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLike) -> FieldErrors:
@@ -315,15 +254,12 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
 
     Parameters
     ----------
-    result
-        Of a correlation.
     x, y
-        Positions [mm] that broadcast together, or two axes. The errors are as smooth as the
-        ansatz: a coarse grid will do.
+        Positions [mm] that broadcast together, or two axes. The errors are as smooth as the ansatz:
+        a coarse grid will do.
     covariance
         (n, n) of the unknowns: ``result.covariance(noise_sd)``, or one of a :class:`Covariance`.
-        Unknowns of infinite variance, about which the images say nothing, make the fields they
-        touch infinite.
+        Unknowns of infinite variance make the fields they touch infinite.
     """
     ansatz, a = result.ansatz, result.unknowns
     matrix = np.asarray(covariance, dtype=np.float64)

@@ -23,18 +23,12 @@ OBSERVABLE = 2.0
 
 @dataclass(frozen=True)
 class Combination:
-    """Unknowns that the images hardly distinguish.
-
-    Parameters
-    ----------
-    eigenvalue
-        Of the column-scaled Gauss-Newton matrix, whose eigenvalues have the mean 1 [-].
-    terms
-        The largest parts: name of the unknown and its weight in the scaled eigenvector.
-    """
+    """Unknowns that the images hardly distinguish."""
 
     eigenvalue: float
+    """Of the column-scaled Gauss-Newton matrix, whose eigenvalues have the mean 1 [-]."""
     terms: tuple[tuple[str, float], ...]
+    """The largest parts: name of the unknown and its weight in the scaled eigenvector."""
 
     def __str__(self) -> str:
         parts = " ".join(f"{weight:+.2f} {name}" for name, weight in self.terms)
@@ -43,34 +37,23 @@ class Combination:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """How well a correlation's unknowns are determined.
-
-    Parameters
-    ----------
-    condition_number
-        Of the column-scaled Gauss-Newton matrix.
-    undetermined
-        Names of the unknowns that the images say nothing about.
-    worst
-        The worst-determined combinations of the others, the worst first.
-    overlap
-        For each mode the largest cosine between a displacement that its v_i and phi_i can make
-        and one that v0 can make [-]: 1 would mean that they are one.
-    model_error_px
-        Estimate, rms per component: residual over grey-level gradient [px].
-    amplitude_px
-        For each mode the rms of v_i phi_i per component [px].
-    speckle_px
-        Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known.
-    """
+    """How well a correlation's unknowns are determined."""
 
     condition_number: float
+    """Of the column-scaled Gauss-Newton matrix."""
     undetermined: tuple[str, ...]
+    """Names of the unknowns that the images say nothing about."""
     worst: tuple[Combination, ...]
+    """The worst-determined combinations of the others, the worst first."""
     overlap: tuple[float, ...]
+    """For each mode the largest cosine between a displacement that its v_i and phi_i can make and
+    one that v0 can make [-]: 1 would mean that they are one."""
     model_error_px: float
+    """Estimate, rms per component: residual over grey-level gradient [px]."""
     amplitude_px: tuple[float, ...]
+    """For each mode the rms of v_i phi_i per component [px]."""
     speckle_px: float = np.inf
+    """Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known."""
 
     @property
     def unobservable(self) -> tuple[int, ...]:
@@ -106,17 +89,9 @@ class Identifiability:
 def identifiability(result: Result, mask: ArrayLike | None = None) -> Identifiability:
     """Look at the Gauss-Newton matrix and at the displacements that the unknowns make.
 
-    Parameters
-    ----------
-    result
-        Of a correlation, or of a fit to a displacement (then ``model_error_px`` is its residual).
-    mask
-        (rows, cols) True on material; everywhere by default.
-
-    Raises
-    ------
-    InputError
-        If the mask is not of the images' size or has no material.
+    Of a correlation, or of a fit to a displacement (then ``model_error_px`` is its residual); the
+    mask (rows, cols) is True on material, everywhere by default. Raises InputError if it is not of
+    the images' size or has no material.
     """
     S, u = _sensitivities(result, mask)
     ansatz, n_modes = result.ansatz, len(result.ansatz.modes)
