@@ -92,8 +92,8 @@ class PhotographOptions(AnsatzOptions):
     order: int | None = None
     """As in :class:`CorrelationOptions`."""
     formulation: str = "total"
-    """Each image is measured against the reference ("total"), or against the one before, pulled back
-    to the reference's frame ("updated"), for speckles that change on the way."""
+    """Images are measured against the reference ("total") or each against the one before, pulled
+    back to the reference's frame ("updated"): for speckles that change on the way."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -146,8 +146,7 @@ class LocalField:
 
     @property
     def rms_beyond_noise(self) -> float:
-        """√(rms² − sd²) [mm]: rms without the field's own errors, at least 0; NaN without any sd.
-        """
+        """√(rms² − sd²) [mm]: rms without the field's own errors, at least 0; NaN without sd."""
         return float(np.sqrt(np.maximum(0.0, self.rms**2 - self.sd_rms**2)))
 
 

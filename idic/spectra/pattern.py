@@ -158,9 +158,9 @@ class WavePattern:
     largest: Peak | None
     """The largest peak outside the edges' lines, pattern or not; None if there is no maximum."""
     family: str
-    """Is "square, 7 parameters" if Eq. (mode) of the paper describes it: two waves near the diagonals,
-    equal amplitudes in x and in y, the same sign in x and the opposite in y (or the reverse); else
-    "unknown", or "none" without waves."""
+    """One of "square, 7 parameters", if Eq. (mode) of the paper describes it: two waves near the
+    diagonals, equal amplitudes in x and in y, the same sign in x and the opposite in y (or the
+    reverse); else "unknown", or "none" without waves."""
     start: tuple[float, ...] | None
     """(7,) start for the mode [-, and mm for a₆, a₇], equivalents resolved; None if the family is
     not the square one."""
