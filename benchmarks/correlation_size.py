@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.assembly import Assembly, residual
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions
 from modeharvest.idic.solver.pyramid import blurred

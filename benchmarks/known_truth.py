@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, square_family
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle

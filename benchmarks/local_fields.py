@@ -16,12 +16,12 @@ from functools import partial
 import numpy as np
 
 from modeharvest.fem.field import Solution
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.photograph.initial_guess import InitialGuess, initial_guess
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.imageset import ImageSet, make_images
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.case import shipped_solution

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
+from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.local.field import LocalField, write_field
 from modeharvest.idic.local.subsets import SubsetOptions, subset_field
-from modeharvest.idic.slow_fields import orders
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.imaging.distortion.calibration.result import sampled_correlations

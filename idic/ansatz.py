@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.chebyshev import Box, Brightness, ChebyshevField
 from modeharvest.idic.modes import FAMILIES, FourierMode, ModeFamily, Taper
-from modeharvest.idic.slow_fields import Box, Brightness, ChebyshevField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Brightness
 from modeharvest.idic.solver.assembly import Assembly, residual
 from modeharvest.idic.solver.final_smoothing import FinalSmoothing, smoothed_pair, speckle_size
 from modeharvest.idic.solver.gauss_newton import (

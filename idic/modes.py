@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.slow_fields import Box, sum_of_products
+from modeharvest.idic.chebyshev import Box, sum_of_products
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 

@@ -10,9 +10,9 @@ from manufactured import DOMAIN, GRID, PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, square_family
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

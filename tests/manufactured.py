@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import spherical_jn
 
-from modeharvest.idic.slow_fields import orders
+from modeharvest.idic.chebyshev import orders
 
 FloatArray = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from manufactured import image_pair, reference_points, speckle
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, square_family
 from modeharvest.idic.photograph.holes import find_hole_lattice
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import spectral_density

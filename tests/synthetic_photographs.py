@@ -12,7 +12,7 @@ from manufactured import inverted
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.slow_fields import Box
+from modeharvest.idic.chebyshev import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 

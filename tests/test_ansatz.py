@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modeharvest.idic.ansatz import Ansatz, ansatz_from_dict
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import to_plain
 

@@ -15,8 +15,8 @@ from known_fields import square_mode
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family, overlap
 from modeharvest.util.errors import InputError
 

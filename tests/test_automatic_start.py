@@ -12,6 +12,7 @@ from known_fields import sampled_field, square_mode
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import AnsatzOptions
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion, outline_motion, robust_fit
@@ -21,7 +22,6 @@ from modeharvest.idic.photograph.initial_guess import (
 )
 from modeharvest.idic.photograph.region import hole_centres
 from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
 from modeharvest.imaging.grid import PixelGrid

@@ -14,9 +14,9 @@ from manufactured import GRID
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Brightness
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import chebyshev as numpy_chebyshev
 
-from modeharvest.idic.slow_fields import Box, ChebyshevField, chebyshev, orders, sum_of_products
+from modeharvest.idic.chebyshev import Box, ChebyshevField, chebyshev, orders, sum_of_products
 from modeharvest.util.errors import InputError
 
 few = settings(max_examples=25, deadline=None, derandomize=True)

@@ -12,11 +12,11 @@ from manufactured import GRID, PIXEL, CosinePattern
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level, eroded
 from modeharvest.imaging.grid import PixelGrid

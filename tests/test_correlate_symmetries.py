@@ -15,11 +15,11 @@ from manufactured import PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.modes import FourierMode, Taper, square_family
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Outcome
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid

@@ -13,9 +13,9 @@ from known_fields import square_mode
 from perforated import OBLIQUE, PITCH, SQUARE, holed_cell
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.modes import FourierMode, Taper
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import (
     FORMAT,

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.final_smoothing import (
     WIDTHS,
     FinalSmoothing,

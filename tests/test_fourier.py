@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, ModeFamily, Taper, free_family, square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.util.errors import InputError
 
 L = 1.9

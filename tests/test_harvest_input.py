@@ -14,8 +14,8 @@ from synthetic_photographs import NOISE, Photographed, lattice_points, of
 
 from modeharvest.cli.root import main
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.noise import measured_noise
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from synthetic_photographs import Displacement, Photographed, lattice_points, of
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, free_family, square_family
 from modeharvest.idic.photograph.measure import MeasuredPhotograph
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase

@@ -13,10 +13,10 @@ from manufactured import DOMAIN, GRID, PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.modes import FourierMode, square_family
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver import level_search
 from modeharvest.idic.solver.assembly import Assembly, residual, valid_pixels
 from modeharvest.idic.solver.gauss_newton import Outcome

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.slow_fields import Box
 from modeharvest.util.errors import InputError
 
 X, Y = (a.ravel() for a in np.meshgrid(np.arange(5.0), np.arange(4.0)))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from known_fields import sampled_field, square_mode
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE, read_pattern
 from modeharvest.idic.spectra.spectrum import gridded, measured_spectrum, spectral_density
 from modeharvest.idic.spectra.waves import find_peaks

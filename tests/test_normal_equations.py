@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.slow_fields import Brightness, ChebyshevField
+from modeharvest.idic.chebyshev import Brightness, ChebyshevField
 from modeharvest.idic.solver.assembly import Assembly, NormalEquations
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage

@@ -13,9 +13,9 @@ from polynomial_fits import polynomial_transfer
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.report.study_resolution import measured_waves, noise_floors, resolution_findings

@@ -12,10 +12,10 @@ from manufactured import PIXEL
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
 from modeharvest.idic.solver.pyramid import Level, blurred
 from modeharvest.imaging.grid import PixelGrid

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import Taper
-from modeharvest.idic.slow_fields import Box
 from modeharvest.util.errors import InputError
 
 TAPER = Taper(Box(-5.7, 5.7, -9.5, 9.0), 0.95)

@@ -9,8 +9,8 @@ import pytest
 from filling_mode import MASK, case
 from manufactured import GRID
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.validation.onset import ImageAmplitude, find_buckling, mean_strain
 

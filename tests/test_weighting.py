@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box, Brightness
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.slow_fields import Box, Brightness
 from modeharvest.idic.solver.assembly import Assembly, warped_back
 from modeharvest.idic.solver.gauss_newton import GaussNewtonOptions, Minimum, Outcome
 from modeharvest.idic.solver.level_search import step_length

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.uncertainty.identifiability import OBSERVABLE
 
 _FIT = 3

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, Taper, square_family
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images

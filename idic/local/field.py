@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.tables import ROLES, Column, Table, choose, read_table
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, FloatArray

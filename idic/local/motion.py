@@ -21,8 +21,8 @@ from scipy.ndimage import binary_fill_holes
 from skimage.registration import optical_flow_ilk
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import Level, LevelPair, level_pair
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField, read_field
 from modeharvest.idic.local.motion import CELL_PX, coarse_field, first_motion
 from modeharvest.idic.local.tables import read_table
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray

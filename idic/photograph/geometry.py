@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.photograph.holes import HoleLattice, find_hole_lattice
 from modeharvest.idic.photograph.matching import (
     BlockMatch,
@@ -25,7 +26,6 @@ from modeharvest.idic.photograph.region import (
     region_of_mask,
     region_of_polygon,
 )
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import read_mask, require_same_shape

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modeharvest.idic.ansatz import Ansatz, AnsatzOptions
+from modeharvest.idic.chebyshev import Box, Brightness
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import (
     SLOW_DEGREE,
@@ -33,7 +34,6 @@ from modeharvest.idic.modes import ModeFamily, Taper, free_family, square_family
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.region import WRONG_CELL, Cells, box_of, junction
 from modeharvest.idic.setup import PhotographOptions
-from modeharvest.idic.slow_fields import Box, Brightness
 from modeharvest.idic.spectra.pattern import WavePattern, nearest_origin, read_pattern
 from modeharvest.idic.spectra.spectrum import measured_spectrum
 from modeharvest.idic.spectra.waves import PlaneWave

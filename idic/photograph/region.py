@@ -15,9 +15,9 @@ from scipy.ndimage import find_objects, label
 from scipy.spatial import KDTree
 from skimage.draw import polygon2mask
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.photograph.holes import HoleLattice, find_holes
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.modes import PER_WAVE
-from modeharvest.idic.slow_fields import orders
 from modeharvest.idic.solver.passes import (
     Runs,
     accumulate,

@@ -26,8 +26,8 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import find_objects
 from scipy.spatial import cKDTree
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
-from modeharvest.idic.slow_fields import Box
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.util.arrays import BoolArray, ComplexArray, FloatArray
 from modeharvest.util.errors import InputError

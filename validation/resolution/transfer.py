@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.slow_fields import orders
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import FloatArray

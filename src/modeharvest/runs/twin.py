@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.photograph.measure import MeasuredPhotograph
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
 from modeharvest.imaging.distortion.lens import Distortion

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.photograph.holes import HoleLattice
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum

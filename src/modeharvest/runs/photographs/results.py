@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.photograph.geometry import Geometry
 from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise, residual_test
 from modeharvest.idic.result import Result
-from modeharvest.idic.slow_fields import Box
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
