@@ -48,9 +48,6 @@ from modeharvest.util.scaled_eigen import ScaledEigen
 
 _FINE_PX = 6.5
 """Speckles narrower than this want a spline of order 11."""
-_EIGENVALUE_CUTOFF = 1e-3
-"""On coarse levels, directions with an eigenvalue below this share of the largest one wait for
-the finest level: what a blur does to the images would send them into other valleys."""
 WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes with nothing to assess."""
 
@@ -212,7 +209,6 @@ def fit_displacement(
         step_length(ansatz, grid, inside, 1),
         guess[: ansatz.size],
         options,
-        options.tolerance_px,
         on_iteration=course.report,
     )
     course.lap("iterate")
@@ -293,18 +289,14 @@ class _Course:
         Where gain or offset are unknowns, coarse levels see locally normalised images: what the
         brightness could absorb there is much of the blurred speckle itself.
         """
-        limits = self.options.gauss_newton
         normalised = ansatz.brightness.size > 0 and not finest
         order = order if level == FULL else min(order, 5)
-        coarse_px = limits.coarse_tolerance_px * level.factor
         return LevelSearch(
             level_pair(pair, level, self.options.edge_px, order, normalised=normalised),
             ansatz if finest else replace(ansatz, brightness=Brightness()),
             level,
-            0.0 if finest else _EIGENVALUE_CUTOFF,
-            limits.tolerance_px if finest else coarse_px,
-            coarse_px,
-            limits,
+            finest,
+            self.options.gauss_newton,
             self.report,
         )
 

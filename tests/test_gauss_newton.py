@@ -28,13 +28,11 @@ def run(residual: Residual, start: list[float], left: float = 0.0, **options: fl
         matrix = J.T @ J if with_matrix else np.zeros((len(a), len(a)))
         return NormalEquations(matrix, -J.T @ r, 0.5 * float(r @ r), 100 - off, off)
 
-    chosen = GaussNewtonOptions(**options)  # type: ignore[arg-type]
     return minimise(
         evaluate,
         lambda a, b: float(np.linalg.norm(b - a)),
         np.array(start, dtype=float),
-        chosen,
-        chosen.tolerance_px,
+        GaussNewtonOptions(**options),  # type: ignore[arg-type]
     )
 
 

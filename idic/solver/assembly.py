@@ -238,8 +238,7 @@ def valid_pixels(
     """
     kept = assembly.mask.copy()
     nothing = np.zeros((0, 0, 0), dtype=np.float32)
-    outside = _run(assembly, a, reference, deformed, valid, kept, nothing)
-    return kept, outside
+    return kept, _warp(assembly, a, reference, deformed, nothing, valid, kept)
 
 
 def residual(
@@ -247,7 +246,7 @@ def residual(
 ) -> NDArray[np.float32]:
     """(rows, cols) f - (1 + b) g(x + u) - c; NaN where no pixel counts or g doesn't reach."""
     left = np.full((1, *assembly.grid.shape), np.nan, dtype=np.float32)
-    _fill(left, assembly, a, reference, deformed)
+    _warp(assembly, a, reference, deformed, left)
     return np.asarray(left[0])
 
 
@@ -259,7 +258,7 @@ def warped_back(
     The gradient in [grey levels/mm]; 0, and f, where no pixel counts or g doesn't reach.
     """
     found = np.zeros((3, *assembly.grid.shape), dtype=np.float32)
-    _fill(found, assembly, a, reference, deformed)
+    _warp(assembly, a, reference, deformed, found)
     np.subtract(reference, found[2], out=found[2])
     return found
 
@@ -272,32 +271,23 @@ def push_forward(assembly: Assembly, a: FloatArray, slopes: NDArray[np.float32])
     """
     everywhere = Assembly(assembly.ansatz, assembly.grid, np.ones(assembly.grid.shape, np.bool_))
     u = np.zeros((2, *assembly.grid.shape), dtype=np.float32)
-    nothing = np.zeros((0, 0), dtype=np.bool_)
-    _run(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), nothing, nothing, u)
+    _warp(everywhere, a, slopes[0], SplineImage.of(np.zeros((2, 2))), u)
     in_parallel(push_forward_rows, u, slopes, assembly.grid.pixel_size)
 
 
-def _fill(
-    left: NDArray[np.float32],
+_NOTHING = np.zeros((0, 0), dtype=np.bool_)
+
+
+def _warp(
     assembly: Assembly,
     a: FloatArray,
     reference: NDArray[Any],
     deformed: SplineImage,
-) -> None:
-    """Fill (1, rows, cols) with the residual, or (3, rows, cols) with slopes and residual."""
-    nothing = np.zeros((0, 0), dtype=np.bool_)
-    _run(assembly, a, reference, deformed, nothing, nothing, left)
-
-
-def _run(
-    assembly: Assembly,
-    a: FloatArray,
-    reference: NDArray[Any],
-    deformed: SplineImage,
-    valid: BoolArray,
-    kept: BoolArray,
     left: NDArray[np.float32],
+    valid: BoolArray = _NOTHING,
+    kept: BoolArray = _NOTHING,
 ) -> int:
+    """Fill ``left`` or ``kept`` as :func:`warp_pass` does; how many pixels are mapped outside."""
     ansatz, outside = assembly.ansatz, np.zeros(BANDS, dtype=np.int64)
     tables = tables_of(ansatz, assembly.grid, ansatz.checked(a))
     target = Target.images(reference, deformed, assembly.grid)

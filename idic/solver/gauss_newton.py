@@ -153,7 +153,6 @@ def minimise(
     step_length: StepLength,
     start: FloatArray,
     options: GaussNewtonOptions,
-    tolerance_px: float,
     factor: int = 1,
     on_iteration: Callable[[int], None] = lambda number: None,
     curvature: FloatArray | None = None,
@@ -180,22 +179,23 @@ def minimise(
     eigenvalue_cutoff
         Directions with an eigenvalue below this share of the largest one get no step [-].
     """
-    at = _SearchPoint.of(start, evaluate(start, curvature is None), curvature)
-    limits = _Limits(options, tolerance_px, _SHORT * factor, eigenvalue_cutoff)
+    is_assembled = curvature is None
+    here = evaluate(start, is_assembled)
+    known = here.matrix if curvature is None else curvature
+    at = _SearchPoint(start, here, is_assembled, known, has_fallen=is_assembled)
     history: list[Iteration] = []
     outcome = Outcome.OUTSIDE_IMAGE if _share_outside(at.equations) > options.max_outside else None
     while outcome is None:
         if not np.any(at.curvature):
             outcome = Outcome.SINGULAR
             break
-        step = _descend(at, evaluate, step_length, limits)
+        step = _descend(at, evaluate, step_length, options, _SHORT * factor, eigenvalue_cutoff)
         at = step.to if step.accepted else at
         number, damping, here = len(history) + 1, step.damping, at.equations
-        history.append(
-            Iteration(factor, number, here.mean_square, step.length_px, damping, here.pixels)
-        )
+        taken = Iteration(factor, number, here.mean_square, step.length_px, damping, here.pixels)
+        history.append(taken)
         on_iteration(number)
-        outcome = _ending(step, number, limits)
+        outcome = _ending(step, number, options)
         at = replace(at, damping=0.0 if damping <= _FIRST_DAMPING else 0.1 * damping)
     there = at.equations if at.is_assembled else evaluate(at.a, True)
     return Minimum(at.a, there, outcome, tuple(history), at.curvature)
@@ -213,22 +213,6 @@ class _SearchPoint:
     """Whether the cost still falls a lot: then Gauss-Newton's own matrix is the best."""
     damping: float = 0.0
 
-    @classmethod
-    def of(
-        cls, a: FloatArray, equations: NormalEquations, known: FloatArray | None
-    ) -> _SearchPoint:
-        if known is None:
-            return cls(a, equations, True, equations.matrix)
-        return cls(a, equations, False, known, has_fallen=False)
-
-
-@dataclass(frozen=True)
-class _Limits:
-    options: GaussNewtonOptions
-    tolerance_px: float
-    short_px: float
-    eigenvalue_cutoff: float
-
 
 @dataclass(frozen=True, eq=False)
 class _TrialStep:
@@ -242,20 +226,25 @@ class _TrialStep:
 
 
 def _descend(
-    at: _SearchPoint, evaluate: Evaluate, step_length: StepLength, limits: _Limits
+    at: _SearchPoint,
+    evaluate: Evaluate,
+    step_length: StepLength,
+    options: GaussNewtonOptions,
+    short_px: float,
+    eigenvalue_cutoff: float,
 ) -> _TrialStep:
     """Take a step that lowers the cost, damped as much as it takes."""
     eigen, damping = ScaledEigen.of(at.curvature), at.damping
     while True:
-        a = at.a - eigen.solve(at.equations.gradient, damping, limits.eigenvalue_cutoff)
+        a = at.a - eigen.solve(at.equations.gradient, damping, eigenvalue_cutoff)
         length = step_length(at.a, a)
-        is_settling = damping == 0.0 and length < limits.short_px and not at.has_fallen
+        is_settling = damping == 0.0 and length < short_px and not at.has_fallen
         # The last step's matrix is wanted for the covariance.
-        is_assembled = not is_settling or length <= limits.tolerance_px
+        is_assembled = not is_settling or length <= options.tolerance_px
         found = evaluate(a, is_assembled)
         descends = found.mean_square <= at.equations.mean_square
-        accepted = descends and _share_outside(found) <= limits.options.max_outside
-        if accepted or length <= limits.tolerance_px or damping >= _LARGEST_DAMPING:
+        accepted = descends and _share_outside(found) <= options.max_outside
+        if accepted or length <= options.tolerance_px or damping >= _LARGEST_DAMPING:
             break
         damping = max(_FIRST_DAMPING, 10.0 * damping)
     curvature = found.matrix
@@ -268,13 +257,13 @@ def _descend(
     return _TrialStep(to, length, errors, damping, accepted)
 
 
-def _ending(step: _TrialStep, number: int, limits: _Limits) -> Outcome | None:
+def _ending(step: _TrialStep, number: int, options: GaussNewtonOptions) -> Outcome | None:
     """Why to stop after this step, if there is a reason."""
-    if step.length_px <= limits.tolerance_px and step.damping <= _FIRST_DAMPING:
+    if step.length_px <= options.tolerance_px and step.damping <= _FIRST_DAMPING:
         return Outcome.CONVERGED
-    if step.accepted and number < limits.options.max_iterations:
+    if step.accepted and number < options.max_iterations:
         return None
-    if step.damping <= _FIRST_DAMPING and step.errors <= limits.options.tolerance_errors:
+    if step.damping <= _FIRST_DAMPING and step.errors <= options.tolerance_errors:
         return Outcome.CONVERGED
     return Outcome.MAX_ITERATIONS if step.accepted else Outcome.STAGNATED
 

@@ -37,6 +37,9 @@ _ROUNDS, _SETTLED = 5, 1e-2
 """The pixels used are chosen anew at most 5 times, until less than 1 % of them change."""
 _PLENTY, _STRIDE = 1000, 4
 """Pixels an unknown that suffice to lead the way, and of how many rows one is taken then."""
+_EIGENVALUE_CUTOFF = 1e-3
+"""On coarse levels, directions with an eigenvalue below this share of the largest one wait for
+the finest level: what a blur does to the images would send them into other valleys."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,8 @@ class LevelSearch:
     pair: LevelPair
     ansatz: Ansatz
     level: Level
-    eigenvalue_cutoff: float
-    """Directions less determined than this share of the best one stay as they are [-]."""
-    tolerance_px: float
-    rough_px: float
-    """Steps to stop at, with all pixels and with every few rows [px]."""
+    finest: bool
+    """Whether all unknowns are sought to the full tolerance; or to lead to the next level."""
     options: GaussNewtonOptions
     on_iteration: Callable[[int], None]
     """Called with the number of each finished iteration."""
@@ -74,15 +74,15 @@ class LevelSearch:
         curvature = None
         some = self._thinned(assembly)
         if some is not assembly:
-            rough = self._minimise(some, start, self.rough_px, None)
+            rough = self._minimise(some, start, leads=True)
             history += rough.history
-            if rough.outcome is Outcome.CONVERGED and self._only_leads:
-                return rough, some
             if rough.outcome is Outcome.CONVERGED:
+                if not self.finest:
+                    return rough, some
                 start = rough.unknowns
                 curvature = rough.curvature * (assembly.pixels / some.pixels)
         for _ in range(_ROUNDS):
-            found = self._minimise(assembly, start, self.tolerance_px, curvature)
+            found = self._minimise(assembly, start, curvature, leads=not self.finest)
             history += found.history
             used, start, curvature = assembly, found.unknowns, found.curvature
             if self.pair.valid is None:
@@ -121,19 +121,9 @@ class LevelSearch:
         kept, outside = valid_pixels(self._all_pixels, a, pair.reference, pair.deformed, pair.valid)
         return replace(self._all_pixels, mask=kept, outside=outside)
 
-    @property
-    def _only_leads(self) -> bool:
-        """Whether this is a coarse level: the next one has to be reached, and no more."""
-        return self.eigenvalue_cutoff > 0.0
-
     @cached_property
     def _all_pixels(self) -> Assembly:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
-
-    @cached_property
-    def _material(self) -> NDArray[np.int64]:
-        """(rows,) pixels of the level's mask."""
-        return np.asarray(np.count_nonzero(self.pair.mask, axis=1))
 
     def _thinned(self, assembly: Assembly) -> Assembly:
         """One row of a few, if that leaves plenty of pixels."""
@@ -144,29 +134,34 @@ class LevelSearch:
         return replace(assembly, mask=rows, outside=assembly.outside // _STRIDE)
 
     def _minimise(
-        self, assembly: Assembly, start: FloatArray, tolerance: float, curvature: FloatArray | None
+        self,
+        assembly: Assembly,
+        start: FloatArray,
+        curvature: FloatArray | None = None,
+        *,
+        leads: bool,
     ) -> Minimum:
+        """Go to the full tolerance, or to a coarse one that is enough to lead the way.
+
+        The share of pixels that may leave is one of the whole material: those left out at g's
+        border and at its holes are not to weigh as if they had left.
+        """
+        limits, factor = self.options, self.level.factor
+        rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
+        material = max(1, np.count_nonzero(self.pair.mask[rows]))
+        kept = (assembly.pixels + assembly.outside) / material
+        most = min(1.0, limits.max_outside / kept) if kept > 0 else limits.max_outside
+        tolerance = limits.coarse_tolerance_px * factor if leads else limits.tolerance_px
         return minimise(
             partial(self._equations, assembly),
-            step_length(self.ansatz, assembly.grid, assembly.mask, self.level.factor),
+            step_length(self.ansatz, assembly.grid, assembly.mask, factor),
             start,
-            self._limits(assembly),
-            tolerance,
-            self.level.factor,
+            replace(limits, max_outside=most, tolerance_px=tolerance),
+            factor,
             self.on_iteration,
             curvature,
-            self.eigenvalue_cutoff,
+            0.0 if self.finest else _EIGENVALUE_CUTOFF,
         )
-
-    def _limits(self, assembly: Assembly) -> GaussNewtonOptions:
-        """The options, whose share of pixels that may leave is one of the whole material.
-
-        Those left out at g's border and at its holes are not to weigh as if they had left.
-        """
-        rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
-        kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
-        most = min(1.0, self.options.max_outside / kept) if kept > 0 else self.options.max_outside
-        return replace(self.options, max_outside=most)
 
     def _equations(self, assembly: Assembly, a: FloatArray, with_matrix: bool) -> NormalEquations:
         return assembly.images(a, self.pair.reference, self.pair.deformed, with_matrix)

@@ -124,6 +124,8 @@ The rest of it moves float images by 5e-6 px. At most a sixteenth of the image's
 the strip left out, polynomials are extrapolated, which costs more on small images than it mends."""
 _CONTINUED = 1.5
 """Blur that continues the material into holes on a level without blur of its own [binned px]."""
+_FAR = np.float32(1e-4)
+"""Share of material below which a place is far from any, and takes the mean grey level."""
 
 _AROUND = 3.0
 """How far the local mean and contrast reach, in blurs: nothing finer than the blur is lost."""
@@ -208,28 +210,14 @@ def _smooth(image: FloatImage, weight: BoolArray | None, level: Level) -> FloatI
     if weight is None or weight.all():
         return blurred(binned(image, None, level.factor)[0], level.blur)
     mean, share = binned(image, weight, level.factor)
-    filled = _continued(mean, share, level.blur or _CONTINUED)
-    if level.factor == 1 and level.blur == 0:
-        np.copyto(filled, image, where=weight)
-    return filled
-
-
-def _continued(mean: FloatImage, share: FloatImage, blur: float) -> FloatImage:
-    """Blur both, and divide; far from any material, its mean grey level.
-
-    Parameters
-    ----------
-    mean, share
-        (rows, cols) grey level times share of material, and that share.
-    blur
-        Standard deviation [binned px].
-    """
-    overall = float(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
-    far = np.float32(1e-4)
+    overall = np.float32(mean.sum(dtype=np.float64) / share.sum(dtype=np.float64))
+    blur = level.blur or _CONTINUED
     mean, share = blurred(mean, blur), blurred(share, blur)
-    mean += far * np.float32(overall)
-    share += far
+    mean += _FAR * overall
+    share += _FAR
     mean /= share
+    if level.factor == 1 and level.blur == 0:
+        np.copyto(mean, image, where=weight)
     return mean
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from modeharvest.idic.result import Result
 from modeharvest.util.arrays import FloatArray
@@ -141,15 +141,9 @@ def _orthonormal(columns: FloatArray) -> FloatArray:
     return np.asarray(left[:, sizes > 1e-10 * sizes.max(initial=0.0)])
 
 
-def _determined(result: Result) -> tuple[NDArray[np.intp], FloatArray]:
-    """Numbers of the determined unknowns, and the Gauss-Newton matrix of these."""
-    kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
-    return kept, np.asarray(np.linalg.inv(result.inverse[np.ix_(kept, kept)]), np.float64)
-
-
 def _worst(result: Result) -> tuple[Combination, ...]:
-    kept, matrix = _determined(result)
-    eigen = ScaledEigen.of(matrix)
+    kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
+    eigen = ScaledEigen.of(np.linalg.inv(result.inverse[np.ix_(kept, kept)]))
     found = []
     for value, vector in zip(eigen.values[:_LISTED], eigen.vectors.T[:_LISTED], strict=True):
         largest = np.argsort(-abs(vector))[:_LISTED]
