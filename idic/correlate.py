@@ -264,11 +264,24 @@ class _Course:
         a: FloatArray,
         order: int,
     ) -> _Reached:
-        """Go through levels; on the last one all unknowns are sought, to the full tolerance."""
-        before = a
+        """Go through levels; on the last one all unknowns are sought, to the full tolerance.
+
+        Where gain or offset are unknowns, coarse levels see locally normalised images: what the
+        brightness could absorb there is much of the blurred speckle itself.
+        """
+        edge_px, before = self.options.edge_px, a
         history: tuple[Iteration, ...] = ()
         for level in levels:
-            search = self._search(level, pair, ansatz, level is levels[-1], order)
+            finest, own_order = level is levels[-1], order if level == FULL else min(order, 5)
+            normalised = ansatz.brightness.size > 0 and not finest
+            search = LevelSearch(
+                level_pair(pair, level, edge_px, own_order, normalised=normalised),
+                ansatz if finest else replace(ansatz, brightness=Brightness()),
+                level,
+                finest,
+                self.options.gauss_newton,
+                self.report,
+            )
             self.lap(f"prepare level {level.factor}")
             n = search.ansatz.size
             before = np.append(search.lower_cost(a[:n], before[:n]), a[n:])
@@ -280,25 +293,6 @@ class _Course:
             if found.outcome in WITHOUT_RESULT:
                 break
         return _Reached(search, replace(found, history=history), used, a)
-
-    def _search(
-        self, level: Level, pair: ImagePair, ansatz: Ansatz, finest: bool, order: int
-    ) -> LevelSearch:
-        """Prepare a level of the images, and what to look for there.
-
-        Where gain or offset are unknowns, coarse levels see locally normalised images: what the
-        brightness could absorb there is much of the blurred speckle itself.
-        """
-        normalised = ansatz.brightness.size > 0 and not finest
-        order = order if level == FULL else min(order, 5)
-        return LevelSearch(
-            level_pair(pair, level, self.options.edge_px, order, normalised=normalised),
-            ansatz if finest else replace(ansatz, brightness=Brightness()),
-            level,
-            finest,
-            self.options.gauss_newton,
-            self.report,
-        )
 
 
 def _useful(levels: tuple[Level, ...], ansatz: Ansatz, grid: PixelGrid) -> tuple[Level, ...]:

@@ -195,12 +195,12 @@ def zone_boundary_families(specimen: Specimen) -> tuple[ModeFamily, ...]:
 
 def _two_waves(name: str, first: FloatArray, second: FloatArray) -> ModeFamily:
     """Two waves of given wave vectors [pi/l], the second transverse, phases zero at the origin."""
-    n, m = _along_and_across(first)
+    n, m = local_frame(first)
     turn = np.column_stack([first, (-first[1], first[0])])  # times (1, 0) it is the first wave
     turn = np.column_stack([second, (-second[1], second[0])]) @ np.linalg.inv(turn)
     matrix, offset = np.zeros((2, PER_WAVE, 6)), np.zeros((2, PER_WAVE))
     offset[0, :2] = m
-    matrix[0, :2, 0], matrix[1, :2, 1] = n, _along_and_across(second)[1]
+    matrix[0, :2, 0], matrix[1, :2, 1] = n, local_frame(second)[1]
     matrix[:, 2:4, 2:4] = np.eye(2), turn
     matrix[0, 4, 4] = matrix[1, 4, 5] = 1.0
     names, units = ("L1", "T2", "kx", "ky", "c1", "c2"), ("-",) * 4 + ("mm",) * 2
@@ -220,10 +220,10 @@ def two_waves_near(parameters: ArrayLike, ideal: ArrayLike, half_wavelength: flo
     return near
 
 
-def _along_and_across(k: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors along a wave vector, and that turned by +90 degrees."""
-    along = k / np.linalg.norm(k)
-    return along, np.array([-along[1], along[0]])
+def local_frame(vector: FloatArray) -> FloatArray:
+    """(2, 2) rows: the direction of a vector, and that turned by +90 degrees."""
+    x, y = vector / np.linalg.norm(vector)
+    return np.array([[x, y], [-y, x]])
 
 
 FAMILIES: dict[str, Callable[[Specimen], tuple[ModeFamily, ...]]] = {
@@ -293,7 +293,8 @@ class FourierMode:
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
         # with k near 1 to well under 1 %; the square one is hit exactly.
         t = np.asarray(half_wavelength * np.arange(-192, 193) / 16.0, dtype=np.float64)
-        phi = unit.waves_sum(family.start, t[None, :], t[:, None])
+        x, y = t[None, :], t[:, None]
+        phi = unit._weighted_sum(family.start, x, y, np.ones_like(x), np.ones_like(y))
         largest = float(np.sqrt((phi**2).sum(axis=-1).max()))
         if not largest > 0:
             raise InputError(f"mode family {family.name!r}: the start gives a mode that is zero")
@@ -305,10 +306,6 @@ class FourierMode:
         per_mm = np.pi / self.half_wavelength
         return np.stack([per_mm * (w[2] * x + w[3] * y + w[4]) for w in waves])
 
-    def waves_sum(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(..., 2): sum of (A, B) sin theta [-], without scale and support."""
-        return self._weighted_sum(parameters, x, y, np.ones_like(x), np.ones_like(y))
-
     def evaluate(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(..., 2): phi [-] along x and y, at positions [mm] that broadcast together."""
         taper_x, taper_y = self.scale * self.taper.along_x(x), self.taper.along_y(y)
@@ -318,7 +315,7 @@ class FourierMode:
         self, parameters: ArrayLike, x: FloatArray, y: FloatArray, of_x: FloatArray,
         of_y: FloatArray,
     ) -> FloatArray:  # fmt: skip
-        """(..., 2): sum of (A, B) sin theta, times a function of x and one of y."""
+        """(..., 2): sum of (A, B) sin theta [-], times a function of x and one of y."""
         per_mm = np.pi / self.half_wavelength
         waves = self.family.waves(parameters)
         tx = [per_mm * kx * x for kx in waves[:, 2]]

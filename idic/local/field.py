@@ -233,20 +233,14 @@ def read_field(
     x, y, u, v = _same_shape([table[chosen[role].name] for role in ROLES], chosen, str(path))
     sign = -1.0 if down else 1.0
     if position == "px" and grid is not None:
-        x, y = _from_pixels(x - first_pixel, y - first_pixel, down, grid)
+        row = y - first_pixel  # from the lowest one, unless y grows downwards
+        x, y = grid.to_mm(row if down else grid.rows - 1 - row, x - first_pixel)
     else:
         y = sign * y
     scale = grid.pixel_size if motion == "px" and grid is not None else 1.0
     sd, ok = _quality(table, chosen, x.size, scale, motion == "px", str(path))
     u = scale * np.column_stack([u, sign * v])
     return LocalField(x, y, u, ok, sd, source=Path(path).name)
-
-
-def _from_pixels(
-    x: FloatArray, y: FloatArray, down: bool, grid: PixelGrid
-) -> tuple[FloatArray, FloatArray]:
-    """Positions [mm] of pixels counted from 0; y from the lowest row unless it grows downwards."""
-    return grid.to_mm(y if down else grid.rows - 1 - y, x)
 
 
 def write_field(path: Path | str, field: LocalField) -> None:

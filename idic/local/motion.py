@@ -70,12 +70,6 @@ def robust_fit(matrix: FloatArray, values: FloatArray) -> RobustFit:
     return RobustFit(fit, sd, int((off > OUTLIER * sd).sum()) if sd > 0 else 0)
 
 
-def degree_for(count: int, most: int) -> int:
-    """Total degree of a slow field that so many points can bear: three points a coefficient."""
-    fitting = [d for d in range(1, most + 1) if 3 * (d + 1) * (d + 2) // 2 <= count]
-    return max(fitting, default=0)
-
-
 def fit_unknowns(
     ansatz: Ansatz, a: ArrayLike, field: LocalField, v0_degree: int, v_degree: int
 ) -> RobustFit:
@@ -147,9 +141,11 @@ def _affine(plane: FloatArray, points: FloatArray) -> FloatArray:
 def _through_holes(domain: Box, holes: LocalField) -> tuple[Slow, str] | None:
     """A polynomial through the holes' displacements; None if there are too few for a plane."""
     count = int(holes.good.sum())
-    degree = degree_for(count, SLOW_DEGREE)
-    if degree == 0:
+    # Three points a coefficient.
+    fitting = [d for d in range(1, SLOW_DEGREE + 1) if 3 * (d + 1) * (d + 2) // 2 <= count]
+    if not fitting:
         return None
+    degree = fitting[-1]
     slow = Ansatz(domain, (), degree, 0)
     fit = fit_unknowns(slow, np.zeros(slow.size), holes, degree, -1)
     return partial(slow.displacement_at, fit.coefficients), (

@@ -197,13 +197,9 @@ def _numeric(found: dict[str, Any]) -> Table:
 
 
 _READERS: dict[str, Callable[[Path], Table]] = {
-    ".csv": _read_text,
-    ".txt": _read_text,
-    ".dat": _read_text,
-    ".tsv": _read_text,
+    **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_text),
+    **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
     ".npz": _read_npz,
-    ".h5": _read_hdf5,
-    ".hdf5": _read_hdf5,
     ".mat": _read_mat,
 }
 

@@ -141,29 +141,13 @@ class Geometry:
         A square lattice along the image's axes is what the paper's family is written for; a
         specimen turned by less than a degree is followed by the mode's own wave vectors.
         """
-        if self.lattice is None or self._is_upright:
+        lattice = self.lattice
+        if lattice is None:
             return None
-        row, col = self.lattice.vectors.T
+        if lattice.kind == "square" and abs(lattice.rotation_deg) < _UPRIGHT_DEG:
+            return None
+        row, col = lattice.vectors.T
         return np.asarray(np.column_stack([col, -row]) * self.grid.pixel_size)
-
-    @property
-    def _is_upright(self) -> bool:
-        assert self.lattice is not None
-        return self.lattice.kind == "square" and abs(self.lattice.rotation_deg) < _UPRIGHT_DEG
-
-    def motions_in(self, mask: BoolArray) -> tuple[tuple[HoleMotion, ...], str]:
-        """How the holes may have moved in a deformed image, the likeliest first.
-
-        Nothing where they can't be followed, and why. See
-        :func:`modeharvest.idic.photograph.matching.possible_motions`; the mask (rows, cols) is True
-        on material of the deformed image.
-        """
-        if self.lattice is None:
-            return (), "The reference shows no lattice of holes to follow."
-        try:
-            return possible_motions(self.lattice, find_hole_lattice(mask)), ""
-        except InputError as error:
-            return (), f"The holes could not be followed: {error}."
 
 
 def find_geometry(mask: BoolArray, grid: PixelGrid, table: SpecimenTable, base: Path) -> Geometry:
@@ -238,10 +222,16 @@ def matched_holes(pair: ImagePair, geometry: Geometry) -> tuple[HoleMotion | Non
     Where a column of holes has left the image, the holes alone allow several answers; the speckle
     between them decides. Raises InputError if the images don't show the same surface.
     """
-    motions, why_not = geometry.motions_in(pair.masks[1])
-    if not motions:
-        return None, why_not
-    motion, blocks = _likeliest(pair, motions)
+    if geometry.lattice is None:
+        return None, "The reference shows no lattice of holes to follow."
+    try:
+        motions = possible_motions(geometry.lattice, find_hole_lattice(pair.masks[1]))
+    except InputError as error:
+        return None, f"The holes could not be followed: {error}."
+    tied = motions[0].rivals + 1
+    motion, blocks = best = _best(pair, motions[:tied])
+    if not blocks.is_same and len(motions) > tied:  # those that match fewer holes
+        motion, blocks = max(best, _best(pair, motions[tied:]), key=_share)
     require_same_surface(blocks, "the reference", "the deformed one")
     text = [*motion.text, blocks.text]
     if motion is not motions[0] or motion.rivals:
@@ -259,19 +249,8 @@ def confirmed_by_speckle(pair: ImagePair, expected: Expected) -> str:
     return blocks.text
 
 
-def _likeliest(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
-    """The motion that the speckle agrees with best.
-
-    Those that match as many holes come first, all others only if none of these is right.
-    """
-    tied = motions[0].rivals + 1
-    best = _best(pair, motions[:tied])
-    if best[1].is_same or len(motions) == tied:
-        return best
-    return max(best, _best(pair, motions[tied:]), key=_share)
-
-
 def _best(pair: ImagePair, motions: Sequence[HoleMotion]) -> tuple[HoleMotion, BlockMatch]:
+    """The motion that the speckle agrees with best."""
     return max(
         ((m, match_blocks(pair.reference, pair.deformed, pair.mask, m.at)) for m in motions),
         key=_share,

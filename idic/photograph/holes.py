@@ -8,7 +8,7 @@ neighbours then counts every hole, (i, j), also where the lattice is bent or hol
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -83,8 +83,9 @@ def _typical(areas: FloatArray) -> float:
 
 
 _ALIKE = 0.25
-"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's:
-locally, strain differs from the mean by 10 %, and holes are moulded a little off."""
+"""Vectors this near to each other, as a share of the pitch, stand for one of the lattice's, and
+holes for a place in it: locally, strain differs from the mean by 10 %, and holes are moulded a
+little off."""
 
 
 def spanning_vectors(spots: FloatArray) -> FloatArray | None:
@@ -143,9 +144,6 @@ def _oriented(basis: tuple[FloatArray, FloatArray]) -> FloatArray:
 
 Kind = Literal["square", "hexagonal", "rectangular", "oblique"]
 
-_NEAR = 0.25
-"""Distance of a neighbour from its place in the lattice, as a share of the pitch; locally, strain
-differs from the mean by 10 %, and holes are moulded a little off."""
 _BENT = 0.25
 """Rms distance from a straight lattice, as a share of the pitch, that is no lattice any more."""
 _MOST = 0.5
@@ -182,7 +180,8 @@ class HoleLattice:
     misfit_px: float
     """Rms distance of the centres from the straight lattice [px]."""
     kind: Kind
-    text: tuple[str, ...]
+    too_small: int
+    """Number of much smaller openings that were left out."""
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -203,6 +202,23 @@ class HoleLattice:
         """Number of different i and of different j."""
         i, j = np.ptp(self.index, axis=0) + 1
         return int(i), int(j)
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """What was found."""
+        d, (i, j), (a, b) = self.diameters, self.counts, np.linalg.norm(self.vectors, axis=1)
+        text = [
+            f"{len(self)} holes on a {self.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
+            f"turned by {self.rotation_deg:+.2f} degrees, {self.misfit_px:.2f} px rms off it; "
+            f"diameters {d.mean():.1f} +- {d.std():.1f} px."
+        ]
+        if len(self.missing):
+            text.append(f"Holes are missing at {len(self.missing)} lattice points amid them.")
+        if len(self.extra):
+            text.append(f"{len(self.extra)} holes are not on the lattice and were left out.")
+        if self.too_small:
+            text.append(f"{self.too_small} much smaller openings were left out.")
+        return tuple(text)
 
     def position(self, index: ArrayLike) -> FloatArray:
         """(..., 2) (row, col) [px] of lattice points (i, j), which need not be whole numbers."""
@@ -247,28 +263,22 @@ def lattice_of(holes: Holes, cell_px: float | None = None) -> HoleLattice:
         extra=holes.centres[~known],
         misfit_px=misfit,
         kind=_kind(vectors),
-        text=(),
+        too_small=holes.too_small,
     )
-    if cell_px is not None:
-        require_cell_size(found, cell_px)
-    return _with_text(found, holes)
-
-
-def require_cell_size(lattice: HoleLattice, cell_px: float) -> None:
-    """Raise InputError if a given cell size [px] is not that of the holes."""
-    off = cell_px / lattice.pitch_px - 1.0
-    if not cell_px > 0 or abs(off) > _WRONG_CELL:
+    off = 0.0 if cell_px is None else cell_px / found.pitch_px - 1.0
+    if cell_px is not None and (not cell_px > 0 or abs(off) > _WRONG_CELL):
         raise InputError(
-            f"expected a cell size near {lattice.pitch_px:.1f} px, the distance of the holes in "
+            f"expected a cell size near {found.pitch_px:.1f} px, the distance of the holes in "
             f"the image, got {cell_px:.1f} px ({100 * off:+.0f} %); correct the cell size or the "
             "pixel size"
         )
+    return found
 
 
 def _counted(spots: FloatArray, vectors: FloatArray) -> tuple[IntArray, BoolArray]:
     """(index from 0, known): count from neighbour to neighbour, in the largest connected part."""
     steps = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
-    tree, reach = KDTree(spots), _NEAR * float(np.linalg.norm(vectors, axis=1).min())
+    tree, reach = KDTree(spots), _ALIKE * float(np.linalg.norm(vectors, axis=1).min())
     distance, there = tree.query(spots[:, None] + steps @ vectors, distance_upper_bound=reach)
     best: dict[int, tuple[int, int]] = {}
     free = set(range(len(spots)))
@@ -327,23 +337,6 @@ def _kind(vectors: FloatArray) -> Kind:
     if equal and min(abs(angle - 60.0), abs(angle - 120.0)) < _RIGHT_DEG:
         return "hexagonal"
     return "oblique"
-
-
-def _with_text(lattice: HoleLattice, holes: Holes) -> HoleLattice:
-    d = lattice.diameters
-    (i, j), (a, b) = lattice.counts, np.linalg.norm(lattice.vectors, axis=1)
-    text = [
-        f"{len(lattice)} holes on a {lattice.kind} lattice, {i} x {j}, of {a:.1f} and {b:.1f} px, "
-        f"turned by {lattice.rotation_deg:+.2f} degrees, {lattice.misfit_px:.2f} px rms off it; "
-        f"diameters {d.mean():.1f} +- {d.std():.1f} px."
-    ]
-    if len(lattice.missing):
-        text.append(f"Holes are missing at {len(lattice.missing)} lattice points amid them.")
-    if len(lattice.extra):
-        text.append(f"{len(lattice.extra)} holes are not on the lattice and were left out.")
-    if holes.too_small:
-        text.append(f"{holes.too_small} much smaller openings were left out.")
-    return replace(lattice, text=tuple(text))
 
 
 def _no_lattice(holes: int, why: str) -> InputError:

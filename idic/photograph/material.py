@@ -115,11 +115,6 @@ class MaterialMask:
 
     mask: BoolArray
     """(rows, cols) True on material."""
-    contrast_ratio: float
-    """Contrast of the speckle over what varies in the background [-]; infinity without one."""
-    alike_share: float
-    """Share of the material whose grey level could be the background's [-]: there the edge is a
-    guess by its neighbourhood."""
     text: tuple[str, ...]
 
 
@@ -137,7 +132,7 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
         if not contrast.max() > 0.0:
             raise InputError("expected a speckled material in the image, got a constant grey level")
         text = ("No background was found: the whole image counts as material.",)
-        return MaterialMask(np.ones(grey.shape, dtype=np.bool_), np.inf, 0.0, text)
+        return MaterialMask(np.ones(grey.shape, dtype=np.bool_), text)
     if sure.all():
         raise InputError(
             "expected a speckled material in the image, got a mask with nothing in it: no part has "
@@ -150,7 +145,7 @@ def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> M
             "background's grey levels are everywhere; give the mask as an image"
         )
     material, walls = _without_walls(grey, material, options)
-    return MaterialMask(material, ratio, alike, _text(material, ratio, alike, walls))
+    return MaterialMask(material, _text(material, ratio, alike, walls))
 
 
 def _checked(image: ArrayLike, options: MaterialOptions) -> FloatImage:

@@ -189,11 +189,9 @@ def _moved_holes(result: Result, geometry: Geometry) -> LocalField | None:
 def _moved_to(result: Result, points: FloatArray) -> FloatArray:
     """(n, 2) (row, col) that positions (n, 2) of the reference have moved to [px]."""
     grid = result.grid
-    x, y = grid.to_mm(points[:, 0], points[:, 1])
-    moved = np.column_stack([x, y]) + result.ansatz.displacement_at(
-        result.unknowns, np.column_stack([x, y])
-    )
-    return np.column_stack(grid.to_px(moved[:, 0], moved[:, 1]))
+    before = np.column_stack(grid.to_mm(*points.T))
+    moved = before + result.ansatz.displacement_at(result.unknowns, before)
+    return np.column_stack(grid.to_px(*moved.T))
 
 
 _BAND = 64

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from modeharvest.idic.modes import PER_WAVE, ModeFamily
+from modeharvest.idic.modes import PER_WAVE, ModeFamily, local_frame
 from modeharvest.idic.spectra.pattern import SAME_PHASE
 from modeharvest.idic.spectra.waves import Selection, common_phase
 from modeharvest.util.arrays import FloatArray
@@ -92,12 +92,6 @@ class Tie:
         return "LT"[self.component] + ",".join(str(w + 1) for w in self.waves)
 
 
-def local_frame(vector: FloatArray) -> FloatArray:
-    """(2, 2) rows: the direction of a vector, and that turned by +90 degrees."""
-    x, y = vector / np.linalg.norm(vector)
-    return np.array([[x, y], [-y, x]])
-
-
 def real_waves(selection: Selection) -> list[RealWave]:
     """Turn complex amplitudes into real waves, one each or two."""
     waves: list[RealWave] = []
@@ -155,29 +149,22 @@ def fixed_tie(ties: list[Tie]) -> Tie:
 
 def tied_family(name: str, waves: list[RealWave], ties: list[Tie], pitch: float) -> ModeFamily:
     """Make the family: amplitudes first, then wave vectors, then phases; ``pitch`` is l [mm]."""
-    rows = PER_WAVE * len(waves)
-    columns, start, names, units = [], [], [], []
-    fixed = fixed_tie(ties)
-    offset = _amplitude_column(fixed, waves)
-    for tie in ties:
-        if tie is not fixed and tie.value > 0:
-            columns.append(_amplitude_column(tie, waves))
-            start.append(tie.value / fixed.value)
-            names.append(tie.name)
-            units.append("-")
-    for first, both in _by_wave_vector(waves):
-        for axis in (0, 1):
-            columns.append(_unit_column(rows, [PER_WAVE * w + 2 + axis for w in both]))
-            start.append(waves[first].k[axis])
-            names.append(f"k{'xy'[axis]}{first + 1}")
-            units.append("-")
+    unit, fixed = np.eye(PER_WAVE * len(waves)), fixed_tie(ties)
+    free = [tie for tie in ties if tie is not fixed and tie.value > 0]
+    parameters = [
+        (_amplitude_column(tie, waves), tie.value / fixed.value, tie.name, "-") for tie in free
+    ]
     for w, wave in enumerate(waves):
-        columns.append(_unit_column(rows, [PER_WAVE * w + 4]))
-        start.append(wave.phase * pitch)
-        names.append(f"c{w + 1}")
-        units.append("mm")
-    matrix = np.stack(columns, axis=1)
-    return ModeFamily(name, matrix, offset, np.array(start), tuple(names), tuple(units))
+        if not wave.shares_k:
+            stop = w + 1 + sum(other.shares_k for other in waves[w + 1 : w + 2])
+            for axis in (0, 1):
+                column = unit[PER_WAVE * np.arange(w, stop) + 2 + axis].sum(axis=0)
+                parameters.append((column, wave.k[axis], f"k{'xy'[axis]}{w + 1}", "-"))
+    for w, wave in enumerate(waves):
+        parameters.append((unit[PER_WAVE * w + 4], wave.phase * pitch, f"c{w + 1}", "mm"))
+    columns, start, names, units = zip(*parameters, strict=True)
+    offset = _amplitude_column(fixed, waves)
+    return ModeFamily(name, np.stack(columns, axis=1), offset, np.array(start), names, units)
 
 
 def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
@@ -189,30 +176,12 @@ def _amplitude_column(tie: Tie, waves: list[RealWave]) -> FloatArray:
     return column.ravel()
 
 
-def _unit_column(rows: int, ones: list[int]) -> FloatArray:
-    column = np.zeros(rows)
-    column[ones] = 1.0
-    return column
-
-
-def _by_wave_vector(waves: list[RealWave]) -> list[tuple[int, list[int]]]:
-    """Waves that share one wave vector, named by the first of them."""
-    groups: list[tuple[int, list[int]]] = []
-    for w, wave in enumerate(waves):
-        if wave.shares_k:
-            groups[-1][1].append(w)
-        else:
-            groups.append((w, [w]))
-    return groups
-
-
 def as_rows(waves: list[RealWave], pitch: float) -> FloatArray:
     """(w, 5) A, B [unit of the field], kx, ky [-], c [mm], nothing tied."""
     return np.array([wave.row for wave in waves]) * [1.0, 1.0, 1.0, 1.0, pitch]
 
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-_ACROSS = ("along", "across")
 
 
 def describe(
@@ -223,13 +192,13 @@ def describe(
     captured: float,
 ) -> tuple[str, ...]:
     """Which waves, what they have in common, and how much of the field they are."""
-    return (
-        _stars(waves),
-        _energy(selection, captured),
-        *_phases(waves),
-        *_amplitudes(waves, ties),
-        _family(family, ties),
-    )
+    energy = f"At the start they are {100 * captured:.1f} % of the energy over the material; "
+    if selection.growth[-1][0] == len(selection.xi):
+        energy += "no further wave could be distinguished from them."
+    else:
+        energy += f"the next would add {100 * selection.next_gain:.1f} %."
+    of_waves = (_stars(waves), energy, *_phases(waves))
+    return (*of_waves, *_amplitudes(waves, ties), _family(family, ties))
 
 
 def number(count: int, noun: str) -> str:
@@ -250,19 +219,11 @@ def _stars(waves: list[RealWave]) -> str:
     return f"{number(total, 'wave').capitalize()}: {'; then '.join(parts)}."
 
 
-def _energy(selection: Selection, captured: float) -> str:
-    text = f"At the start they are {100 * captured:.1f} % of the energy over the material"
-    if selection.growth[-1][0] == len(selection.xi):
-        return text + "; no further wave could be distinguished from them."
-    return text + f"; the next would add {100 * selection.next_gain:.1f} %."
-
-
 def _phases(waves: list[RealWave]) -> list[str]:
-    pairs = [w for w in waves if w.shares_k]
-    text = []
+    pairs, text = sum(w.shares_k for w in waves), []
     if pairs:
         text.append(
-            f"In {number(len(pairs), 'wave')} x and y are out of phase; each of these is written "
+            f"In {number(pairs, 'wave')} x and y are out of phase; each of these is written "
             "as a wave along x and a wave along y with the same wave vector."
         )
     phases = np.array([w.phase for w in waves])
@@ -279,8 +240,9 @@ def _amplitudes(waves: list[RealWave], ties: list[Tie]) -> list[str]:
     text = []
     for tie in ties:
         if len(tie.waves) > 1 and tie.value > 0:
+            where = ("along", "across")[tie.component]
             text.append(
-                f"The amplitude {_ACROSS[tie.component]} the wave vector is the same in waves "
+                f"The amplitude {where} the wave vector is the same in waves "
                 f"{', '.join(str(w + 1) for w in tie.waves)} within {100 * SAME_AMPLITUDE:.0f} %, "
                 f"signs {_signs(tie, waves)}."
             )

@@ -18,7 +18,6 @@ collapsed into a corner, with the Gauss-Jacobi rule whose weight is the Jacobian
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +41,7 @@ class MeshQuadrature:
     ----------
     positions : (q, 2) points in the material [mm].
     weights : (q,) area that each stands for [mm^2], positive.
+    area : of the material [mm^2].
     """
 
     def __init__(self, mesh: Mesh, points: int = 8) -> None:
@@ -59,17 +59,13 @@ class MeshQuadrature:
             )
         self.positions = self.values(mesh.nodes)
         self.weights = np.asarray((jacobian * weights).ravel())
+        self.area = float(self.weights.sum())
 
     def values(self, nodal: ArrayLike) -> FloatArray:
         """(q, c) values, at the points, of a field (n, c) given at the mesh's nodes."""
         field = np.asarray(nodal, dtype=np.float64)
         at_points = np.einsum("pk,mkc->mpc", self._shapes, field[self.mesh.cells], optimize=True)
         return np.ascontiguousarray(at_points.reshape(-1, field.shape[1]))
-
-    @cached_property
-    def area(self) -> float:
-        """Area of the material [mm^2]."""
-        return float(self.weights.sum())
 
     def without_mean(self, values: FloatArray) -> FloatArray:
         """Values (q, c) less their mean over the material: rigid translations taken out."""
@@ -151,12 +147,16 @@ class LatticeSpectrum:
     @property
     def S_xx(self) -> FloatArray:
         """(n,) energy spectral density of u_x [mm⁶]."""
-        return _squared(self.coefficients[:, 0])
+        return self._squared[:, 0]
 
     @property
     def S_yy(self) -> FloatArray:
         """(n,) energy spectral density of u_y [mm⁶]."""
-        return _squared(self.coefficients[:, 1])
+        return self._squared[:, 1]
+
+    @property
+    def _squared(self) -> FloatArray:
+        return np.asarray(self.coefficients.real**2 + self.coefficients.imag**2)
 
     @property
     def shares(self) -> FloatArray:
@@ -321,8 +321,3 @@ def _transformed(
 
 def _pair(vector: FloatArray) -> tuple[float, float]:
     return float(vector[0]), float(vector[1])
-
-
-def _squared(value: ComplexArray) -> FloatArray:
-    squared: FloatArray = value.real**2 + value.imag**2
-    return squared

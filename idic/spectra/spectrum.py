@@ -179,8 +179,7 @@ def _binned(u: FloatArray, factor: int) -> FloatArray:
 
 
 def _squared(value: ComplexArray) -> FloatArray:
-    squared: FloatArray = value.real**2 + value.imag**2
-    return squared
+    return np.asarray(value.real**2 + value.imag**2)
 
 
 def _check(displacement: FloatArray, grid: PixelGrid, mask: BoolArray, pitch: float) -> None:

@@ -30,13 +30,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
 from modeharvest.idic.spectra.lattice_spectrum import LatticePeak, LatticeSpectrum, MeshQuadrature
 from modeharvest.idic.spectra.spectrum import Spectrum
-from modeharvest.util.arrays import BoolArray, ComplexArray, FloatArray
+from modeharvest.util.arrays import ComplexArray, FloatArray
 from modeharvest.util.errors import InputError
 
 EDGE_LINE_WIDTHS = 2.0
@@ -93,48 +92,34 @@ def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
     """All maxima of S_xx + S_yy outside the edges' lines, largest first."""
     xi1, xi2, S_xx, S_yy = spectrum.window(xi_max)
     S = S_xx + S_yy
-    margin = [min(0.3, EDGE_LINE_WIDTHS * spectrum.pitch / size) for size in spectrum.extent]
-    away1 = np.abs(xi1 - np.round(xi1)) >= margin[0]
-    away2 = (np.abs(xi2 - np.round(xi2)) >= margin[1]) & (xi2 > 0)
-    searched = away2[:, None] & away1[None, :]
+    lobes = [spectrum.pitch / size for size in spectrum.extent]
+    on1, on2 = (
+        np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
+        for xi, lobe in zip((xi1, xi2), lobes, strict=True)
+    )
+    searched = (~on2 & (xi2 > 0))[:, None] & ~on1
     if not searched.any() or not S.max() > 0:
         return []
     median = float(np.median(S[searched]))
     # Two maxima closer than a main lobe's width, l/L, are one.
-    lobe = spectrum.pitch / max(spectrum.extent)
-    distance = max(1, round(lobe / (xi1[1] - xi1[0])))
+    distance = max(1, round(min(lobes) / (xi1[1] - xi1[0])))
     # Maxima of the whole plane that are searched, so the foot of a line is not one of them.
     maxima = maximum_filter(S, 2 * distance + 1) == S
-    found = np.vstack([np.argwhere(maxima & searched), _on_lines(S, maxima, xi1, xi2, spectrum)])
+    found = [*np.argwhere(maxima & searched)]
+    # On one of the edges' lines, not where two cross, those that stand out.
+    half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1 > 0.5 * lobes[0])
+    half_plane &= xi2[:, None] > -0.5 * lobes[1]
+    for r, c in np.argwhere(maxima & (on1 != on2[:, None]) & half_plane):
+        along, at, xi, lobe = (S[:, c], r, xi2, lobes[1]) if on1[c] else (S[r], c, xi1, lobes[0])
+        away = np.abs(xi - xi[at]) / lobe
+        beside = along[(away >= 1.5) & (away <= 2.5)]
+        if beside.size and S[r, c] >= LINE_CONTRAST * beside.max():
+            found.append(np.array([r, c]))
     peaks = [
         Peak((float(xi1[c]), float(xi2[r])), float(S[r, c]), float(S[r, c]) / median)
         for r, c in found
     ]
     return sorted(peaks, key=lambda p: -p.density)
-
-
-def _on_lines(
-    S: FloatArray, maxima: BoolArray, xi1: FloatArray, xi2: FloatArray, spectrum: Spectrum
-) -> NDArray[np.intp]:
-    """(n, 2) indices of maxima on one of the edges' lines, not where two cross, that stand out."""
-    lobes = [spectrum.pitch / size for size in spectrum.extent]
-    near = [
-        np.abs(xi - np.round(xi)) < min(0.3, EDGE_LINE_WIDTHS * lobe)
-        for xi, lobe in zip((xi1, xi2), lobes, strict=True)
-    ]
-    half_plane = (xi2[:, None] > 0.5 * lobes[1]) | (xi1[None, :] > 0.5 * lobes[0])
-    half_plane &= xi2[:, None] > -0.5 * lobes[1]
-    one_line = near[0][None, :] != near[1][:, None]
-    found = []
-    for r, c in np.argwhere(maxima & one_line & half_plane):
-        along, at, xi, lobe = (
-            (S[:, c], r, xi2, lobes[1]) if near[0][c] else (S[r], c, xi1, lobes[0])
-        )
-        away = np.abs(xi - xi[at]) / lobe
-        beside = along[(away >= 1.5) & (away <= 2.5)]
-        if beside.size and S[r, c] >= LINE_CONTRAST * beside.max():
-            found.append((r, c))
-    return np.array(found, dtype=np.intp).reshape(-1, 2)
 
 
 def fit_waves(spectrum: Spectrum, peaks: Sequence[Peak]) -> list[PlaneWave]:

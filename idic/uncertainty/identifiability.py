@@ -143,7 +143,8 @@ def _orthonormal(columns: FloatArray) -> FloatArray:
 
 def _worst(result: Result) -> tuple[Combination, ...]:
     kept = np.flatnonzero(np.isfinite(np.diag(result.inverse)))
-    eigen = ScaledEigen.of(np.linalg.inv(result.inverse[np.ix_(kept, kept)]))
+    matrix = np.linalg.inv(result.inverse[np.ix_(kept, kept)])
+    eigen = ScaledEigen.of(np.asarray(matrix, np.float64))
     found = []
     for value, vector in zip(eigen.values[:_LISTED], eigen.vectors.T[:_LISTED], strict=True):
         largest = np.argsort(-abs(vector))[:_LISTED]
