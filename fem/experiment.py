@@ -27,13 +27,11 @@ class PathOptions:
 
     Parameters
     ----------
-    first_step, largest_step, critical_tolerance
-        Steps of nominal strain along the primary path; to which the critical one is located [-].
-    first_amplitude
-        Largest nodal displacement of the first step onto the branch, as a share of the pitch
-        or whatever length the branch is given [-].
-    growth
-        Most by which the mode's amplitude may grow in one step along the branch [-].
+    first_step, largest_step, critical_tolerance : steps of nominal strain along the primary path;
+        to which the critical one is located [-].
+    first_amplitude : largest nodal displacement of the first step onto the branch, as a share of
+        the pitch or whatever length the branch is given [-].
+    growth : most by which the mode's amplitude may grow in one step along the branch [-].
     """
 
     first_step: float = 0.04
@@ -62,26 +60,18 @@ class Experiment:
 
     Parameters
     ----------
-    specimen, material
-        Geometry [mm] and strain energy density [MPa].
-    strains
-        Nominal strains of the snapshots, ascending, compression positive [-].
-    mesh_size
-        Target edge length of the T6 elements [mm].
-    edges
-        Loaded edges "clamped" or "sliding".
-    branches
-        What to keep above the critical strain, out of "primary" (unstable there), "buckled+"
+    specimen, material : geometry [mm] and strain energy density [MPa].
+    strains : nominal strains of the snapshots, ascending, compression positive [-].
+    mesh_size : target edge length of the T6 elements [mm].
+    edges : loaded edges "clamped" or "sliding".
+    branches : what to keep above the critical strain, out of "primary" (unstable there), "buckled+"
         and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
-    imperfection
-        Scatter of the holes; with any, there is no bifurcation to find and the one natural
-        path is followed.
-    tilt
-        By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
-        about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is
-        not quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
-    guided
-        Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail
+    imperfection : scatter of the holes; with any, there is no bifurcation to find and the one
+        natural path is followed.
+    tilt : by how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
+        about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not
+        quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
+    guided : fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail
         would; ``holes_y`` has to be even, rows not staggered. Keeps a long specimen from bowing
         sideways.
     """

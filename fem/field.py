@@ -87,17 +87,15 @@ class Snapshot:
 
     Parameters
     ----------
-    nominal_strain
-        Applied shortening over L, the length of the cellular part [-]; compression positive.
-    reaction, energy
-        Compressive force on the loaded edge [N/mm] and stored energy [N], per unit thickness.
-    negative_pivots
-        Number of negative eigenvalues of the tangent stiffness; 0 means stable, None unknown.
-    eigenvalues
-        Lowest eigenvalues of K x = lambda M x, ascending [N/mm^4]; M is the mass matrix of
-        unit density. Empty where none were computed.
-    branch
-        "primary", "buckled+" or "buckled-".
+    nominal_strain : applied shortening over L, the length of the cellular part [-]; compression
+        positive.
+    reaction, energy : compressive force on the loaded edge [N/mm] and stored energy [N], per unit
+        thickness.
+    negative_pivots : number of negative eigenvalues of the tangent stiffness; 0 means stable, None
+        unknown.
+    eigenvalues : lowest eigenvalues of K x = lambda M x, ascending [N/mm^4]; M is the mass matrix
+        of unit density. Empty where none were computed.
+    branch : "primary", "buckled+" or "buckled-".
     """
 
     nominal_strain: float
@@ -236,12 +234,8 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     """Take the mesh and displacement of any solver whose file meshio reads.
 
     Cells are T3, T6, Q4, Q8 or Q9 in the x-y plane [mm], ``displacement`` is the name of a nodal
-    vector field [mm], ``nominal_strain`` that of the snapshot [-].
-
-    Raises
-    ------
-    InputError
-        If the file can't be read, has no such cells or several types of them, or no such field.
+    vector field [mm], ``nominal_strain`` that of the snapshot [-]. InputError if the file can't be
+    read, has no such cells or several types of them, or no such field.
     """
     source = read_any_mesh(path)
     types = sorted({block.type for block in source.cells})

@@ -153,9 +153,8 @@ def _cosh_m_asinh_sqrt(s: Any, m: float) -> Any:
 def _series(s: Any, m: float) -> Any:
     """Taylor series of cosh(m asinh(sqrt(s))), by Horner's rule.
 
-    y(s) solves s (1 + s) y'' + (1/2 + s) y' = m^2/4 y, which gives the ratio of
-    coefficients a_{k+1}/a_k = (m^2/4 - k^2) / ((k + 1) (k + 1/2)); for an even m the series
-    ends.
+    y(s) solves s (1 + s) y'' + (1/2 + s) y' = m^2/4 y, which gives the ratio of coefficients
+    a_{k+1}/a_k = (m^2/4 - k^2) / ((k + 1) (k + 1/2)); for an even m the series ends.
     """
     coefficients = [1.0]
     for k in range(_SERIES_TERMS):

@@ -31,13 +31,8 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
     """Move the mesh so that every hole has its own centre and diameter.
 
     Hole edges stay ellipses of the same aspect; the motion fades out towards the cell's boundary,
-    so cells do not disturb each other and the outer edges stay straight.
-
-    Raises
-    ------
-    InputError
-        If the scatter could close the thinnest ligament: four standard deviations beyond half of
-        it.
+    so cells do not disturb each other and the outer edges stay straight. InputError if the scatter
+    could close the thinnest ligament: four standard deviations beyond half of it.
     """
     # Where y is scaled so that holes are circles.
     scale, limit = np.array([1.0, specimen.aspect]), specimen.largest_diameter
@@ -96,10 +91,7 @@ class MeshBlock:
 def quarter_cell(pitch: float, diameter: float, size: float) -> MeshBlock:
     """A quarter of the square unit cell, [0, l/2]^2, with the hole's centre at the origin.
 
-    Raises
-    ------
-    InputError
-        If ``size`` leaves fewer than two elements on a quarter of the hole's edge.
+    InputError if ``size`` leaves fewer than two elements on a quarter of the hole's edge.
     """
     half, radius = 0.5 * pitch, 0.5 * diameter
     return quarter_polygon((half, half), half, (radius, radius), size)
@@ -110,21 +102,14 @@ def quarter_polygon(
 ) -> MeshBlock:
     """A quarter of a unit cell about an elliptical hole, the hole's centre at the origin.
 
+    InputError if ``size`` leaves fewer than two elements on a quarter of the hole's edge.
+
     Parameters
     ----------
-    heights
-        Of the cell's upper side at x = width and at x = 0 [mm]; the same for a rectangle.
-    width
-        Half the cell's width [mm].
-    radii
-        The hole's, along x and y [mm].
-    size
-        Target edge length of the elements [mm].
-
-    Raises
-    ------
-    InputError
-        If ``size`` leaves fewer than two elements on a quarter of the hole's edge.
+    heights : of the cell's upper side at x = width and at x = 0 [mm]; the same for a rectangle.
+    width : half the cell's width [mm].
+    radii : the hole's, along x and y [mm].
+    size : target edge length of the elements [mm].
     """
     low, high = heights
     a, b = radii
@@ -149,19 +134,13 @@ def rectangle(width: float, height: float, n_width: int, n_height: int) -> MeshB
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
     """The specimen's T6 mesh, symmetric to the last bit about the axes that the holes have.
 
-    Those are both, unless diameters are graded.
+    Those are both, unless diameters are graded. InputError if the size is not positive, or too
+    large for the cells.
 
     Parameters
     ----------
-    specimen
-        Geometry [mm].
-    size
-        Target edge length of the elements [mm].
-
-    Raises
-    ------
-    InputError
-        If the size is not positive, or too large for the cells.
+    specimen : geometry [mm].
+    size : target edge length of the elements [mm].
     """
     width, height = specimen.half_size
     require_size(size, 4.0 * width * height)
@@ -171,18 +150,13 @@ def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
 def require_size(size: float, area: float) -> None:
     """Refuse a size of elements that nothing could be computed with.
 
+    InputError if the size is not positive, or so small that meshing and factorising would need more
+    memory than there is.
+
     Parameters
     ----------
-    size
-        Edge length of the elements [mm].
-    area
-        Of what they are to fill, holes included [mm^2].
-
-    Raises
-    ------
-    InputError
-        If the size is not positive, or so small that meshing and factorising would need more
-        memory than there is.
+    size : edge length of the elements [mm].
+    area : of what they are to fill, holes included [mm^2].
     """
     if not 0 < size < math.inf:
         raise InputError(f"mesh size: expected a positive length in mm, got {size}")
@@ -197,10 +171,8 @@ def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
 
     Parameters
     ----------
-    blocks
-        Already placed.
-    tolerance
-        Nodes closer than this become one [mm].
+    blocks : already placed.
+    tolerance : nodes closer than this become one [mm].
     """
     offsets = np.cumsum([0] + [len(b.nodes) for b in blocks[:-1]])
     nodes = np.vstack([b.nodes for b in blocks])
@@ -289,12 +261,9 @@ def mesh_block(
 
     Parameters
     ----------
-    corners
-        The polygon's corners, counter-clockwise [mm].
-    divisions
-        Number of elements on each side, the first from the first corner to the second.
-    arcs
-        Numbers of those sides that are arcs about the origin: of a circle, or, where they end on
+    corners : the polygon's corners, counter-clockwise [mm].
+    divisions : number of elements on each side, the first from the first corner to the second.
+    arcs : numbers of those sides that are arcs about the origin: of a circle, or, where they end on
         both axes, of an ellipse.
     """
     with quiet_gmsh():

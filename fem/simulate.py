@@ -306,12 +306,9 @@ def simulate_pattern(
 
     Parameters
     ----------
-    experiment, mesh
-        Its strains and branches are not used; the mesh of its specimen.
-    pattern, target
-        What is measured, and the amplitude to be reached [mm].
-    largest_strain
-        Up to which to look for the first critical point [-].
+    experiment, mesh : its strains and branches are not used; the mesh of its specimen.
+    pattern, target : what is measured, and the amplitude to be reached [mm].
+    largest_strain : up to which to look for the first critical point [-].
 
     Returns
     -------

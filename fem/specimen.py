@@ -22,10 +22,8 @@ class Stacking:
 
     Parameters
     ----------
-    shift
-        By how much a row is moved along x against the one below: 0, or 0.5 [pitch].
-    rise
-        Distance of the rows [pitch]; None where ``pitch_y`` gives it.
+    shift : by how much a row is moved along x against the one below: 0, or 0.5 [pitch].
+    rise : distance of the rows [pitch]; None where ``pitch_y`` gives it.
     """
 
     shift: float
@@ -44,38 +42,32 @@ STACKINGS = {
 class Specimen:
     """A rectangular specimen with ``holes_y`` rows of ``holes_x`` round or elliptical holes.
 
-    The origin is the specimen's centre; x is the loading direction. Defaults are the
-    virtual experiment of the paper (section "Virtual Experiments").
+    The origin is the specimen's centre; x is the loading direction. Defaults are the virtual
+    experiment of the paper (section "Virtual Experiments").
 
-    In triangular stacking every second row, counted from below, has one hole less: no hole is
-    cut, the specimen is symmetric about the y axis, and with an odd number of rows about the x
-    axis too. The cellular part is the bounding box of the holes' cells; what is left of it at
-    the ends of the shorter rows, and between the cells at top and bottom, is solid.
+    In triangular stacking every second row, counted from below, has one hole less: no hole is cut,
+    the specimen is symmetric about the y axis, and with an odd number of rows about the x axis too.
+    The cellular part is the bounding box of the holes' cells; what is left of it at the ends of the
+    shorter rows, and between the cells at top and bottom, is solid.
 
     Parameters
     ----------
-    holes_x, holes_y
-        Number of holes in a row, along the loading direction, and number of rows [-].
-    diameter
-        Hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at its
-        centre.
-    pitch
-        Centre-to-centre distance l along a row, the unit cell size [mm].
-    bulk_x, bulk_y
-        Width of the solid strips beside the cellular part, at the loaded edges and at the
-        free edges [mm]; 0 leaves them out.
-    grading_x, grading_y
-        Change of the diameter from hole to hole, per distance of their centres in the loading and
-        in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A
-        specimen graded in one direction keeps its mirror symmetry in the other. Ellipses keep
-        their aspect.
-    stacking
-        "square", "rectangular" or "triangular" (equilateral, rows along x); see ``STACKINGS``.
-    pitch_y
-        Distance of the rows [mm], of rectangular stacking; that of the others follows from
+    holes_x, holes_y : number of holes in a row, along the loading direction, and number of rows
+        [-].
+    diameter : hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at
+        its centre.
+    pitch : centre-to-centre distance l along a row, the unit cell size [mm].
+    bulk_x, bulk_y : width of the solid strips beside the cellular part, at the loaded edges and at
+        the free edges [mm]; 0 leaves them out.
+    grading_x, grading_y : change of the diameter from hole to hole, per distance of their centres
+        in the loading and in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x +
+        grading_y y. A specimen graded in one direction keeps its mirror symmetry in the other.
+        Ellipses keep their aspect.
+    stacking : "square", "rectangular" or "triangular" (equilateral, rows along x); see
+        ``STACKINGS``.
+    pitch_y : distance of the rows [mm], of rectangular stacking; that of the others follows from
         ``pitch``.
-    diameter_y
-        Diameter of elliptical holes along y [mm]; None for round ones.
+    diameter_y : diameter of elliptical holes along y [mm]; None for round ones.
     """
 
     holes_x: int = 6
@@ -305,12 +297,9 @@ class Imperfection:
 
     Parameters
     ----------
-    position_sd
-        Standard deviation of each coordinate of a hole's centre [mm].
-    diameter_sd
-        Standard deviation of a hole's diameter [mm].
-    seed
-        Seed of the random generator.
+    position_sd : standard deviation of each coordinate of a hole's centre [mm].
+    diameter_sd : standard deviation of a hole's diameter [mm].
+    seed : seed of the random generator.
     """
 
     position_sd: float = 0.0

@@ -32,12 +32,9 @@ class PixelQuadrature:
 
     Parameters
     ----------
-    points
-        Points in each pixel away from the edges; 0: none needed, the average is exact.
-    rms_bound
-        Bound of their root-mean-square error on the pattern [fraction of full scale].
-    edge_points
-        Points in each pixel near an edge.
+    points : points in each pixel away from the edges; 0: none needed, the average is exact.
+    rms_bound : bound of their root-mean-square error on the pattern [fraction of full scale].
+    edge_points : points in each pixel near an edge.
     """
 
     points: int
@@ -111,18 +108,14 @@ class ImageRecord:
 
     Parameters
     ----------
-    image, camera_image, mask
-        Names of the files: without noise, as exposed, where there is material.
-    noise_sd
-        Root mean square over the material of the camera image's predicted noise [fraction of
+    image, camera_image, mask : names of the files: without noise, as exposed, where there is
+        material.
+    noise_sd : root mean square over the material of the camera image's predicted noise [fraction of
         full scale].
-    saturated_px, doubly_covered_px
-        Material pixels at the highest level, and pixels inside more than one element, where the
-        specimen overlaps.
-    light
-        The factor on the irradiance; None if the light doesn't flicker.
-    quadrature
-        How the pixels were averaged; None if they show points.
+    saturated_px, doubly_covered_px : material pixels at the highest level, and pixels inside more
+        than one element, where the specimen overlaps.
+    light : the factor on the irradiance; None if the light doesn't flicker.
+    quadrature : how the pixels were averaged; None if they show points.
     """
 
     image: str

@@ -22,12 +22,9 @@ class PixelGrid:
 
     Parameters
     ----------
-    rows, cols
-        Image size [px].
-    pixel_size
-        Edge of a pixel [mm/px].
-    x0, y0
-        Position of the centre of pixel (row 0, column 0), the upper left one [mm].
+    rows, cols : image size [px].
+    pixel_size : edge of a pixel [mm/px].
+    x0, y0 : position of the centre of pixel (row 0, column 0), the upper left one [mm].
     """
 
     rows: int

@@ -89,12 +89,9 @@ class SnapshotRecord(ImageRecord):
 
     Parameters
     ----------
-    nominal_strain, branch
-        Of the snapshot [-].
-    truth
-        Name of the truth's file.
-    inverse_map_max_residual_px
-        Largest residual of the inverse mapping [px].
+    nominal_strain, branch : of the snapshot [-].
+    truth : name of the truth's file.
+    inverse_map_max_residual_px : largest residual of the inverse mapping [px].
     """
 
     nominal_strain: float
@@ -263,23 +260,16 @@ def make_images(
 ) -> ImageSet:
     """Make (or find finished) the images and the truth of some snapshots.
 
+    InputError if a snapshot is missing, an element is turned inside out, two strains would share a
+    file name, or the disk refuses.
+
     Parameters
     ----------
-    solution, spec
-        What is imaged, and how.
-    folder
-        Where to write; made if it doesn't exist. A whole set of the same solution, spec, strains
-        and code is left as it is; any other set there is replaced.
-    strains
-        Nominal strains of the snapshots to image [-]; by default those of all.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If a snapshot is missing, an element is turned inside out, two strains would share a
-        file name, or the disk refuses.
+    solution, spec : what is imaged, and how.
+    folder : where to write; made if it doesn't exist. A whole set of the same solution, spec,
+        strains and code is left as it is; any other set there is replaced.
+    strains : nominal strains of the snapshots to image [-]; by default those of all.
+    progress : listener.
     """
     folder = Path(folder)
     if strains is None:

@@ -56,13 +56,12 @@ class HasDisplacement(Protocol):
 class Truth:
     """What a measurement of one deformed image should find; each part is made when asked for.
 
-    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where
-    there is no material.
+    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where there
+    is no material.
 
     Parameters
     ----------
-    part
-        Gives a part by its name, the name of its property.
+    part : gives a part by its name, the name of its property.
     """
 
     part: Callable[[str], NDArray[Any]]
@@ -135,23 +134,16 @@ def _read_part(path: Path | str, name: str) -> NDArray[Any]:
 class ImagePair:
     """A reference and a deformed image of one size; checked, and read-only.
 
+    InputError if sizes differ, a mask is empty, or an image holds NaN or is constant on its
+    material.
+
     Parameters
     ----------
-    reference, deformed
-        (rows, cols) grey levels f and g; kept as float32.
-    grid
-        Their pixels.
-    mask, deformed_mask
-        (rows, cols) True on material, in f and in g; None for everywhere.
-    truth
-        What a measurement should find, where that is known.
-    strain
-        Nominal strain of the deformed image [-]; NaN where it isn't known.
-
-    Raises
-    ------
-    InputError
-        If sizes differ, a mask is empty, or an image holds NaN or is constant on its material.
+    reference, deformed : (rows, cols) grey levels f and g; kept as float32.
+    grid : their pixels.
+    mask, deformed_mask : (rows, cols) True on material, in f and in g; None for everywhere.
+    truth : what a measurement should find, where that is known.
+    strain : nominal strain of the deformed image [-]; NaN where it isn't known.
     """
 
     reference: FloatImage
@@ -194,10 +186,7 @@ class ImagePair:
     def rms(self, measured: HasDisplacement) -> float:
         """Root mean square of truth - measured *per component* over the material [mm].
 
-        Raises
-        ------
-        InputError
-            If there is no truth.
+        InputError if there is no truth.
         """
         if self.truth is None:
             raise InputError("expected a pair whose true displacement is known, got one without")

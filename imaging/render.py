@@ -37,16 +37,11 @@ class ImagedState:
 
     Parameters
     ----------
-    mesh
-        The undeformed mesh.
-    displacement
-        (n, 2) at its nodes [mm]; None for the undeformed state.
-    grid
-        The pixels; the speckle's whole pixels are the grid's.
-    speckle, background
-        Intensity of the material and around it [fraction of full scale].
-    where
-        What to call the state in an error.
+    mesh : the undeformed mesh.
+    displacement : (n, 2) at its nodes [mm]; None for the undeformed state.
+    grid : the pixels; the speckle's whole pixels are the grid's.
+    speckle, background : intensity of the material and around it [fraction of full scale].
+    where : what to call the state in an error.
     """
 
     mesh: Mesh
@@ -109,13 +104,10 @@ class Rendering:
 
     Parameters
     ----------
-    image
-        (rows, cols) float32 intensity [fraction of full scale].
-    mask
-        (rows, cols) True where there is material.
-    doubly_covered
-        How many of its pixels lie inside more than one element: the specimen overlaps there,
-        and the element of the lowest number is shown.
+    image : (rows, cols) float32 intensity [fraction of full scale].
+    mask : (rows, cols) True where there is material.
+    doubly_covered : how many of its pixels lie inside more than one element: the specimen overlaps
+        there, and the element of the lowest number is shown.
     """
 
     image: FloatImage

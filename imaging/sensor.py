@@ -62,18 +62,13 @@ _TAIL = 5.0  # standard deviations of the blur; 6e-7 of it lie beyond
 class Aperture:
     """The weight h with which a pixel averages what falls on the sensor.
 
+    InputError if a value is out of its range.
+
     Parameters
     ----------
-    fill_factor
-        Sensitive part of the pixel's area [-], a centred square: 1 is the whole pixel, 0 a
-        point.
-    psf_px
-        Standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    fill_factor : sensitive part of the pixel's area [-], a centred square: 1 is the whole pixel, 0
+        a point.
+    psf_px : standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens.
     """
 
     fill_factor: float = 0.0
@@ -146,31 +141,20 @@ class Aperture:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How a sensor turns light into grey levels.
+    """How a sensor turns light into grey levels; InputError if a value is out of its range.
 
     Parameters
     ----------
-    fill_factor, psf_px
-        As of an :class:`Aperture`.
-    gain
-        Factor from irradiance to grey level [-].
-    offset
-        Grey level of the dark [fraction of full scale].
-    full_well
-        Electrons that an irradiance of 1 frees [-]: the fewer, the more shot noise; 0: none.
-    read_noise
-        Standard deviation of the read noise [fraction of full scale].
-    saturation
-        Grey level that is never exceeded [fraction of full scale].
-    flicker
-        Relative standard deviation of the light from image to image [-], even over an image.
-    shot_seed, read_seed, flicker_seed
-        Seeds of the noises; every image of a set has streams of its own.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    fill_factor, psf_px : as of an :class:`Aperture`.
+    gain : factor from irradiance to grey level [-].
+    offset : grey level of the dark [fraction of full scale].
+    full_well : electrons that an irradiance of 1 frees [-]: the fewer, the more shot noise; 0:
+        none.
+    read_noise : standard deviation of the read noise [fraction of full scale].
+    saturation : grey level that is never exceeded [fraction of full scale].
+    flicker : relative standard deviation of the light from image to image [-], even over an image.
+    shot_seed, read_seed, flicker_seed : seeds of the noises; every image of a set has streams of
+        its own.
     """
 
     fill_factor: float = 0.0

@@ -67,11 +67,9 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
 
     Parameters
     ----------
-    image
-        (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about
-        its outermost pixels.
-    order, pad
-        3, 5 or 11; rows and columns of mirrored coefficients to put around it [px].
+    image : (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about its
+        outermost pixels.
+    order, pad : 3, 5 or 11; rows and columns of mirrored coefficients to put around it [px].
 
     Returns
     -------
@@ -298,10 +296,8 @@ class SplineImage:
 
     Parameters
     ----------
-    coefficients
-        (rows + 2 PAD, cols + 2 PAD) B-spline coefficients, float32 or float64.
-    order
-        3, 5 or 11.
+    coefficients : (rows + 2 PAD, cols + 2 PAD) B-spline coefficients, float32 or float64.
+    order : 3, 5 or 11.
     """
 
     coefficients: NDArray[Any]
@@ -320,17 +316,12 @@ class SplineImage:
     def of(cls, image: ArrayLike, order: int = 5, dtype: Any = np.float32) -> SplineImage:
         """Prefilter an image (mirrored at its border) and keep the coefficients.
 
+        InputError if the image isn't of 2 x 2 px or more, or the order is not among the three.
+
         Parameters
         ----------
-        image, order
-            (rows, cols) grey levels; 3, 5 or 11.
-        dtype
-            How the coefficients are stored: float32 costs 1e-7 of full scale.
-
-        Raises
-        ------
-        InputError
-            If the image isn't of 2 x 2 px or more, or the order is not among the three.
+        image, order : (rows, cols) grey levels; 3, 5 or 11.
+        dtype : how the coefficients are stored: float32 costs 1e-7 of full scale.
         """
         pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:

@@ -2,8 +2,7 @@
 
 At every load the least stable wave is found: on a grid of the zone, from its best points on by
 descent along the eigenvalue's gradient, and for waves much longer than the cell by the acoustic
-tensor of the effective medium. The load at which the least value is zero is a root in one
-variable.
+tensor of the effective medium. The load at which the least value is zero is a root in one variable.
 """
 
 from __future__ import annotations
@@ -33,23 +32,16 @@ class LatticeCritical:
 
     Parameters
     ----------
-    load
-        Critical load; without one, the last load reached [-].
-    found, outcome
-        Whether there is a critical point up to there; what was found, as a sentence.
-    least_stable, state
-        The least stable wave and the equilibrium at ``load``.
-    waves
-        All waves of the grid that are critical there: a degenerate set has more than one. k and -k
-        are the same mode and appear once. Empty for long waves.
-    history
-        The least stable wave at every load looked at, by load.
-    below, above
-        Number of negative eigenvalues at each of ``waves`` a millionth of the load below and
-        above the critical one: the proof.
-    unstable_before
-        Waves of the grid that are unstable already a millionth below: this is the first critical
-        point if there are none. Not looked for where one wave was given.
+    load : critical load; without one, the last load reached [-].
+    found, outcome : whether there is a critical point up to there; what was found, as a sentence.
+    least_stable, state : the least stable wave and the equilibrium at ``load``.
+    waves : all waves of the grid that are critical there: a degenerate set has more than one. k and
+        -k are the same mode and appear once. Empty for long waves.
+    history : the least stable wave at every load looked at, by load.
+    below, above : number of negative eigenvalues at each of ``waves`` a millionth of the load below
+        and above the critical one: the proof.
+    unstable_before : waves of the grid that are unstable already a millionth below: this is the
+        first critical point if there are none. Not looked for where one wave was given.
     """
 
     load: float
@@ -69,10 +61,7 @@ def first_critical(
 ) -> LatticeCritical:
     """The first critical load over all wave vectors, along the path of a primitive cell.
 
-    Raises
-    ------
-    InputError
-        If the lattice is a mechanism: a wave costs no energy without load.
+    InputError if the lattice is a mechanism: a wave costs no energy without load.
     """
     search = search or CriticalSearch()
     zone = Zone(path.cell, search.divisions)

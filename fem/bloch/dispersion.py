@@ -57,12 +57,9 @@ class ZoneMap:
 
     Parameters
     ----------
-    phases
-        (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
-    eigenvalues
-        (g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0.
-    lattice
-        (2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm].
+    phases : (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
+    eigenvalues : (g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0.
+    lattice : (2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm].
     """
 
     load: float
@@ -93,16 +90,12 @@ class Dispersion:
 
     Parameters
     ----------
-    labels, stops
-        Names of the path's corners, and their places among its points.
-    waves, distances
-        (p, 2) phases (k . a1, k . a2) [rad] and (p,) length of the path so far [rad/mm].
-    loads
-        (s,) [-].
-    eigenvalues
-        (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
-    zone
-        Maps of the zone, one for each requested load.
+    labels, stops : names of the path's corners, and their places among its points.
+    waves, distances : (p, 2) phases (k . a1, k . a2) [rad] and (p,) length of the path so far
+        [rad/mm].
+    loads : (s,) [-].
+    eigenvalues : (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
+    zone : maps of the zone, one for each requested load.
     """
 
     labels: tuple[str, ...]

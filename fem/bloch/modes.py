@@ -46,21 +46,17 @@ class ModeSet:
 
     Parameters
     ----------
-    mesh, lattice, primitive
-        T6 mesh of the commensurate cell, undeformed, and lattice vectors of that cell and of the
-        primitive one as rows (2, 2) [mm].
-    waves
-        (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
-    eigenvalues
-        (m,) of K x = lambda M x, M of unit density [N/mm^4]; near zero at a critical point.
-    shapes
-        (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
+    mesh, lattice, primitive : T6 mesh of the commensurate cell, undeformed, and lattice vectors of
+        that cell and of the primitive one as rows (2, 2) [mm].
+    waves : (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
+    eigenvalues : (m,) of K x = lambda M x, M of unit density [N/mm^4]; near zero at a critical
+        point.
+    shapes : (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
         delta_ij. The sign is such that the first large component is positive. Waves with phases
         other than 0 and pi have their modes in pairs, which are the real and imaginary part.
-    load, gradient
-        Load parameter and F̄ (2, 2) of the state whose tangent they belong to [-].
-    info
-        Plain JSON values: lattice, material, loading, whether and where it is critical, versions.
+    load, gradient : load parameter and F̄ (2, 2) of the state whose tangent they belong to [-].
+    info : plain JSON values: lattice, material, loading, whether and where it is critical,
+        versions.
     """
 
     mesh: Mesh
@@ -91,18 +87,15 @@ class BranchState:
 
     Parameters
     ----------
-    gradient, stress
-        (2, 2) F̄ [-] and P̄ [MPa].
-    energy, primary_energy
-        Stored energy per area of the cell, here and on the primary path at the same load [MPa];
-        NaN where that path ends before. Under a stress other than 0 the lower energy minus
-        P̄ : F̄ is what is preferred.
-    negative_eigenvalues
-        Of the cell's tangent with F̄'s free components; 0: stable against its own period.
-    displacement
-        (n, 2) of the mesh's nodes [mm].
-    amplitudes
-        (m,) mean over the material of (u - affine part - primary fluctuation) . phi_i [mm].
+    gradient, stress : (2, 2) F̄ [-] and P̄ [MPa].
+    energy, primary_energy : stored energy per area of the cell, here and on the primary path at the
+        same load [MPa]; NaN where that path ends before. Under a stress other than 0 the lower
+        energy minus P̄ : F̄ is what is preferred.
+    negative_eigenvalues : of the cell's tangent with F̄'s free components; 0: stable against its
+        own period.
+    displacement : (n, 2) of the mesh's nodes [mm].
+    amplitudes : (m,) mean over the material of (u - affine part - primary fluctuation) . phi_i
+        [mm].
     """
 
     load: float
@@ -125,15 +118,11 @@ class Branch:
 
     Parameters
     ----------
-    combination
-        (m,) coefficients of the modes at the start, of unit length [-].
-    states
-        By load; empty if it could not be followed. A load that the branch meets twice is there
+    combination : (m,) coefficients of the modes at the start, of unit length [-].
+    states : by load; empty if it could not be followed. A load that the branch meets twice is there
         twice.
-    outcome
-        How far it was followed, and why no farther.
-    curve
-        (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
+    outcome : how far it was followed, and why no farther.
+    curve : (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
         the critical one first.
     """
 

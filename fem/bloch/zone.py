@@ -29,13 +29,10 @@ class LeastStable:
 
     Parameters
     ----------
-    value
-        filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves
-        its limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable.
-    wave
-        Phases [rad]; (0, 0) for long waves and for modes with the cell's own period.
-    angle
-        Direction of k for long waves [rad]; None otherwise.
+    value : filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves its
+        limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable.
+    wave : phases [rad]; (0, 0) for long waves and for modes with the cell's own period.
+    angle : direction of k for long waves [rad]; None otherwise.
     """
 
     load: float

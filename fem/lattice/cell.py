@@ -35,18 +35,13 @@ class CellState:
 
     Parameters
     ----------
-    load
-        e: for compressions the nominal strain [-].
-    gradient, gradient_rate
-        (2, 2) F̄ and dF̄/de [-].
-    fluctuation, fluctuation_rate
-        (2 count,) w of the masters in the order of ``Reduction``, and dw/de [mm].
-    stress
-        (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
-    stiffness
-        (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
-    moduli
-        (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
+    load : e: for compressions the nominal strain [-].
+    gradient, gradient_rate : (2, 2) F̄ and dF̄/de [-].
+    fluctuation, fluctuation_rate : (2 count,) w of the masters in the order of ``Reduction``, and
+        dw/de [mm].
+    stress : (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
+    stiffness : (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
+    moduli : (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
     """
 
     load: float

@@ -22,10 +22,9 @@ class CriticalSearch:
 
     Parameters
     ----------
-    divisions
-        Of each axis of the zone; an even number has the points M and X on the grid.
-    largest, first_step, largest_step, tolerance
-        Load up to which to look, its steps, and to which it is located [-].
+    divisions : of each axis of the zone; an even number has the points M and X on the grid.
+    largest, first_step, largest_step, tolerance : load up to which to look, its steps, and to which
+        it is located [-].
     """
 
     largest: float = 0.3
@@ -49,11 +48,9 @@ class BranchOptions:
 
     Parameters
     ----------
-    first, longest, farthest
-        First and largest step of the amplitude, the rms displacement in the mode, and the
-        amplitude where to stop [-].
-    growth
-        Of the step from one point to the next.
+    first, longest, farthest : first and largest step of the amplitude, the rms displacement in the
+        mode, and the amplitude where to stop [-].
+    growth : of the step from one point to the next.
     """
 
     # At small amplitudes the directions of a degenerate set are all but equivalent.

@@ -111,13 +111,10 @@ class PathFollower:
 
         Parameters
         ----------
-        states, targets
-            Equilibria so far, at least one; targets already passed are left out.
-        until_unstable
-            Stop after the first state with negative pivots.
-        refuse_unstable
-            Take a step that arrives at an unstable state, or far from where it was expected, for a
-            slip off a stable path (that of an imperfect specimen) and shorten it.
+        states, targets : equilibria so far, at least one; targets already passed are left out.
+        until_unstable : stop after the first state with negative pivots.
+        refuse_unstable : take a step that arrives at an unstable state, or far from where it was
+            expected, for a slip off a stable path (that of an imperfect specimen) and shorten it.
 
         Returns
         -------

@@ -23,14 +23,10 @@ class Critical:
 
     Parameters
     ----------
-    strain, u
-        Critical nominal strain [-], and the displacement there.
-    modes
-        Those whose eigenvalues are nearest to zero, the critical one(s) first.
-    eigenvalues
-        (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.
-    below, above
-        Negative pivots at strain - tolerance and strain + tolerance: the proof.
+    strain, u : critical nominal strain [-], and the displacement there.
+    modes : those whose eigenvalues are nearest to zero, the critical one(s) first.
+    eigenvalues : (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.
+    below, above : negative pivots at strain - tolerance and strain + tolerance: the proof.
     """
 
     strain: float

@@ -34,16 +34,12 @@ class EdgeCompression:
 
     Parameters
     ----------
-    length
-        The length that nominal strain refers to [mm]; e * length is the shortening.
-    edges
-        "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
+    length : the length that nominal strain refers to [mm]; e * length is the shortening.
+    edges : "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
         for one node at mid-height, which keeps the specimen in place.
-    tilt
-        Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
+    tilt : counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
         strain [rad]: -e tilt y is added to its u_x.
-    pins
-        Points (x, y) whose u_y is fixed [mm]; nodes have to be there.
+    pins : points (x, y) whose u_y is fixed [mm]; nodes have to be there.
     """
 
     half_width: float
@@ -110,9 +106,8 @@ class SymmetricFactor:
 class Structure:
     """A meshed hyperelastic body under one loading: what its equilibrium equations need.
 
-    Vectors are PETSc vectors over all displacement components; ``u`` includes the
-    constrained ones. ``factorisations`` counts every numerical factorisation. The mesh (T6) is
-    needed on rank 0 only.
+    Vectors are PETSc vectors over all displacement components; ``u`` includes the constrained ones.
+    ``factorisations`` counts every numerical factorisation. The mesh (T6) is needed on rank 0 only.
     """
 
     def __init__(

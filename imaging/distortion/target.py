@@ -24,21 +24,14 @@ from modeharvest.util.errors import InputError, require_within
 class CalibrationTarget:
     """A target and the shifts of the stage that carries it.
 
+    InputError if a value is out of its range.
+
     Parameters
     ----------
-    shifts_px
-        Intended shifts (along columns, along rows) [px], one for each photograph.
-    stage_sd_px
-        Standard deviation of the stage's error, of each component of each shift [px].
-    seed
-        Seed of the stage's errors, and of the target's speckle.
-    speckle
-        The target's pattern, but for its seeds; the specimen's where it is None.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    shifts_px : intended shifts (along columns, along rows) [px], one for each photograph.
+    stage_sd_px : standard deviation of the stage's error, of each component of each shift [px].
+    seed : seed of the stage's errors, and of the target's speckle.
+    speckle : the target's pattern, but for its seeds; the specimen's where it is None.
     """
 
     shifts_px: tuple[tuple[float, float], ...] = (
@@ -72,12 +65,9 @@ def photograph_target(
 
     Parameters
     ----------
-    target, sensor, bits
-        Shifts and pattern; the camera.
-    speckle
-        The pattern if the target has none of its own, but for its seeds.
-    points
-        (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
+    target, sensor, bits : shifts and pattern; the camera.
+    speckle : the pattern if the target has none of its own, but for its seeds.
+    points : (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
     """
     rows, cols = points[0].shape
     pattern = Speckle(_reseeded(target.speckle or speckle, target.seed), (rows, cols))

@@ -40,14 +40,10 @@ class ReferenceElement:
 
     Parameters
     ----------
-    name
-        T3, T6, Q4, Q8 or Q9.
-    triangular
-        Whether the reference domain is the triangle (else the square).
-    nodes
-        (k, 2) local coordinates (xi, eta) of the nodes [-].
-    monomials
-        Which k of the nine monomials the element spans.
+    name : T3, T6, Q4, Q8 or Q9.
+    triangular : whether the reference domain is the triangle (else the square).
+    nodes : (k, 2) local coordinates (xi, eta) of the nodes [-].
+    monomials : which k of the nine monomials the element spans.
 
     Attributes
     ----------

@@ -31,17 +31,13 @@ class Located:
 
     Parameters
     ----------
-    element
-        (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
+    element : (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
         does. A pixel on a shared edge or node belongs to the element of the lowest number.
-    values
-        (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi, eta)
-        there [-]; NaN where no element is.
-    residual_px
-        (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px]; NaN
-        where no element is.
-    doubly_covered
-        How many pixels lie inside more than one element: the mesh overlaps there.
+    values : (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi,
+        eta) there [-]; NaN where no element is.
+    residual_px : (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px];
+        NaN where no element is.
+    doubly_covered : how many pixels lie inside more than one element: the mesh overlaps there.
     """
 
     element: NDArray[np.int32]
@@ -76,24 +72,16 @@ def locate(
 ) -> Located:
     """Find element and local coordinates, or fields, at every pixel centre of a grid.
 
+    InputError if a Jacobian isn't positive everywhere in some element.
+
     Parameters
     ----------
-    nodes
-        (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
-    cells, element
-        (m, k) node numbers of each element; T3, T6, Q4, Q8 or Q9.
-    grid
-        The pixels.
-    where
-        What to call the mesh in an error.
-    nodal
-        (n, c) fields at the nodes to evaluate instead of the local coordinates: faster than
+    nodes : (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
+    cells, element : (m, k) node numbers of each element; T3, T6, Q4, Q8 or Q9.
+    grid : the pixels.
+    where : what to call the mesh in an error.
+    nodal : (n, c) fields at the nodes to evaluate instead of the local coordinates: faster than
         :func:`interpolate` later, and without the memory for those.
-
-    Raises
-    ------
-    InputError
-        If a Jacobian isn't positive everywhere in some element.
     """
     require_positive_jacobian(nodes, cells, element, where)
     elements = tabulate_elements(nodes, cells, element, grid)

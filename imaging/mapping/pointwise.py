@@ -91,25 +91,19 @@ def locate_points(
 ) -> Located:
     """Find element and local coordinates of points given by their image positions.
 
+    InputError if a Jacobian isn't positive everywhere in some element.
+
     Parameters
     ----------
-    nodes, cells, element, where
-        As for :func:`modeharvest.imaging.mapping.isoparametric.locate`.
-    grid
-        What positions in px mean; they need not lie on it.
-    row, col
-        Positions of the points [px], of shapes that broadcast to two dimensions.
+    nodes, cells, element, where : as for :func:`modeharvest.imaging.mapping.isoparametric.locate`.
+    grid : what positions in px mean; they need not lie on it.
+    row, col : positions of the points [px], of shapes that broadcast to two dimensions.
 
     Returns
     -------
     Located
         With arrays of the points' shape; points beside the mesh, and NaN, belong to no element.
         How many points lie inside more than one element is not counted.
-
-    Raises
-    ------
-    InputError
-        If a Jacobian isn't positive everywhere in some element.
     """
     require_positive_jacobian(nodes, cells, element, where)
     row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))

@@ -42,13 +42,11 @@ def render_rows_average(
 
     Parameters
     ----------
-    mesh, nodes
-        The undeformed mesh, whose Jacobians are proved positive in the state with the node
-        positions ``nodes`` (n, 2) [mm].
-    grid, pattern, background
-        The pixels, the pattern's among them; intensity of the material and around it.
-    selected, offsets, weights
-        (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
+    mesh, nodes : the undeformed mesh, whose Jacobians are proved positive in the state with the
+        node positions ``nodes`` (n, 2) [mm].
+    grid, pattern, background : the pixels, the pattern's among them; intensity of the material and
+        around it.
+    selected, offsets, weights : (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
     """
     total = np.zeros(grid.shape)
     position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)

@@ -49,10 +49,8 @@ class StoredImage:
 
     Parameters
     ----------
-    levels
-        (rows, cols), or (rows, cols, 3) colour.
-    notes
-        Sentences about pages left out and turns made.
+    levels : (rows, cols), or (rows, cols, 3) colour.
+    notes : sentences about pages left out and turns made.
     """
 
     levels: NDArray[Any]
@@ -76,11 +74,8 @@ def read_stored(path: Path, *, single: bool = False) -> StoredImage:
     """Read a TIFF, PNG or JPEG; an alpha channel is dropped.
 
     Of a file with several pages the first is taken, unless it has to be the ``single`` one.
-
-    Raises
-    ------
-    InputError
-        One line: the file is missing, empty, damaged, or its numbers can't be read unchanged.
+    InputError, in one line: the file is missing, empty, damaged, or its numbers can't be read
+    unchanged.
     """
     remedy = "if it is a damaged file, or cut short, copy it or make it again"
     with reading(path, "a TIFF, PNG or JPEG image", remedy), warnings.catch_warnings():

@@ -46,24 +46,16 @@ class Photograph:
 
     Parameters
     ----------
-    path
-        Its file.
-    image
-        (rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top.
-    bits
-        Bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats.
-    stored_bits
-        Bits of a number in the file: 8, 16, or 32 or 64 for floats.
-    full_scale
-        The grey level that counts as white: 2^bits - 1; for floats 1, or the largest level if
-        that is above 1.
-    was_colour
-        Whether it was made grey from colour.
-    saturated, black
-        (rows, cols) True where a channel is at the level beyond which the camera or the file
-        cuts off, or at 0.
-    notes
-        Sentences about what was changed when it was read.
+    path : its file.
+    image : (rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top.
+    bits : bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats.
+    stored_bits : bits of a number in the file: 8, 16, or 32 or 64 for floats.
+    full_scale : the grey level that counts as white: 2^bits - 1; for floats 1, or the largest level
+        if that is above 1.
+    was_colour : whether it was made grey from colour.
+    saturated, black : (rows, cols) True where a channel is at the level beyond which the camera or
+        the file cuts off, or at 0.
+    notes : sentences about what was changed when it was read.
     """
 
     path: Path
@@ -102,13 +94,8 @@ def read_photograph(path: Path | str) -> Photograph:
     """Read a photograph.
 
     Of a file with several pages the first is taken, and the orientation tag is obeyed; ``notes``
-    tell of it.
-
-    Raises
-    ------
-    InputError
-        One line that names the file: it is missing, damaged, not a picture of grey or colour
-        levels, holds NaN or infinity, or every pixel has the same level.
+    tell of it. InputError, in one line that names the file: it is missing, damaged, not a picture
+    of grey or colour levels, holds NaN or infinity, or every pixel has the same level.
     """
     stored = read_stored(Path(path))
     require_grey_levels(stored.levels, path)
@@ -140,13 +127,8 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
     """Check whether a photograph shows a pattern at all; notes about what is not that good.
 
     ``mask`` (rows, cols) is True on material, if that is known: a background may be as white or
-    black as it likes.
-
-    Raises
-    ------
-    InputError
-        If more than half of the material (without a mask: more than 95 % of the image) is
-        saturated or black, or if there is nothing but noise.
+    black as it likes. InputError if more than half of the material (without a mask: more than 95 %
+    of the image) is saturated or black, or if there is nothing but noise.
     """
     notes = []
     for name, where, remedy in (

@@ -70,16 +70,11 @@ class BinaryField:
 
     Parameters
     ----------
-    cycles_per_px
-        Standard deviation of the Gaussian field's spectral density [cycles/px].
-    blur_px
-        Standard deviation of the Gaussian blur [px].
-    levels
-        Values outside and inside the second phase, before the blur.
-    coverage
-        Share of the area of the second phase [-].
-    seed
-        Seed of the random numbers.
+    cycles_per_px : standard deviation of the Gaussian field's spectral density [cycles/px].
+    blur_px : standard deviation of the Gaussian blur [px].
+    levels : values outside and inside the second phase, before the blur.
+    coverage : share of the area of the second phase [-].
+    seed : seed of the random numbers.
     """
 
     cycles_per_px: float
@@ -99,10 +94,8 @@ class Layer:
 
     Parameters
     ----------
-    field
-        Its phases and its blur.
-    shape
-        (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
+    field : its phases and its blur.
+    shape : (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
         that suit an FFT; the realisation depends on them, hence on ``shape``.
 
     Attributes

@@ -36,23 +36,15 @@ _WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations a
 class Ink:
     """A second layer: dots of ink, thresholded from a Gaussian field of their own and blurred.
 
+    InputError if a value is out of its range.
+
     Parameters
     ----------
-    standard_deviation
-        Standard deviation of the Gaussian field's spectral density [cycles/px].
-    blur_px
-        Standard deviation of the Gaussian blur [px].
-    coverage
-        Share of the area under ink [-].
-    darkness
-        Share of the light that ink takes away [-].
-    seed
-        Seed of the random numbers; streams differ from those of the layer below.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    standard_deviation : standard deviation of the Gaussian field's spectral density [cycles/px].
+    blur_px : standard deviation of the Gaussian blur [px].
+    coverage : share of the area under ink [-].
+    darkness : share of the light that ink takes away [-].
+    seed : seed of the random numbers; streams differ from those of the layer below.
     """
 
     standard_deviation: float = 0.05
@@ -78,28 +70,18 @@ class Ink:
 
 @dataclass(frozen=True)
 class SpeckleSpec:
-    """What the speckle looks like.
+    """What the speckle looks like; InputError if a value is out of its range.
 
     Parameters
     ----------
-    standard_deviation
-        Standard deviation of the spectral density of the Gaussian field, in ``unit``.
-    unit
-        "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px"
-        (2 pi times coarser); the paper leaves it open.
-    blur_px
-        Standard deviation of the Gaussian blur [px], at least 0.75.
-    dark, bright
-        Grey levels of the two phases before the blur, as fractions of full scale [-].
-    seed
-        Seed of the random numbers.
-    ink
-        A second layer; none by default.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    standard_deviation : standard deviation of the spectral density of the Gaussian field, in
+        ``unit``.
+    unit : "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi times
+        coarser); the paper leaves it open.
+    blur_px : standard deviation of the Gaussian blur [px], at least 0.75.
+    dark, bright : grey levels of the two phases before the blur, as fractions of full scale [-].
+    seed : seed of the random numbers.
+    ink : a second layer; none by default.
     """
 
     standard_deviation: float = 1.0 / 20.0

@@ -69,13 +69,10 @@ class PeriodicSpline:
 
     Parameters
     ----------
-    coefficients
-        (rows + 7, cols + 7) B-spline coefficients over one period of the finer samples; the
-        first ones are repeated after the last.
-    period
-        (rows, cols) of the period [px].
-    bound
-        Bound of the error anywhere, in units of the pattern.
+    coefficients : (rows + 7, cols + 7) B-spline coefficients over one period of the finer samples;
+        the first ones are repeated after the last.
+    period : (rows, cols) of the period [px].
+    bound : bound of the error anywhere, in units of the pattern.
     """
 
     coefficients: FloatArray
@@ -90,10 +87,9 @@ class PeriodicSpline:
 
         Parameters
         ----------
-        spectrum, period
-            (rows, cols // 2 + 1) c_k in the layout of a real FFT; (rows, cols) of the period [px].
-        tolerance
-            What the bound has to be, if 4 x 4 samples per pixel suffice for that.
+        spectrum, period : (rows, cols // 2 + 1) c_k in the layout of a real FFT; (rows, cols) of
+            the period [px].
+        tolerance : what the bound has to be, if 4 x 4 samples per pixel suffice for that.
         """
         size = np.abs(spectrum)
         for finer in _FINER:

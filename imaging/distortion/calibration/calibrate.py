@@ -56,19 +56,15 @@ class CalibrationOptions:
 
     Parameters
     ----------
-    degrees
-        Total degrees of S to compare, ascending, from 2 on, until the criterion rises two times.
-    rotations
-        Whether the target may turn a little between photographs; only where shifts are not
+    degrees : total degrees of S to compare, ascending, from 2 on, until the criterion rises two
+        times.
+    rotations : whether the target may turn a little between photographs; only where shifts are not
         known.
-    blurs_px
-        Blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
+    blurs_px : blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
         correlation and S leave; the last makes the spline's noise independent of where between
         pixels it samples, which would else draw S towards half pixels.
-    points
-        About how many points of the target to look at; more lower the standard deviation.
-    order
-        Of the spline that samples the photographs: 5 or 3.
+    points : about how many points of the target to look at; more lower the standard deviation.
+    order : of the spline that samples the photographs: 5 or 3.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
@@ -95,24 +91,17 @@ def calibrate(
 ) -> Calibration:
     """Find the distortion of a lens from photographs of one flat target in several positions.
 
+    InputError if there are too few photographs, of different sizes, without speckle, of different
+    things, or without enough shifts.
+
     Parameters
     ----------
-    images
-        m >= 3 photographs (rows, cols), the target shifted in its plane along at least two
+    images : m >= 3 photographs (rows, cols), the target shifted in its plane along at least two
         directions.
-    shifts
-        (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
+    shifts : (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
         goes into S. Not needed: without them the affine part of S isn't observable and is zero.
-    options
-        How.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If there are too few photographs, of different sizes, without speckle, of different
-        things, or without enough shifts.
+    options : how.
+    progress : listener.
     """
     options = options or CalibrationOptions()
     photographs = _checked(images)

@@ -36,12 +36,9 @@ class Pose:
 
     Parameters
     ----------
-    shift
-        (row, col) [px].
-    angle
-        Rotation [rad].
-    contrast, brightness
-        c and o: c I + o is as bright as the first photograph.
+    shift : (row, col) [px].
+    angle : rotation [rad].
+    contrast, brightness : c and o: c I + o is as bright as the first photograph.
     """
 
     shift: tuple[float, float] = (0.0, 0.0)
@@ -65,16 +62,12 @@ class View:
 
     Parameters
     ----------
-    spline
-        The photograph.
-    pose
-        Where the target is in it.
-    free
-        (5,) whether shift (2), rotation, contrast and brightness are unknown.
-    distorted
-        False if the photograph has no distortion, as one of a known pair.
-    border_px
-        Width of the margin that is left out: spline and blur know only its mirror image [px].
+    spline : the photograph.
+    pose : where the target is in it.
+    free : (5,) whether shift (2), rotation, contrast and brightness are unknown.
+    distorted : False if the photograph has no distortion, as one of a known pair.
+    border_px : width of the margin that is left out: spline and blur know only its mirror image
+        [px].
     """
 
     spline: SplineImage
@@ -133,22 +126,16 @@ class Fit:
 
     Parameters
     ----------
-    coefficients
-        (k,) of the model.
-    poses
-        One a view.
-    inverse
-        (K, K) inverse of the normal matrix: of the coefficients, then of each view's unknowns.
-    free
-        (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
-    sum_of_squares, freedom
-        Scatter about the mean [grey levels squared], and its degrees of freedom.
-    matches
-        (views,) correlation of each photograph with the mean of the others [-].
-    iterations, converged
-        How many steps, and whether the last one was short enough.
-    condition_number
-        Of the normal matrix, scaled to a unit diagonal.
+    coefficients : (k,) of the model.
+    poses : one a view.
+    inverse : (K, K) inverse of the normal matrix: of the coefficients, then of each view's
+        unknowns.
+    free : (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
+    sum_of_squares, freedom : scatter about the mean [grey levels squared], and its degrees of
+        freedom.
+    matches : (views,) correlation of each photograph with the mean of the others [-].
+    iterations, converged : how many steps, and whether the last one was short enough.
+    condition_number : of the normal matrix, scaled to a unit diagonal.
     """
 
     coefficients: FloatArray
@@ -186,12 +173,9 @@ def fit_views(
 
     Parameters
     ----------
-    model, c, views
-        The distortions to choose from; (k,) coefficients and poses to begin with.
-    points
-        (n,) rows and columns of ideal positions to look at [px].
-    tolerance_px
-        Largest change of S or of a shift [px] at which to stop.
+    model, c, views : the distortions to choose from; (k,) coefficients and poses to begin with.
+    points : (n,) rows and columns of ideal positions to look at [px].
+    tolerance_px : largest change of S or of a shift [px] at which to stop.
     """
     poses = [view.pose for view in views]
     free = np.array([view.free for view in views])

@@ -39,12 +39,9 @@ class PolynomialModel:
 
     Parameters
     ----------
-    shape
-        (rows, cols) of the image [px].
-    degree
-        Total degree, at least 1.
-    fixed
-        How many terms of each component are zero: 3, the affine ones, where shifts are not
+    shape : (rows, cols) of the image [px].
+    degree : total degree, at least 1.
+    fixed : how many terms of each component are zero: 3, the affine ones, where shifts are not
         known; 1, the constant, where they are; 0 if all are observable.
     """
 
@@ -100,11 +97,9 @@ class CameraModel:
 
     Parameters
     ----------
-    camera
-        The parameters that are known, and where the unknown ones begin.
-    unknown
-        Names among cx, cy and k1 ... p2. The focal lengths are not: another f with other k is the
-        same S.
+    camera : the parameters that are known, and where the unknown ones begin.
+    unknown : names among cx, cy and k1 ... p2. The focal lengths are not: another f with other k is
+        the same S.
     """
 
     camera: CameraDistortion

@@ -46,23 +46,17 @@ def recover_camera(
 ) -> LensEstimate:
     """Find the lens that shows the scene of one image as another.
 
+    InputError if sizes differ, an image is blank, or the images don't show the same scene.
+
     Parameters
     ----------
-    undistorted, distorted
-        (rows, cols) grey levels of one scene.
-    model
-        What the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
+    undistorted, distorted : (rows, cols) grey levels of one scene.
+    model : what the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
         ``fixed=0``. By default an OpenCV camera with unknown cx, cy, k1, k2, k3; its focal length
         is taken as the larger size of the image, because another f with other k is the same S.
-    mask, points
-        (rows, cols) where the undistorted image counts; about how many pixels to look at.
-    order
-        Of the spline that samples the images: 5 or 3.
-
-    Raises
-    ------
-    InputError
-        If sizes differ, an image is blank, or the images don't show the same scene.
+    mask, points : (rows, cols) where the undistorted image counts; about how many pixels to look
+        at.
+    order : of the spline that samples the images: 5 or 3.
     """
     images = checked_images((undistorted, distorted), ("undistorted", "distorted"))
     rows, cols = images[0].shape

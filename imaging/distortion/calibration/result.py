@@ -29,10 +29,9 @@ def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, 
 
     Parameters
     ----------
-    blur_px, order
-        Standard deviation of the blur before the spline [px]; the spline's order, 3 or 5.
-    stride_px
-        Distance between samples along rows and columns [px].
+    blur_px, order : standard deviation of the blur before the spline [px]; the spline's order, 3 or
+        5.
+    stride_px : distance between samples along rows and columns [px].
 
     Returns
     -------
@@ -70,19 +69,14 @@ class LensEstimate:
 
     Parameters
     ----------
-    distortion
-        What the model made of it.
-    coefficients, covariance
-        (k,) and (k, k) of the model's unknowns.
-    model
-        Which these are.
-    noise_sd
-        Noise of an image, estimated from the residual [grey levels].
-    matches
-        (m,) correlation of each image with the mean of the others, the distortion taken out [-].
-    bic
-        Bayesian information criterion; of two models of one set take that with the lower one.
-        NaN if it was not kept.
+    distortion : what the model made of it.
+    coefficients, covariance : (k,) and (k, k) of the model's unknowns.
+    model : which these are.
+    noise_sd : noise of an image, estimated from the residual [grey levels].
+    matches : (m,) correlation of each image with the mean of the others, the distortion taken out
+        [-].
+    bic : Bayesian information criterion; of two models of one set take that with the lower one. NaN
+        if it was not kept.
     """
 
     distortion: Distortion
@@ -127,17 +121,12 @@ class DegreeTrial:
 
     Parameters
     ----------
-    degree, unknowns
-        Total degree; number of all unknowns.
-    residual_rms
-        Scatter of the photographs about their mean [grey levels].
-    bic
-        Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
+    degree, unknowns : total degree; number of all unknowns.
+    residual_rms : scatter of the photographs about their mean [grey levels].
+    bic : Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
         for N values; the degree with 0 is taken [-].
-    change_px
-        Rms per component over the image by which S differs from the degree before [px].
-    sd_px
-        Rms per component over the image of S's standard deviation [px].
+    change_px : rms per component over the image by which S differs from the degree before [px].
+    sd_px : rms per component over the image of S's standard deviation [px].
     """
 
     degree: int
@@ -154,15 +143,12 @@ class Calibration(LensEstimate):
 
     Parameters
     ----------
-    distortion, model
-        S; the model's ``fixed`` terms could not be observed and are zero.
-    shifts, shifts_sd
-        (m, 2) motion of the target since the first photograph, along rows and columns [px], and
-        its standard deviation; 0 where given.
-    angles, angles_sd
-        (m,) its rotation, from the columns' to the rows' axis [rad], and its standard deviation.
-    trials
-        One for each degree.
+    distortion, model : S; the model's ``fixed`` terms could not be observed and are zero.
+    shifts, shifts_sd : (m, 2) motion of the target since the first photograph, along rows and
+        columns [px], and its standard deviation; 0 where given.
+    angles, angles_sd : (m,) its rotation, from the columns' to the rows' axis [rad], and its
+        standard deviation.
+    trials : one for each degree.
     """
 
     distortion: PolynomialDistortion
