@@ -69,10 +69,7 @@ def first_critical(
 
 
 def critical_at(
-    path: CellPath,
-    wave: Wave,
-    search: CriticalSearch | None = None,
-    progress: Progress = silent,
+    path: CellPath, wave: Wave, search: CriticalSearch | None = None, progress: Progress = silent
 ) -> LatticeCritical:
     """The first load at which the given wave is critical, whatever the others do.
 

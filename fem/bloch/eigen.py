@@ -65,11 +65,7 @@ class BlochWaves:
         self._condense()
 
     def lowest(
-        self,
-        wave: Wave,
-        count: int = 1,
-        near: BlochModes | None = None,
-        tolerance: float = 1e-14,
+        self, wave: Wave, count: int = 1, near: BlochModes | None = None, tolerance: float = 1e-14
     ) -> BlochModes:
         """The ``count`` lowest eigenpairs, at Γ without the two translations.
 
