@@ -25,8 +25,6 @@ _LARGEST_TILT = 1.0
 class PathOptions:
     """How the path is followed.
 
-    Parameters
-    ----------
     first_step, largest_step, critical_tolerance : steps of nominal strain along the primary path;
         to which the critical one is located [-].
     first_amplitude : largest nodal displacement of the first step onto the branch, as a share of
@@ -58,8 +56,6 @@ class PathOptions:
 class Experiment:
     """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
 
-    Parameters
-    ----------
     specimen, material : geometry [mm] and strain energy density [MPa].
     strains : nominal strains of the snapshots, ascending, compression positive [-].
     mesh_size : target edge length of the T6 elements [mm].

@@ -85,8 +85,6 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 class Snapshot:
     """One equilibrium state, with the displacement (n, 2) at the mesh's nodes [mm].
 
-    Parameters
-    ----------
     nominal_strain : applied shortening over L, the length of the cellular part [-]; compression
         positive.
     reaction, energy : compressive force on the loaded edge [N/mm] and stored energy [N], per unit

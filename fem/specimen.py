@@ -20,8 +20,6 @@ MOST_HOLES = 1000
 class Stacking:
     """How rows of holes along x are stacked along y.
 
-    Parameters
-    ----------
     shift : by how much a row is moved along x against the one below: 0, or 0.5 [pitch].
     rise : distance of the rows [pitch]; None where ``pitch_y`` gives it.
     """
@@ -50,8 +48,6 @@ class Specimen:
     The cellular part is the bounding box of the holes' cells; what is left of it at the ends of the
     shorter rows, and between the cells at top and bottom, is solid.
 
-    Parameters
-    ----------
     holes_x, holes_y : number of holes in a row, along the loading direction, and number of rows
         [-].
     diameter : hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at
@@ -295,8 +291,6 @@ class Specimen:
 class Imperfection:
     """Independent normal scatter of every hole.
 
-    Parameters
-    ----------
     position_sd : standard deviation of each coordinate of a hole's centre [mm].
     diameter_sd : standard deviation of a hole's diameter [mm].
     seed : seed of the random generator.

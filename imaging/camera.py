@@ -30,8 +30,6 @@ _MOST_POINTS = 16  # a side
 class PixelQuadrature:
     """How the pixels of an image were averaged.
 
-    Parameters
-    ----------
     points : points in each pixel away from the edges; 0: none needed, the average is exact.
     rms_bound : bound of their root-mean-square error on the pattern [fraction of full scale].
     edge_points : points in each pixel near an edge.
@@ -106,8 +104,6 @@ def points_a_side(
 class ImageRecord:
     """What the sidecar of a set says of an image.
 
-    Parameters
-    ----------
     image, camera_image, mask : names of the files: without noise, as exposed, where there is
         material.
     noise_sd : root mean square over the material of the camera image's predicted noise [fraction of

@@ -20,8 +20,6 @@ from modeharvest.util.errors import InputError
 class PixelGrid:
     """A regular grid of square pixels laid over the physical plane.
 
-    Parameters
-    ----------
     rows, cols : image size [px].
     pixel_size : edge of a pixel [mm/px].
     x0, y0 : position of the centre of pixel (row 0, column 0), the upper left one [mm].

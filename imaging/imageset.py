@@ -87,8 +87,6 @@ _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*
 class SnapshotRecord(ImageRecord):
     """What the sidecar says of a deformed image.
 
-    Parameters
-    ----------
     nominal_strain, branch : of the snapshot [-].
     truth : name of the truth's file.
     inverse_map_max_residual_px : largest residual of the inverse mapping [px].

@@ -59,8 +59,6 @@ class Truth:
     The last axis of length 2 holds the components (x, y) along the physical axes; NaN where there
     is no material.
 
-    Parameters
-    ----------
     part : gives a part by its name, the name of its property.
     """
 
@@ -137,8 +135,6 @@ class ImagePair:
     InputError if sizes differ, a mask is empty, or an image holds NaN or is constant on its
     material.
 
-    Parameters
-    ----------
     reference, deformed : (rows, cols) grey levels f and g; kept as float32.
     grid : their pixels.
     mask, deformed_mask : (rows, cols) True on material, in f and in g; None for everywhere.

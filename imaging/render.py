@@ -35,8 +35,6 @@ from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 class ImagedState:
     """A state of the specimen before a camera.
 
-    Parameters
-    ----------
     mesh : the undeformed mesh.
     displacement : (n, 2) at its nodes [mm]; None for the undeformed state.
     grid : the pixels; the speckle's whole pixels are the grid's.
@@ -102,8 +100,6 @@ class ImagedState:
 class Rendering:
     """An image, and where it shows material.
 
-    Parameters
-    ----------
     image : (rows, cols) float32 intensity [fraction of full scale].
     mask : (rows, cols) True where there is material.
     doubly_covered : how many of its pixels lie inside more than one element: the specimen overlaps

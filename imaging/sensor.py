@@ -64,8 +64,6 @@ class Aperture:
 
     InputError if a value is out of its range.
 
-    Parameters
-    ----------
     fill_factor : sensitive part of the pixel's area [-], a centred square: 1 is the whole pixel, 0
         a point.
     psf_px : standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens.
@@ -143,8 +141,6 @@ class Aperture:
 class Sensor:
     """How a sensor turns light into grey levels; InputError if a value is out of its range.
 
-    Parameters
-    ----------
     fill_factor, psf_px : as of an :class:`Aperture`.
     gain : factor from irradiance to grey level [-].
     offset : grey level of the dark [fraction of full scale].

@@ -26,8 +26,6 @@ _BYTES_PER_PIXEL = 250.0
 class ImagingSpec:
     """How a specimen is imaged; InputError if a value is out of its range.
 
-    Parameters
-    ----------
     pixel_size : edge of a pixel [mm/px].
     margin_px : background kept around the specimen in all its states [px]; the image size follows.
     shape : (rows, cols) instead of the size that follows from the margin [px].

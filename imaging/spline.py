@@ -294,8 +294,6 @@ PAD = 6
 class SplineImage:
     """An image that can be evaluated anywhere.
 
-    Parameters
-    ----------
     coefficients : (rows + 2 PAD, cols + 2 PAD) B-spline coefficients, float32 or float64.
     order : 3, 5 or 11.
     """

@@ -30,8 +30,6 @@ _BESIDE = 1e-6  # of the critical load: where the proof is made
 class LatticeCritical:
     """Where a lattice first becomes unstable, or how far it was found to be stable.
 
-    Parameters
-    ----------
     load : critical load; without one, the last load reached [-].
     found, outcome : whether there is a critical point up to there; what was found, as a sentence.
     least_stable, state : the least stable wave and the equilibrium at ``load``.

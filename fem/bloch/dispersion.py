@@ -55,8 +55,6 @@ _MAP_ARRAYS = ("phases", "eigenvalues", "lattice")
 class ZoneMap:
     """The lowest eigenvalue over all of the zone at one load [-].
 
-    Parameters
-    ----------
     phases : (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
     eigenvalues : (g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0.
     lattice : (2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm].
@@ -88,8 +86,6 @@ class ZoneMap:
 class Dispersion:
     """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors.
 
-    Parameters
-    ----------
     labels, stops : names of the path's corners, and their places among its points.
     waves, distances : (p, 2) phases (k . a1, k . a2) [rad] and (p,) length of the path so far
         [rad/mm].

@@ -44,8 +44,6 @@ NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i =
 class ModeSet:
     """Real modes of a lattice on its smallest cell that has their period.
 
-    Parameters
-    ----------
     mesh, lattice, primitive : T6 mesh of the commensurate cell, undeformed, and lattice vectors of
         that cell and of the primitive one as rows (2, 2) [mm].
     waves : (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
@@ -85,8 +83,6 @@ class ModeSet:
 class BranchState:
     """An equilibrium of the commensurate cell beyond the critical point.
 
-    Parameters
-    ----------
     gradient, stress : (2, 2) F̄ [-] and P̄ [MPa].
     energy, primary_energy : stored energy per area of the cell, here and on the primary path at the
         same load [MPa]; NaN where that path ends before. Under a stress other than 0 the lower
@@ -116,8 +112,6 @@ class BranchState:
 class Branch:
     """A buckled branch: which combination of modes it started with, and its states.
 
-    Parameters
-    ----------
     combination : (m,) coefficients of the modes at the start, of unit length [-].
     states : by load; empty if it could not be followed. A load that the branch meets twice is there
         twice.

@@ -27,8 +27,6 @@ _SAME = 1e-3  # phases [rad] that far apart are the same wave
 class LeastStable:
     """The wave that is nearest to instability at one load.
 
-    Parameters
-    ----------
     value : filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves its
         limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable.
     wave : phases [rad]; (0, 0) for long waves and for modes with the cell's own period.

@@ -33,8 +33,6 @@ _AMPLITUDE_TOLERANCE = 1e-11  # relative
 class CellState:
     """An equilibrium of a cell.
 
-    Parameters
-    ----------
     load : e: for compressions the nominal strain [-].
     gradient, gradient_rate : (2, 2) F̄ and dF̄/de [-].
     fluctuation, fluctuation_rate : (2 count,) w of the masters in the order of ``Reduction``, and

@@ -20,8 +20,6 @@ from modeharvest.util.errors import InputError
 class CriticalSearch:
     """How the first critical point is looked for.
 
-    Parameters
-    ----------
     divisions : of each axis of the zone; an even number has the points M and X on the grid.
     largest, first_step, largest_step, tolerance : load up to which to look, its steps, and to which
         it is located [-].
@@ -46,8 +44,6 @@ class CriticalSearch:
 class BranchOptions:
     """How a branch is followed; lengths are shares of the primitive cell's shorter vector.
 
-    Parameters
-    ----------
     first, longest, farthest : first and largest step of the amplitude, the rms displacement in the
         mode, and the amplitude where to stop [-].
     growth : of the step from one point to the next.

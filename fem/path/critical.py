@@ -21,8 +21,6 @@ _ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to beco
 class Critical:
     """The first critical point of the primary path.
 
-    Parameters
-    ----------
     strain, u : critical nominal strain [-], and the displacement there.
     modes : those whose eigenvalues are nearest to zero, the critical one(s) first.
     eigenvalues : (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.

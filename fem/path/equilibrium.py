@@ -32,8 +32,6 @@ _TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
 class EdgeCompression:
     """Compression along x by displacing the two edges x = +-half_width [mm] towards each other.
 
-    Parameters
-    ----------
     length : the length that nominal strain refers to [mm]; e * length is the shortening.
     edges : "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
         for one node at mid-height, which keeps the specimen in place.

@@ -100,8 +100,6 @@ class PolynomialDistortion(Distortion):
     S(row, col) = sum over i + j <= degree of c_ij T_i(xi) T_j(eta), where xi and eta run from -1 to
     1 from the first to the last column and row. Beyond the image it goes on as it is.
 
-    Parameters
-    ----------
     shape : (rows, cols) of the image [px].
     coefficients : (2, n) c_ij along the rows' and the columns' index [px], n = (degree + 1)(degree
         + 2)/2, by rising i + j, in each of them by rising j: 1, xi, eta, T_2(xi), xi eta, T_2(eta),
@@ -204,8 +202,6 @@ class CameraDistortion(Distortion):
 
     col' = cx + fx x', row' = cy + fy y'. The ideal image has the same fx, fy, cx, cy.
 
-    Parameters
-    ----------
     fx, fy : focal lengths [px].
     cx, cy : principal point, column and row [px]; whole numbers are pixel centres, as in OpenCV.
     k1, k2, p1, p2, k3, k4, k5, k6 : coefficients [-], in OpenCV's order.
@@ -276,8 +272,6 @@ class SampledDistortion(Distortion):
 
     Beyond the grid it goes on linearly from the edge.
 
-    Parameters
-    ----------
     rows, cols : (n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each.
     field : (2, n, m) S along the rows' and the columns' index [px].
     """

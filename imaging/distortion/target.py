@@ -26,8 +26,6 @@ class CalibrationTarget:
 
     InputError if a value is out of its range.
 
-    Parameters
-    ----------
     shifts_px : intended shifts (along columns, along rows) [px], one for each photograph.
     stage_sd_px : standard deviation of the stage's error, of each component of each shift [px].
     seed : seed of the stage's errors, and of the target's speckle.

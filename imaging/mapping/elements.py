@@ -38,8 +38,6 @@ _SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0],
 class ReferenceElement:
     """One element type.
 
-    Parameters
-    ----------
     name : T3, T6, Q4, Q8 or Q9.
     triangular : whether the reference domain is the triangle (else the square).
     nodes : (k, 2) local coordinates (xi, eta) of the nodes [-].

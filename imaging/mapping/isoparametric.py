@@ -29,8 +29,6 @@ from modeharvest.util.errors import InputError
 class Located:
     """Every pixel of an image in terms of a mesh.
 
-    Parameters
-    ----------
     element : (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
         does. A pixel on a shared edge or node belongs to the element of the lowest number.
     values : (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi,

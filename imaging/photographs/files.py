@@ -47,8 +47,6 @@ _ORIENTATION = 274
 class StoredImage:
     """What a file holds.
 
-    Parameters
-    ----------
     levels : (rows, cols), or (rows, cols, 3) colour.
     notes : sentences about pages left out and turns made.
     """

@@ -44,8 +44,6 @@ _OTHER_SCALE = 4.0
 class Photograph:
     """A photograph in grey.
 
-    Parameters
-    ----------
     path : its file.
     image : (rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top.
     bits : bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats.

@@ -68,8 +68,6 @@ def gaussian_field(
 class BinaryField:
     """A thresholded Gaussian field of two phases, and its blur: what a layer looks like.
 
-    Parameters
-    ----------
     cycles_per_px : standard deviation of the Gaussian field's spectral density [cycles/px].
     blur_px : standard deviation of the Gaussian blur [px].
     levels : values outside and inside the second phase, before the blur.

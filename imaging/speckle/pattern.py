@@ -38,8 +38,6 @@ class Ink:
 
     InputError if a value is out of its range.
 
-    Parameters
-    ----------
     standard_deviation : standard deviation of the Gaussian field's spectral density [cycles/px].
     blur_px : standard deviation of the Gaussian blur [px].
     coverage : share of the area under ink [-].
@@ -72,8 +70,6 @@ class Ink:
 class SpeckleSpec:
     """What the speckle looks like; InputError if a value is out of its range.
 
-    Parameters
-    ----------
     standard_deviation : standard deviation of the spectral density of the Gaussian field, in
         ``unit``.
     unit : "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi times

@@ -67,8 +67,6 @@ class Workspace(NamedTuple):
 class PeriodicSpline:
     """A pattern that can be evaluated anywhere, fast, to within a proved bound.
 
-    Parameters
-    ----------
     coefficients : (rows + 7, cols + 7) B-spline coefficients over one period of the finer samples;
         the first ones are repeated after the last.
     period : (rows, cols) of the period [px].

@@ -54,8 +54,6 @@ _LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
 class CalibrationOptions:
     """How to calibrate.
 
-    Parameters
-    ----------
     degrees : total degrees of S to compare, ascending, from 2 on, until the criterion rises two
         times.
     rotations : whether the target may turn a little between photographs; only where shifts are not

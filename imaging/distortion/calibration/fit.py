@@ -34,8 +34,6 @@ class Pose:
 
     T(x) = centre + R (x - centre) + shift, a small rotation from the columns' to the rows' axis.
 
-    Parameters
-    ----------
     shift : (row, col) [px].
     angle : rotation [rad].
     contrast, brightness : c and o: c I + o is as bright as the first photograph.
@@ -60,8 +58,6 @@ class Pose:
 class View:
     """A photograph and what is unknown of it.
 
-    Parameters
-    ----------
     spline : the photograph.
     pose : where the target is in it.
     free : (5,) whether shift (2), rotation, contrast and brightness are unknown.
@@ -124,8 +120,6 @@ _CHUNK = 4096
 class Fit:
     """Where the least squares ended.
 
-    Parameters
-    ----------
     coefficients : (k,) of the model.
     poses : one a view.
     inverse : (K, K) inverse of the normal matrix: of the coefficients, then of each view's

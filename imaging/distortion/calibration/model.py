@@ -37,8 +37,6 @@ class DistortionModel(Protocol):
 class PolynomialModel:
     """Polynomials of a total degree, all of their terms or those above the affine ones.
 
-    Parameters
-    ----------
     shape : (rows, cols) of the image [px].
     degree : total degree, at least 1.
     fixed : how many terms of each component are zero: 3, the affine ones, where shifts are not
@@ -95,8 +93,6 @@ class PolynomialModel:
 class CameraModel:
     """A camera, some parameters of which are unknown.
 
-    Parameters
-    ----------
     camera : the parameters that are known, and where the unknown ones begin.
     unknown : names among cx, cy and k1 ... p2. The focal lengths are not: another f with other k is
         the same S.

@@ -67,8 +67,6 @@ def sampled_correlations(
 class LensEstimate:
     """A lens as a fit found it.
 
-    Parameters
-    ----------
     distortion : what the model made of it.
     coefficients, covariance : (k,) and (k, k) of the model's unknowns.
     model : which these are.
@@ -119,8 +117,6 @@ class LensEstimate:
 class DegreeTrial:
     """What a degree of S gave.
 
-    Parameters
-    ----------
     degree, unknowns : total degree; number of all unknowns.
     residual_rms : scatter of the photographs about their mean [grey levels].
     bic : Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
@@ -141,8 +137,6 @@ class DegreeTrial:
 class Calibration(LensEstimate):
     """The lens of a set of photographs, without the part of S that can't be observed.
 
-    Parameters
-    ----------
     distortion, model : S; the model's ``fixed`` terms could not be observed and are zero.
     shifts, shifts_sd : (m, 2) motion of the target since the first photograph, along rows and
         columns [px], and its standard deviation; 0 where given.
