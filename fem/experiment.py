@@ -1,7 +1,4 @@
-"""What a virtual compression test is: plain dataclasses, no dolfinx.
-
-``simulate`` runs it.
-"""
+"""What a virtual compression test is: plain dataclasses, no dolfinx."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import Any
 
 from modeharvest.fem.materials import Material, Ogden, material_table
 from modeharvest.fem.specimen import Imperfection, Specimen
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 EDGES = ("clamped", "sliding")
 BRANCHES = ("primary", "buckled+", "buckled-")
@@ -21,12 +18,18 @@ SMALLEST_STEP = 1e-5
 _LARGEST_TILT = 1.0
 
 
+def require_edges(edges: str) -> None:
+    """Raise InputError unless loaded edges are of a known kind."""
+    if edges not in EDGES:
+        raise InputError(f"edges: expected {' or '.join(map(repr, EDGES))}, got {edges!r}")
+
+
 @dataclass(frozen=True)
 class PathOptions:
     """How the path is followed.
 
-    first_step, largest_step, critical_tolerance : steps of nominal strain along the primary path;
-        to which the critical one is located [-].
+    first_step, largest_step : of nominal strain along the primary path [-].
+    critical_tolerance : to which the critical strain is located [-].
     first_amplitude : largest nodal displacement of the first step onto the branch, as a share of
         the pitch or whatever length the branch is given [-].
     growth : most by which the mode's amplitude may grow in one step along the branch [-].
@@ -39,17 +42,11 @@ class PathOptions:
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        steps = (self.first_step, self.largest_step, self.first_amplitude)
-        if not (all(SMALLEST_STEP <= step <= 1 for step in steps) and 1 < self.growth <= 100):
-            raise InputError(
-                f"path options: expected steps and an amplitude from {SMALLEST_STEP:g} to 1 and a "
-                f"growth above 1 and at most 100, got {self}"
-            )
-        if not 1e-12 <= self.critical_tolerance < 1:
-            got = self.critical_tolerance
-            raise InputError(
-                f"path options: expected a critical_tolerance of 1e-12 to 1, got {got}"
-            )
+        what, tolerance = "path options: expected a", self.critical_tolerance
+        for name in ("first_step", "largest_step", "first_amplitude"):
+            require_within(f"{what} {name}", getattr(self, name), SMALLEST_STEP, 1.0)
+        require_within(f"{what} growth", self.growth, 1.0, 100.0, above=True)
+        require_within(f"{what} critical_tolerance", tolerance, 1e-12, 1.0)
 
 
 @dataclass(frozen=True)
@@ -93,8 +90,7 @@ class Experiment:
             )
         if not 0.0 < self.mesh_size < float("inf"):
             raise InputError(f"mesh_size: expected a positive length in mm, got {self.mesh_size}")
-        if self.edges not in EDGES:
-            raise InputError(f"edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}")
+        require_edges(self.edges)
         if not self.branches or not set(self.branches) <= set(BRANCHES):
             raise InputError(f"branches: expected some of {BRANCHES}, got {self.branches}")
         if not abs(self.tilt) <= _LARGEST_TILT:
@@ -104,8 +100,7 @@ class Experiment:
             )
         if self.guided and (self.specimen.holes_y % 2 or self.specimen.is_staggered):
             raise InputError(
-                "guided: expected square or rectangular stacking and an even holes_y, so that "
-                "there are solid junctions at mid-height, got "
+                "guided: expected rows in line and an even holes_y (junctions at mid-height), got "
                 f"{self.specimen.stacking} stacking and {self.specimen.holes_y}"
             )
 
@@ -119,15 +114,11 @@ class Experiment:
 
         As JSON gives it back; the rest of the options says how the solution is found.
         """
+        loading = {"edges": self.edges, "length_mm": self.specimen.length}
         tables = {
             "specimen": self.specimen.plain(),
             "material": material_table(self.material),
-            "loading": {
-                "edges": self.edges,
-                "length_mm": self.specimen.length,
-                "tilt_rad": self.tilt,
-                "guided": self.guided,
-            },
+            "loading": {**loading, "tilt_rad": self.tilt, "guided": self.guided},
             "imperfection": asdict(self.imperfection),
         }
         plain: dict[str, dict[str, Any]] = json.loads(json.dumps(tables))

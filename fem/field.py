@@ -6,8 +6,8 @@ read with h5py alone::
     nodes (n, 2) [mm]    cells (m, k)    @element @geometry @material @versions @seed
     snapshots/0000/displacement (n, 2) [mm]    @nominal_strain @branch ...
 
-Nodes of a cell: corners counter-clockwise, then mid-sides starting between the first two
-corners, then (Q9) the centre; this is the order of VTK, gmsh and meshio.
+Nodes of a cell: corners counter-clockwise, then mid-sides starting between the first two corners,
+then (Q9) the centre; this is the order of VTK, gmsh and meshio.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ class Mesh:
     element: str
 
     def __post_init__(self) -> None:
-        if self.element not in NODES_PER_CELL:
-            known = list(NODES_PER_CELL)
+        if self.element not in (known := list(NODES_PER_CELL)):
             raise InputError(f"expected an element among {known}, got {self.element}")
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(self.cells, dtype=np.int64))
@@ -56,8 +55,8 @@ class Mesh:
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 2:
             raise InputError(f"expected nodes of shape (n, 2), got {self.nodes.shape}")
         if self.cells.ndim != 2 or self.cells.shape[1] != k:
-            kind, shape = self.element, self.cells.shape
-            raise InputError(f"expected {kind} cells of shape (m, {k}), got {shape}")
+            what = f"{self.element} cells of shape (m, {k})"
+            raise InputError(f"expected {what}, got {self.cells.shape}")
         if not np.isfinite(self.nodes).all():
             raise InputError("expected finite node positions, got NaN or infinity")
         if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.nodes):
@@ -179,17 +178,21 @@ class Solution:
 
     def write_vtu(self, path: Path | str) -> None:
         """Write mesh and all displacements as VTU for ParaView, atomically."""
-        flat = np.zeros((len(self.mesh.nodes), 1))
-        points = np.hstack([self.mesh.nodes, flat])
-        data = {
-            f"u_mm_{k:04d}_{s.branch}_{100 * s.nominal_strain:.3f}pct": np.hstack(
-                [s.displacement, flat]
-            )
+        fields = {
+            f"u_mm_{k:04d}_{s.branch}_{100 * s.nominal_strain:.3f}pct": s.displacement
             for k, s in enumerate(self.snapshots)
         }
-        cells = [(_MESHIO_NAME[self.mesh.element], self.mesh.cells)]
         with atomic(path) as temporary:
-            meshio.Mesh(points, cells, point_data=data).write(temporary, file_format="vtu")
+            in_space(self.mesh, fields).write(temporary, file_format="vtu")
+
+
+def in_space(mesh: Mesh, fields: Mapping[str, FloatArray]) -> meshio.Mesh:
+    """A mesh with nodal vectors (n, 2) by name, all in three dimensions: VTK knows no plane."""
+    nodes, *vectors = (
+        np.pad(values, ((0, 0), (0, 1))) for values in (mesh.nodes, *fields.values())
+    )
+    cells = [(_MESHIO_NAME[mesh.element], mesh.cells)]
+    return meshio.Mesh(nodes, cells, point_data=dict(zip(fields, vectors, strict=True)))
 
 
 def write_mesh(file: h5py.File, mesh: Mesh) -> None:
@@ -238,11 +241,9 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     source = read_any_mesh(path)
     types = sorted({block.type for block in source.cells})
     found = [e for e, name in _MESHIO_NAME.items() if name in types]
-    if not found:
+    if len(found) != 1:
         known = list(_MESHIO_NAME.values())
-        raise InputError(f"expected cells among {known} in {path}, got {types}")
-    if len(found) > 1:
-        raise InputError(f"expected one type of cells in {path}, got {types}")
+        raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
     if displacement not in source.point_data:
         names = list(source.point_data)
         raise InputError(f"expected a nodal field {displacement!r} in {path}, got {names}")
@@ -252,5 +253,5 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     name = _MESHIO_NAME[found[0]]
     cells = np.vstack([block.data for block in source.cells if block.type == name])
     mesh = Mesh(source.points[:, :2], cells, found[0])
-    u = np.ascontiguousarray(u[:, :2])
-    return Solution(mesh, (Snapshot(nominal_strain, u),), {"source": str(path)})
+    snapshot = Snapshot(nominal_strain, np.ascontiguousarray(u[:, :2]))
+    return Solution(mesh, (snapshot,), {"source": str(path)})

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.special import ellipe
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.fem.specimen import Imperfection, Specimen, centred
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.machine import require_memory
@@ -67,7 +67,8 @@ def perturb(mesh: Mesh, specimen: Specimen, imperfection: Imperfection) -> Mesh:
 REVERSED_T6 = [0, 2, 1, 5, 4, 3]
 _BYTES_PER_ELEMENT = 15e3
 """Of meshing, assembling and factorising; 13 kB were measured from 9 000 to 83 000 elements."""
-_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+"""Of the coordinates in the four quarters of a plane."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,7 @@ class MeshBlock:
 
 
 def quarter_cell(pitch: float, diameter: float, size: float) -> MeshBlock:
-    """A quarter of the square unit cell, [0, l/2]^2, with the hole's centre at the origin.
-
-    InputError if ``size`` leaves fewer than two elements on a quarter of the hole's edge.
-    """
+    """A quarter of the square unit cell, [0, l/2]^2; see :func:`quarter_polygon`."""
     half, radius = 0.5 * pitch, 0.5 * diameter
     return quarter_polygon((half, half), half, (radius, radius), size)
 
@@ -134,13 +132,8 @@ def rectangle(width: float, height: float, n_width: int, n_height: int) -> MeshB
 def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
     """The specimen's T6 mesh, symmetric to the last bit about the axes that the holes have.
 
-    Those are both, unless diameters are graded. InputError if the size is not positive, or too
-    large for the cells.
-
-    Parameters
-    ----------
-    specimen : geometry [mm].
-    size : target edge length of the elements [mm].
+    Those are both, unless diameters are graded. ``size`` is the elements' target edge length [mm];
+    InputError if it is not positive, or too large for the cells.
     """
     width, height = specimen.half_size
     require_size(size, 4.0 * width * height)
@@ -148,32 +141,20 @@ def mesh_specimen(specimen: Specimen, size: float) -> Mesh:
 
 
 def require_size(size: float, area: float) -> None:
-    """Refuse a size of elements that nothing could be computed with.
+    """Refuse an edge length of elements [mm] with which nothing could be computed.
 
-    InputError if the size is not positive, or so small that meshing and factorising would need more
-    memory than there is.
-
-    Parameters
-    ----------
-    size : edge length of the elements [mm].
-    area : of what they are to fill, holes included [mm^2].
+    InputError if it is not positive, or so small that meshing and factorising would need more
+    memory than there is; ``area`` [mm^2] is what they are to fill, holes included.
     """
     if not 0 < size < math.inf:
         raise InputError(f"mesh size: expected a positive length in mm, got {size}")
     count = area / size / size
-    require_memory(
-        _BYTES_PER_ELEMENT * count, f"a mesh of about {count:.2g} elements", "enlarge mesh_size"
-    )
+    what = f"a mesh of about {count:.2g} elements"
+    require_memory(_BYTES_PER_ELEMENT * count, what, "enlarge mesh_size")
 
 
 def join(blocks: list[MeshBlock], tolerance: float) -> Mesh:
-    """One T6 mesh of blocks whose shared sides are divided alike.
-
-    Parameters
-    ----------
-    blocks : already placed.
-    tolerance : nodes closer than this become one [mm].
-    """
+    """One T6 mesh of placed blocks; nodes closer than ``tolerance`` [mm] become one."""
     offsets = np.cumsum([0] + [len(b.nodes) for b in blocks[:-1]])
     nodes = np.vstack([b.nodes for b in blocks])
     cells = np.vstack([b.cells + k for b, k in zip(blocks, offsets, strict=True)])
@@ -202,7 +183,7 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
     radii = [(0.5 * float(d), 0.5 * float(aspect * d)) for d in diameters]
     cells = [quarter_polygon(heights, half, radius, size) for radius in radii]
     for (x, y), k in zip(specimen.hole_centres, which, strict=True):
-        yield from (cells[k].placed(sign, (x, y)) for sign in _SIGNS)
+        yield from (cells[k].placed(sign, (x, y)) for sign in SIGNS)
     if specimen.is_staggered:
         yield from _fillers(specimen, size)
 
@@ -213,15 +194,14 @@ def _tiles(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
         is_full = specimen.row_counts == specimen.holes_x
         for y, full in zip(specimen.row_heights, is_full, strict=True):
             strip = sides[low if full else high]
-            yield from (strip.placed(s, (s[0] * a, y)) for s in _SIGNS)
+            yield from (strip.placed(s, (s[0] * a, y)) for s in SIGNS)
     if specimen.bulk_y > 0:
         strip = rectangle(half, specimen.bulk_y, n_half, n_y)
-        centres_x = (np.arange(specimen.holes_x) - 0.5 * (specimen.holes_x - 1)) * specimen.pitch
-        for x in centres_x:
-            yield from (strip.placed(s, (x, s[1] * b)) for s in _SIGNS)
+        for x in centred(specimen.holes_x) * specimen.pitch:
+            yield from (strip.placed(s, (x, s[1] * b)) for s in SIGNS)
     if specimen.bulk_x > 0 and specimen.bulk_y > 0:
         corner = rectangle(specimen.bulk_x, specimen.bulk_y, n_x, n_y)
-        yield from (corner.placed(s, (s[0] * a, s[1] * b)) for s in _SIGNS)
+        yield from (corner.placed(s, (s[0] * a, s[1] * b)) for s in SIGNS)
 
 
 def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
@@ -234,21 +214,19 @@ def _fillers(specimen: Specimen, size: float) -> Iterator[MeshBlock]:
     a, _ = specimen.cellular_half_size
     n_half, n_low, n_high, n_gap = (divisions_of(d, size) for d in (half, low, high, high - low))
     slant = divisions_of(math.hypot(half, high - low), size)
-    end = mesh_block(
-        [(0.0, 0.0), (half, 0.0), (half, low), (0.0, high)], [n_half, n_low, slant, n_high]
-    )
+    corners = [(0.0, 0.0), (half, 0.0), (half, low), (0.0, high)]
+    end = mesh_block(corners, [n_half, n_low, slant, n_high])
     gap = mesh_block([(0.0, high), (half, low), (half, high)], [slant, n_gap, n_half])
     last = specimen.holes_y - 1
-    rows = zip(specimen.row_heights, specimen.row_counts, strict=True)
-    for row, (y, count) in enumerate(rows):
+    for row, (y, count) in enumerate(zip(specimen.row_heights, specimen.row_counts, strict=True)):
         is_full = count == specimen.holes_x
         halves = [] if is_full else [(-a, 1.0), (a, -1.0)]  # and the side that is inwards
         for x, sign in halves:
             yield from (end.placed((sign, up), (x, y)) for up in (1.0, -1.0))
-        centres = (np.arange(count) - 0.5 * (count - 1)) * specimen.pitch
+        centres = centred(count) * specimen.pitch
         for up in (side for side, at in ((-1.0, 0), (1.0, last)) if at == row):
-            corners = [*halves, *((x, sign) for x in centres for sign in (1.0, -1.0))]
-            yield from (gap.placed((sign, up), (x, y)) for x, sign in corners)
+            places = [*halves, *((x, sign) for x in centres for sign in (1.0, -1.0))]
+            yield from (gap.placed((sign, up), (x, y)) for x, sign in places)
             if is_full and (width := specimen.bulk_x) > 0:
                 beside = rectangle(width, high - low, divisions_of(width, size), n_gap)
                 yield from (beside.placed((s, up), (s * a, y + up * low)) for s in (1.0, -1.0))
@@ -261,8 +239,8 @@ def mesh_block(
 
     Parameters
     ----------
-    corners : the polygon's corners, counter-clockwise [mm].
-    divisions : number of elements on each side, the first from the first corner to the second.
+    corners, divisions : the polygon's corners, counter-clockwise [mm]; number of elements on each
+        side, the first from the first corner to the second.
     arcs : numbers of those sides that are arcs about the origin: of a circle, or, where they end on
         both axes, of an ellipse.
     """

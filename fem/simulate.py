@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from modeharvest.fem import dolfinx_api
 from modeharvest.fem.experiment import BRANCHES, Experiment
@@ -22,7 +20,6 @@ from modeharvest.fem.path.continuation import PathFollower, State
 from modeharvest.fem.path.critical import Critical, locate_critical
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.stability import Mode
-from modeharvest.fem.specimen import Specimen
 from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.progress import Progress, silent
@@ -46,11 +43,9 @@ def simulate(
 def _follower(
     experiment: Experiment, mesh: Mesh, comm: MPI.Comm, progress: Progress = silent
 ) -> PathFollower:
-    spec = experiment.specimen
+    spec, edges = experiment.specimen, experiment.edges
     pins = spec.mid_junctions if experiment.guided else ()
-    loading = EdgeCompression(
-        spec.half_size[0], spec.length, experiment.edges, experiment.tilt, pins
-    )
+    loading = EdgeCompression(spec.half_size[0], spec.length, edges, experiment.tilt, pins)
     structure = Structure(mesh, experiment.material, loading, comm)
     return PathFollower(structure, experiment.path, progress)
 
@@ -81,7 +76,12 @@ class _Run:
         snapshots = self._snapshots(path, limit, branches)
         info = self._info(path, critical, branches)
         info["outcome"] = self._outcome(snapshots, limit, {"primary": path, **branches})
-        info["warnings"] = self._warnings(snapshots)
+        info["warnings"] = [
+            f"{s.branch} at {100 * s.nominal_strain:g} % is not stable ({s.negative_pivots} "
+            "negative pivots): the secondary bifurcation before it is not followed"
+            for s in snapshots
+            if s.branch != "primary" and s.negative_pivots
+        ]
         return Solution(self.mesh, tuple(snapshots), info)
 
     def _primary(self) -> tuple[list[State], Critical | None]:
@@ -114,24 +114,20 @@ class _Run:
         A mode of another symmetry has none, nor has one of staggered rows; there a field without
         symmetries decides, so that the sign isn't left to rounding.
         """
-        mode = critical.modes[0]
-        is_staggered = self.experiment.specimen.is_staggered
-        overlap = 0.0 if is_staggered else self._pattern_overlap(mode)
-        if abs(overlap) < 1e-6:
-            overlap = mode.overlap(self._asymmetric_field())
-        if overlap < 0:
-            critical.modes[0] = mode.reversed()
-        return critical
+        mode, spec = critical.modes[0], self.experiment.specimen
 
-    def _asymmetric_field(self) -> PETSc.Vec:
-        """A smooth field that no symmetry of a rectangle maps to plus or minus itself."""
-
-        def field(points: FloatArray) -> FloatArray:
-            x, y = (points / self.experiment.specimen.half_size).T
+        def asymmetric(points: FloatArray) -> FloatArray:
+            """Which no symmetry of a rectangle maps to plus or minus itself."""
+            x, y = (points / spec.half_size).T
             along, across = (1.0 + 0.7 * x) * (1.0 + 0.3 * y), (1.0 - 0.2 * x) * (1.0 - 0.6 * y)
             return np.stack([along, across], axis=1)
 
-        return self.follower.structure.from_function(field)
+        overlap = 0.0 if spec.is_staggered else self._pattern_overlap(mode)
+        if abs(overlap) < 1e-6:
+            overlap = mode.overlap(self.follower.structure.from_function(asymmetric))
+        if overlap < 0:
+            critical.modes[0] = mode.reversed()
+        return critical
 
     def _pattern_overlap(self, mode: Mode) -> float:
         pattern = self.follower.structure.from_function(self.experiment.specimen.pattern)
@@ -144,20 +140,22 @@ class _Run:
         The root of the part of x . M x that lies in the span of the pattern's restrictions
         to single unit cells: 1 for the pattern with any smooth envelope.
         """
-        structure, spec = self.follower.structure, self.experiment.specimen
-        pattern = spec.pattern(self.mesh.nodes)
-        cell = _cell_of(self.mesh.nodes, spec)
-        inside = cell >= 0
+        structure, spec, nodes = self.follower.structure, self.experiment.specimen, self.mesh.nodes
+        pattern = spec.pattern(nodes)
+        (a, b), (x, y) = spec.cellular_half_size, nodes.T
+        column = np.floor((x + a) / spec.pitch).astype(np.int64)
+        row = np.floor((y + b) / spec.row_distance).astype(np.int64)
+        inside = (column >= 0) & (column < spec.holes_x) & (row >= 0) & (row < spec.holes_y)
+        cell = (column * spec.holes_y + row)[inside]
         with_mode = np.sum(pattern * structure.nodal(mode.weighted), axis=1)[inside]
         mass_of = structure.nodal(self.follower.mass * structure.from_function(spec.pattern))
         with_self = np.sum(pattern * mass_of, axis=1)[inside]
-        numerator = np.bincount(cell[inside], with_mode)
-        return float(np.sqrt(np.sum(numerator**2 / np.bincount(cell[inside], with_self))))
+        numerator = np.bincount(cell, with_mode)
+        return float(np.sqrt(np.sum(numerator**2 / np.bincount(cell, with_self))))
 
     def _branches(self, critical: Critical) -> dict[str, list[State]]:
         targets = [e for e in self.experiment.strains if e > critical.strain]
-        pitch = self.experiment.specimen.pitch
-        signs = {"buckled+": 1, "buckled-": -1}
+        pitch, signs = self.experiment.specimen.pitch, {"buckled+": 1, "buckled-": -1}
         return {
             name: follow_branch(self.follower, critical, targets, signs[name], pitch)
             for name in self.experiment.branches
@@ -167,11 +165,11 @@ class _Run:
     def _snapshots(
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
     ) -> list[Snapshot]:
-        kept: list[tuple[State, str]] = [
+        beyond = np.inf if "primary" in self.experiment.branches else limit
+        kept = [
             (state, "primary")
             for state in path
-            if _is_among(state.strain, self.experiment.strains)
-            and (state.strain <= limit or "primary" in self.experiment.branches)
+            if _is_among(state.strain, self.experiment.strains) and state.strain <= beyond
         ]
         kept += [(state, name) for name, states in branches.items() for state in states]
         kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
@@ -181,21 +179,17 @@ class _Run:
     def _info(
         self, path: list[State], critical: Critical | None, branches: dict[str, list[State]]
     ) -> dict[str, Any]:
-        e = self.experiment
+        paths = {"primary": path, **branches}
+        versions = {"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION}
+        versions |= {"numpy": np.__version__, "python": platform.python_version()}
         return {
-            **e.described(),
-            "mesh_size_mm": e.mesh_size,
+            **self.experiment.described(),
+            "mesh_size_mm": self.experiment.mesh_size,
             "critical": None if critical is None else self._critical_info(critical),
-            "path": {"primary": self._curve(path)}
-            | {name: self._curve(states) for name, states in branches.items()},
+            "path": {name: self._curve(states) for name, states in paths.items()},
             "factorisations": self.follower.structure.factorisations,
             "unknowns": 2 * len(self.mesh.nodes),
-            "versions": {
-                "modeharvest": __version__,
-                "dolfinx": dolfinx_api.VERSION,
-                "numpy": np.__version__,
-                "python": platform.python_version(),
-            },
+            "versions": versions,
         }
 
     def _critical_info(self, critical: Critical) -> dict[str, Any]:
@@ -225,15 +219,6 @@ class _Run:
             "negative_pivots": [s.negative_pivots for s in states],
             "lowest_eigenvalues_N_per_mm4": [list(s.eigenvalues) for s in states],
         }
-
-    def _warnings(self, snapshots: list[Snapshot]) -> list[str]:
-        """Snapshots that are not stable although their branch is meant to be."""
-        return [
-            f"{s.branch} at {100 * s.nominal_strain:g} % is not stable ({s.negative_pivots} "
-            "negative pivots): the secondary bifurcation before it is not followed"
-            for s in snapshots
-            if s.branch != "primary" and s.negative_pivots
-        ]
 
     def _outcome(
         self, snapshots: list[Snapshot], limit: float, paths: dict[str, list[State]]
@@ -267,15 +252,6 @@ def _stable_until(path: list[State], critical: Critical | None) -> float:
     return max(state.strain for state in path if state.negative_pivots == 0)
 
 
-def _cell_of(nodes: FloatArray, specimen: Specimen) -> NDArray[np.int64]:
-    """(n,) number of the unit cell that each node lies in, -1 in the bulk edges."""
-    a, b = specimen.cellular_half_size
-    column = np.floor((nodes[:, 0] + a) / specimen.pitch).astype(np.int64)
-    row = np.floor((nodes[:, 1] + b) / specimen.row_distance).astype(np.int64)
-    inside = (column >= 0) & (column < specimen.holes_x) & (row >= 0) & (row < specimen.holes_y)
-    return np.where(inside, column * specimen.holes_y + row, -1)
-
-
 def _is_among(strain: float, strains: Sequence[float]) -> bool:
     return any(abs(strain - e) < 1e-12 for e in strains)
 
@@ -302,21 +278,17 @@ def simulate_pattern(
 ) -> Solution:
     """Compress a perfect specimen beyond buckling until its pattern has a given amplitude.
 
-    Without the unstable primary path, which costs most where ligaments are thin.
+    Without the unstable primary path, which costs most where ligaments are thin. The solution has
+    one snapshot, on the branch that leaves the primary path at its first critical point. Without
+    such a point it is the last stable state, and ``info["critical"]`` is None; else that has the
+    ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's share. ``info["outcome"]`` is
+    "complete" or the reason why not.
 
     Parameters
     ----------
     experiment, mesh : its strains and branches are not used; the mesh of its specimen.
     pattern, target : what is measured, and the amplitude to be reached [mm].
     largest_strain : up to which to look for the first critical point [-].
-
-    Returns
-    -------
-    Solution
-        With one snapshot, on the branch that leaves the primary path at its first critical point.
-        Without such a point it is the last stable state, and ``info["critical"]`` is None; else
-        that has the ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's share.
-        ``info["outcome"]`` is "complete" or the reason why not.
     """
     spec, follower = experiment.specimen, _follower(experiment, mesh, MPI.COMM_SELF)
     structure = follower.structure

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 MOST_HOLES = 1000
 """In a direction."""
@@ -48,8 +48,7 @@ class Specimen:
     The cellular part is the bounding box of the holes' cells; what is left of it at the ends of the
     shorter rows, and between the cells at top and bottom, is solid.
 
-    holes_x, holes_y : number of holes in a row, along the loading direction, and number of rows
-        [-].
+    holes_x, holes_y : number of holes in a row, along the loading direction; number of rows.
     diameter : hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at
         its centre.
     pitch : centre-to-centre distance l along a row, the unit cell size [mm].
@@ -59,8 +58,7 @@ class Specimen:
         in the loading and in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x +
         grading_y y. A specimen graded in one direction keeps its mirror symmetry in the other.
         Ellipses keep their aspect.
-    stacking : "square", "rectangular" or "triangular" (equilateral, rows along x); see
-        ``STACKINGS``.
+    stacking : "square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``.
     pitch_y : distance of the rows [mm], of rectangular stacking; that of the others follows from
         ``pitch``.
     diameter_y : diameter of elliptical holes along y [mm]; None for round ones.
@@ -110,37 +108,29 @@ class Specimen:
                 "specimen: expected bulk edges of 0 mm or more, got "
                 f"bulk_x = {self.bulk_x} mm, bulk_y = {self.bulk_y} mm"
             )
-        self._check_rows()
-        smallest, largest = self.diameters.min(), self.diameters.max()
-        if not 0 < smallest <= largest < self.largest_diameter:
-            limit = self.largest_diameter
-            said = f"{limit:.5g} mm" + (", the pitch" if limit == self.pitch else "")
-            raise InputError(
-                f"specimen: expected 0 < d < {said}, of every hole, got d from "
-                f"{smallest:.5g} to {largest:.5g} mm; make diameters or gradings smaller"
-            )
-
-    def _check_rows(self) -> None:
-        """The rows' distance and the ellipses' aspect leave every hole its own cell."""
-        aspect, row = self.aspect, self.row_distance
-        if not (0 < aspect < np.inf and 0 < row < np.inf):
+        if not (0 < self.aspect < np.inf and 0 < self.row_distance < np.inf):
             raise InputError(
                 "specimen: expected a positive pitch_y and diameter_y, got "
                 f"{self.pitch_y} mm and {self.diameter_y} mm"
             )
-        if self.is_staggered and not row / aspect > 0.5 * self.pitch:
+        ratio = 2.0 * self.row_distance / self.pitch
+        if self.is_staggered and not self.aspect < ratio:
             raise InputError(
-                f"specimen: expected diameter_y < {2.0 * row / self.pitch:.4g} diameter in "
-                f"{self.stacking} stacking (a hole must stay in its row), got {self.diameter_y} mm "
-                f"and {self.diameter} mm"
+                f"specimen: expected diameter_y < {ratio:.4g} diameter in {self.stacking} stacking "
+                f"(a hole must stay in its row), got {self.diameter_y} mm and {self.diameter} mm"
+            )
+        smallest, largest, limit = self.diameters.min(), self.diameters.max(), self.largest_diameter
+        if not 0 < smallest <= largest < limit:
+            what = f"{limit:.5g} mm" + (", the pitch" if limit == self.pitch else "")
+            raise InputError(
+                f"specimen: expected 0 < d < {what}, of every hole, got d from "
+                f"{smallest:.5g} to {largest:.5g} mm; make diameters or gradings smaller"
             )
 
     def plain(self) -> dict[str, Any]:
         """As files have it: what was added to the square lattice of circles only where used."""
-        usual = {field.name: field.default for field in fields(self)}
-        added = ("stacking", "pitch_y", "diameter_y")
-        values = asdict(self)
-        return {n: v for n, v in values.items() if n not in added or v != usual[n]}
+        usual = {"stacking": "square", "pitch_y": None, "diameter_y": None}
+        return {n: v for n, v in asdict(self).items() if n not in usual or v != usual[n]}
 
     @property
     def is_staggered(self) -> bool:
@@ -205,8 +195,7 @@ class Specimen:
     @property
     def row_heights(self) -> FloatArray:
         """(holes_y,) y of each row [mm]."""
-        at = (np.arange(self.holes_y) - 0.5 * (self.holes_y - 1)) * self.row_distance
-        return np.asarray(at)
+        return centred(self.holes_y) * self.row_distance
 
     @property
     def length(self) -> float:
@@ -230,13 +219,8 @@ class Specimen:
     @property
     def hole_centres(self) -> FloatArray:
         """(holes, 2) positions of the hole centres [mm], exactly symmetric; from left to right."""
-        centres = np.array(
-            [
-                (x, y)
-                for y, count in zip(self.row_heights, self.row_counts, strict=True)
-                for x in (np.arange(count) - 0.5 * (count - 1)) * self.pitch
-            ]
-        )
+        rows = zip(self.row_heights, self.row_counts, strict=True)
+        centres = np.array([(x, y) for y, count in rows for x in centred(count) * self.pitch])
         return np.asarray(centres[np.lexsort((centres[:, 1], centres[:, 0]))])
 
     @property
@@ -287,6 +271,11 @@ class Specimen:
         return np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], axis=-1)
 
 
+def centred(count: int) -> FloatArray:
+    """(count,) numbers at a distance of 1, with a mean of exactly 0."""
+    return np.asarray(np.arange(count) - 0.5 * (count - 1))
+
+
 @dataclass(frozen=True)
 class Imperfection:
     """Independent normal scatter of every hole.
@@ -303,8 +292,7 @@ class Imperfection:
     def __post_init__(self) -> None:
         if not (self.position_sd >= 0 and self.diameter_sd >= 0):
             raise InputError(f"imperfection: expected standard deviations >= 0 mm, got {self}")
-        if self.seed < 0:
-            raise InputError(f"imperfection: expected a seed of 0 or more, got {self.seed}")
+        require_within("imperfection: expected a seed", self.seed, 0)
 
     @property
     def is_none(self) -> bool:

@@ -57,12 +57,10 @@ def integrate(
         side, bound = points_a_side(aperture, scene.speckle.spec, scene.compression)
         nodes, weights = aperture.rule(side)
         offsets = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
-        pairs = np.asarray(np.outer(weights, weights).ravel(), dtype=np.float64)
-        image[inside] = scene.average(offsets, pairs, inside)
+        image[inside] = scene.average(offsets, (weights[:, None] * weights).ravel(), inside)
         quadrature = PixelQuadrature(side**2, bound)
     scattered = aperture.scattered()
-    even: FloatArray = np.full(len(scattered), 1.0 / len(scattered))
-    image[near] = scene.average(scattered, even, near)
+    image[near] = scene.average(scattered, np.full(EDGE_POINTS, 1.0 / EDGE_POINTS), near)
     return image, quadrature
 
 
@@ -104,8 +102,7 @@ def points_a_side(
 class ImageRecord:
     """What the sidecar of a set says of an image.
 
-    image, camera_image, mask : names of the files: without noise, as exposed, where there is
-        material.
+    image, camera_image, mask : files without noise, as exposed, and of where there is material.
     noise_sd : root mean square over the material of the camera image's predicted noise [fraction of
         full scale].
     saturated_px, doubly_covered_px : material pixels at the highest level, and pixels inside more
@@ -148,7 +145,10 @@ class Camera:
 
         The image's ``name`` also seeds noise and flicker.
         """
-        observed = self._through_lens(ideal, scene)
+        observed = ideal
+        if self.points is not None:
+            shown = render_observed(scene, self.points)
+            observed = replace(shown, doubly_covered=ideal.doubly_covered)
         sensor, bits, mask = self.spec.sensor, self.spec.bits, observed.mask
         irradiance, quadrature, light = observed.image, None, None
         if not sensor.aperture.is_point:
@@ -171,10 +171,3 @@ class Camera:
             light=light,
             quadrature=quadrature,
         )
-
-    def _through_lens(self, ideal: Rendering, scene: ImagedState) -> Rendering:
-        """What the lens shows."""
-        if self.points is None:
-            return ideal
-        shown = render_observed(scene, self.points)
-        return replace(shown, doubly_covered=ideal.doubly_covered)

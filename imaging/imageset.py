@@ -7,11 +7,10 @@
     images.json
 
 The number in a file's name is the nominal strain in hundredths of a percent (0780 is 7.80 %).
-The plain images are noise-free averages over the pixels in float32; those with the bits in
-their name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says
-how the set was made and is written last: without it, the set isn't finished. Files are compared
-with the sizes and SHA-256 in it when they are read. It also holds what makes the set anew (a set
-with the same key need not be made), and:
+The plain images are noise-free averages over the pixels in float32; those with the bits in their
+name are single exposures by the sensor: noise, saturation, rounding. ``images.json`` says how the
+set was made and is written last: without it, the set isn't finished. Files are compared with the
+SHA-256 in it when they are read. It also holds what makes the set anew, and:
 
 ``noise``
     The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
@@ -22,8 +21,7 @@ with the same key need not be made), and:
     Sentences about what makes the images other than what a camera would show.
 
 With a distortion of the lens, images and masks are as the lens shows them, and the truth
-(:mod:`modeharvest.imaging.pair`) is on the ideal grid: what a measurement finds in images that
-were undistorted.
+(:mod:`modeharvest.imaging.pair`) is on the ideal grid: what is measured in undistorted images.
 """
 
 from __future__ import annotations
@@ -117,7 +115,8 @@ class ImageSet:
         with reading(path, what, remedy):
             images = cls(Path(folder), read_record(path, FORMAT, what, remedy))
             _ = images.grid, images.spec, images.max_residual_px
-            names = [name for record in images._records for name in _file_names(record)]
+            records = (images._reference, *images._snapshots)
+            names = [name for record in records for name in _file_names(record)]
             if not set(names) <= set(images.digests):
                 raise InputError(f"expected digests of {names}, got {list(images.digests)}")
             return images
@@ -146,10 +145,6 @@ class ImageSet:
         return tuple(made(SnapshotRecord, record) for record in self.info["snapshots"])
 
     @property
-    def _records(self) -> tuple[ImageRecord, ...]:
-        return (self._reference, *self._snapshots)
-
-    @property
     def max_residual_px(self) -> float:
         """The largest residual of the inverse mapping in the whole set [px]."""
         return float(self.info["inverse_map_max_residual_px"])
@@ -172,15 +167,9 @@ class ImageSet:
 
     def pair(self, strain: float, *, camera: bool = False) -> ImagePair:
         """The reference and the deformed image at a nominal strain [-]; ``camera``: as exposed."""
-        return ImagePair(
-            self.reference(camera=camera),
-            self.deformed(strain, camera=camera),
-            self.grid,
-            self.mask(),
-            self.deformed_mask(strain),
-            self.truth(strain),
-            strain,
-        )
+        f, g = self.reference(camera=camera), self.deformed(strain, camera=camera)
+        masks = self.mask(), self.deformed_mask(strain)
+        return ImagePair(f, g, self.grid, *masks, self.truth(strain), strain)
 
     def __iter__(self) -> Iterator[ImagePair]:
         """The pairs of the set without noise, each read when it is its turn."""
@@ -267,7 +256,6 @@ def make_images(
     folder : where to write; made if it doesn't exist. A whole set of the same solution, spec,
         strains and code is left as it is; any other set there is replaced.
     strains : nominal strains of the snapshots to image [-]; by default those of all.
-    progress : listener.
     """
     folder = Path(folder)
     if strains is None:
@@ -278,7 +266,9 @@ def make_images(
     key = image_key(solution, spec, strains)
     if is_complete(folder, key):
         return ImageSet.read(folder)
-    _discard(folder)
+    (folder / SIDECAR).unlink(missing_ok=True)  # first: the mark that a set is complete
+    for path in (path for pattern in _OWN_FILES for path in folder.glob(pattern)):
+        path.unlink(missing_ok=True)
     info, names = _write_set(solution, strains, spec, folder, progress)
     files = {n: {"bytes": (folder / n).stat().st_size, "sha256": sha256_of(folder / n)}
              for n in names}  # fmt: skip
@@ -288,16 +278,11 @@ def make_images(
 
 
 def _write_set(
-    solution: Solution,
-    strains: Sequence[float],
-    spec: ImagingSpec,
-    folder: Path,
-    progress: Progress,
+    solution: Solution, strains: Sequence[float], spec: ImagingSpec, folder: Path, report: Progress
 ) -> tuple[dict[str, Any], list[str]]:
     """Write all files but the sidecar; its content, and the files' names."""
-    steps = 1 + len(strains)
-    progress(0, steps, "images: reference")
-    mesh = solution.mesh
+    steps, mesh = 1 + len(strains), solution.mesh
+    report(0, steps, "images: reference")
     grid = choose_grid(solution, strains, spec)
     located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "undeformed mesh")
     speckle = Speckle(spec.speckle, grid.shape)
@@ -307,11 +292,12 @@ def _write_set(
     reference = camera.expose(ideal, scene, "reference", "mask.tif")
     snapshots = []
     for k, strain in enumerate(strains):
-        progress(1 + k, steps, f"images: strain {100 * strain:.2f} %")
+        report(1 + k, steps, f"images: strain {100 * strain:.2f} %")
         where = f"snapshot at strain {strain:.4f}"
         moved = replace(scene, displacement=solution.at(strain).displacement, where=where)
         snapshots.append(_write_snapshot(camera, moved, solution.at(strain), strain, located))
-    residuals = [record.inverse_map_max_residual_px for record in snapshots]
+    residuals, records = [s.inverse_map_max_residual_px for s in snapshots], [reference, *snapshots]
+    plain = [{n: v for n, v in asdict(record).items() if v is not None} for record in records]
     constant, slope = spec.sensor.noise_model(spec.bits)
     info = {
         "grid": asdict(grid),
@@ -319,18 +305,18 @@ def _write_set(
         "speckle_period_px": list(speckle.period),
         "inverse_map_max_residual_px": max(located.max_residual_px, *residuals),
         "noise": {"constant": constant, "slope": slope, "offset": spec.sensor.offset},
-        "reference": _plain(reference),
-        "snapshots": [_plain(record) for record in snapshots],
+        "reference": plain[0],
+        "snapshots": plain[1:],
         "warnings": [
             f"{record.image}: {record.doubly_covered_px} px lie inside more than one element; the "
             "specimen overlaps there, as a real one in contact doesn't"
-            for record in (reference, *snapshots)
+            for record in records
             if record.doubly_covered_px
         ],
         "solution": dict(solution.info),
         "versions": versions(*_LIBRARIES),
     }
-    return info, [name for record in (reference, *snapshots) for name in _file_names(record)]
+    return info, [name for record in records for name in _file_names(record)]
 
 
 def _write_snapshot(
@@ -350,21 +336,9 @@ def _write_snapshot(
     )
 
 
-def _plain(record: ImageRecord) -> dict[str, Any]:
-    return {name: value for name, value in asdict(record).items() if value is not None}
-
-
 def _file_names(record: ImageRecord) -> list[str]:
     more = [record.truth] if isinstance(record, SnapshotRecord) else []
     return [record.image, record.camera_image, record.mask, *more]
-
-
-def _discard(folder: Path) -> None:
-    """Take away an older or an unfinished set, the mark of completeness first."""
-    (folder / SIDECAR).unlink(missing_ok=True)
-    for pattern in _OWN_FILES:
-        for path in folder.glob(pattern):
-            path.unlink(missing_ok=True)
 
 
 def _label(strain: float) -> str:

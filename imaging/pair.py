@@ -56,10 +56,8 @@ class HasDisplacement(Protocol):
 class Truth:
     """What a measurement of one deformed image should find; each part is made when asked for.
 
-    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where there
-    is no material.
-
-    part : gives a part by its name, the name of its property.
+    ``part`` gives it by the name of its property. The last axis of length 2 holds the components
+    (x, y) along the physical axes; NaN where there is no material.
     """
 
     part: Callable[[str], NDArray[Any]]
@@ -102,10 +100,7 @@ class Truth:
     def write(self, path: Path | str, nominal_strain: float, grid: PixelGrid) -> None:
         """Write a truth file, whole or not at all."""
         with atomic_hdf5(path) as file:
-            file.attrs["format"] = TRUTH_FORMAT
-            file.attrs["nominal_strain"] = nominal_strain
-            for name, value in asdict(grid).items():
-                file.attrs[name] = value
+            file.attrs.update(format=TRUTH_FORMAT, nominal_strain=nominal_strain, **asdict(grid))
             for name, (unit, meaning) in _PARTS.items():
                 data = self.part(name)
                 data = np.moveaxis(data, -1, 0) if data.ndim == 3 else data
@@ -113,8 +108,7 @@ class Truth:
                 dataset = file.create_dataset(
                     name, data=data, chunks=chunk, compression="lzf", shuffle=True
                 )
-                dataset.attrs["unit"] = unit
-                dataset.attrs["meaning"] = meaning
+                dataset.attrs.update(unit=unit, meaning=meaning)
 
 
 def _read_part(path: Path | str, name: str) -> NDArray[Any]:
@@ -162,28 +156,21 @@ class ImagePair:
     @property
     def grey(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The grey levels of the material, of f and of g."""
-        return grey_levels_in(self.reference, self.mask), grey_levels_in(
-            self.deformed, self.deformed_mask
-        )
+        f, g = self.reference, self.deformed
+        return grey_levels_in(f, self.mask), grey_levels_in(g, self.deformed_mask)
 
     @property
     def masks(self) -> tuple[BoolArray, BoolArray]:
         """(rows, cols) True on material, of f and of g; everywhere where there is no mask."""
-        f_mask, g_mask = (
-            np.ones(self.grid.shape, dtype=np.bool_) if mask is None else mask
-            for mask in (self.mask, self.deformed_mask)
-        )
-        return f_mask, g_mask
+        everywhere, f, g = np.ones(self.grid.shape, np.bool_), self.mask, self.deformed_mask
+        return everywhere if f is None else f, everywhere if g is None else g
 
     def with_images(self, reference: NDArray[Any], deformed: NDArray[Any]) -> ImagePair:
         """The same pair with other grey levels: noisy, blurred."""
         return replace(self, reference=reference, deformed=deformed)
 
     def rms(self, measured: HasDisplacement) -> float:
-        """Root mean square of truth - measured *per component* over the material [mm].
-
-        InputError if there is no truth.
-        """
+        """Rms of truth - measured *per component* on material [mm]; InputError without a truth."""
         if self.truth is None:
             raise InputError("expected a pair whose true displacement is known, got one without")
         error = self.truth.displacement - measured.displacement(self.grid)
@@ -196,7 +183,7 @@ def grey_levels_in(image: NDArray[Any], mask: BoolArray | None) -> NDArray[Any]:
 
 
 def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> FloatImage:
-    """The image as read-only float32; raises InputError unless finite and of the grid's shape."""
+    """The image as read-only float32; InputError unless finite and of the grid's shape."""
     pixels = np.asarray(image)
     if pixels.shape != grid.shape:
         raise InputError(
@@ -214,7 +201,7 @@ def checked_image(image: ArrayLike, what: str, grid: PixelGrid) -> FloatImage:
 
 
 def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArray | None:
-    """The mask, read-only; raises InputError unless it has the grid's shape and some material."""
+    """The mask, read-only; InputError unless it has the grid's shape and some material."""
     if mask is None:
         return None
     inside = np.ascontiguousarray(mask, dtype=np.bool_)

@@ -60,9 +60,7 @@ _TAIL = 5.0  # standard deviations of the blur; 6e-7 of it lie beyond
 
 @dataclass(frozen=True)
 class Aperture:
-    """The weight h with which a pixel averages what falls on the sensor.
-
-    InputError if a value is out of its range.
+    """The weight h with which a pixel averages light; InputError if a value is out of its range.
 
     fill_factor : sensitive part of the pixel's area [-], a centred square: 1 is the whole pixel, 0
         a point.
@@ -144,13 +142,11 @@ class Sensor:
     fill_factor, psf_px : as of an :class:`Aperture`.
     gain : factor from irradiance to grey level [-].
     offset : grey level of the dark [fraction of full scale].
-    full_well : electrons that an irradiance of 1 frees [-]: the fewer, the more shot noise; 0:
-        none.
+    full_well : electrons that an irradiance of 1 frees [-]; the fewer, the more noise; 0: none.
     read_noise : standard deviation of the read noise [fraction of full scale].
     saturation : grey level that is never exceeded [fraction of full scale].
     flicker : relative standard deviation of the light from image to image [-], even over an image.
-    shot_seed, read_seed, flicker_seed : seeds of the noises; every image of a set has streams of
-        its own.
+    shot_seed, read_seed, flicker_seed : of noises; every image of a set has streams of its own.
     """
 
     fill_factor: float = 0.0
@@ -187,8 +183,6 @@ class Sensor:
 
     def illumination(self, name: str) -> float:
         """Factor on an image's irradiance, 1 on average, by its name in its set."""
-        if self.flicker == 0.0:
-            return 1.0
         draw = _stream(self.flicker_seed, "flicker", name).standard_normal()
         return float(np.exp(self.flicker * draw))
 
@@ -201,8 +195,7 @@ class Sensor:
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """One exposure of averages over the pixels (rows, cols): noise, cut-off and rounding.
 
-        The image's ``name`` in its set decides the noise with the seeds, so that no two images
-        share theirs.
+        The noise follows from the seeds and the image's ``name``: no two images of a set share it.
         """
         grey: NDArray[np.floating] = self.mean(irradiance)
         if self.full_well > 0.0:

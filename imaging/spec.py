@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,16 +56,16 @@ class ImagingSpec:
         require_within("imaging: expected a margin [px]", self.margin_px, 0)
         require_within("imaging: expected a background", self.background, 0.0, 1.0)
         require_within("imaging: expected bits", self.bits, 1, 16)
-        if self.shape is not None and min(self.shape) < _FEWEST_PX:
-            raise InputError(f"imaging: expected a shape of 8 x 8 px or more, got {self.shape}")
-        two_layers, distorted = self.speckle.ink is not None, self.distortion is not None
-        if (two_layers or distorted) and not self.sensor.aperture.is_point:
+        if self.shape is not None:
+            if min(self.shape) < _FEWEST_PX:
+                raise InputError(f"imaging: expected a shape of 8 x 8 px or more, got {self.shape}")
+            object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+        is_plain = self.speckle.ink is None and self.distortion is None
+        if not is_plain and not self.sensor.aperture.is_point:
             raise InputError(
                 "imaging: expected pixels that show points (fill_factor = 0, psf_px = 0) with a "
                 "distortion or a second layer of speckle, got pixels that average"
             )
-        if self.shape is not None:
-            object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
 
     def lens(self, shape: tuple[int, int]) -> AnyDistortion | None:
         """The distortion of images of (rows, cols) px; InputError if its file can't be read."""
@@ -78,7 +78,7 @@ class ImagingSpec:
 
 
 def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> PixelGrid:
-    """Choose the grid, centred on the undeformed specimen, that holds it in all its states.
+    """The grid, centred on the undeformed specimen, that holds it in all its states.
 
     InputError if the specimen doesn't fit an image size that the spec prescribes.
     """
@@ -96,23 +96,15 @@ def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec)
         wide = np.ceil(reach / spec.pixel_size - 1e-9) + spec.margin_px
         size = 2.0 * wide + 1.0 if spec.shape is None else np.array(spec.shape, np.float64)
         count = float(np.prod(size))
-    require_memory(
-        _BYTES_PER_PIXEL * count, f"images of {1e-6 * count:.3g} Mpx", "enlarge pixel_size"
-    )
-    half = wide.astype(int)
-    cols, rows = (int(n) for n in 2 * half + 1)
+    what = f"images of {1e-6 * count:.3g} Mpx"
+    require_memory(_BYTES_PER_PIXEL * count, what, "enlarge pixel_size")
+    cols, rows = (2 * int(n) + 1 for n in wide)
     if spec.shape is not None:
-        if spec.shape[0] < rows - 2 * spec.margin_px or spec.shape[1] < cols - 2 * spec.margin_px:
+        least, (rows, cols) = (rows - 2 * spec.margin_px, cols - 2 * spec.margin_px), spec.shape
+        if rows < least[0] or cols < least[1]:
             raise InputError(
-                f"imaging: expected an image of at least {rows - 2 * spec.margin_px} x "
-                f"{cols - 2 * spec.margin_px} px to hold the specimen in all its states, got "
-                f"{spec.shape[0]} x {spec.shape[1]}; enlarge shape or pixel_size"
+                f"imaging: expected an image of at least {least[0]} x {least[1]} px to hold the "
+                f"specimen in all its states, got {rows} x {cols}; enlarge shape or pixel_size"
             )
-        rows, cols = spec.shape
-    return PixelGrid(
-        rows,
-        cols,
-        spec.pixel_size,
-        float(centre[0]) - 0.5 * (cols - 1) * spec.pixel_size,
-        float(centre[1]) + 0.5 * (rows - 1) * spec.pixel_size,
-    )
+    middle = PixelGrid.centred(rows, cols, spec.pixel_size)
+    return replace(middle, x0=float(centre[0]) + middle.x0, y0=float(centre[1]) + middle.y0)

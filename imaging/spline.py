@@ -1,15 +1,14 @@
 """Value and gradient of an image between its pixels, by B-splines of order 3, 5 or 11.
 
-The image is prefiltered once, so that the spline passes through every pixel: each line goes
-through a recursive filter, forwards and backwards, once for every pole; the mirrored border makes
-it exact, and the result does not depend on the number of threads. Afterwards a sample costs 16, 36
-or 144 coefficients. On a speckle blurred by 3 px the cubic is off by 6e-5 of full scale and the
-quintic by 8e-7. Speckles finer than 6 px want order 11: docs/metrology.md.
+The image is prefiltered once, so that the spline passes through every pixel: each line goes through
+a recursive filter, forwards and backwards, once for every pole; the mirrored border makes it exact.
+Afterwards a sample costs 16, 36 or 144 coefficients. Speckles finer than 6 px want order 11:
+docs/metrology.md.
 
 Compilers turn loops over many points into vectors, but here neighbouring points read from places
-that differ; what can go side by side are the taps of a row: the six of a quintic spline, written
-out as vectors of eight whose last two weights are zero, which takes half the time; the twelve of
-one of order 11, as vectors of sixteen. LLVM splits them where the machine's vectors are shorter.
+that differ; what can go side by side are the taps of a row: the six of a quintic spline as a vector
+of eight whose last two weights are zero, the twelve of one of order 11 as a vector of sixteen. LLVM
+splits them where the machine's vectors are shorter.
 
 Source: Unser, Aldroubi, Eden 1993, doi 10.1109/78.193220 (poles, initial values).
 """
@@ -33,10 +32,15 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.compiled import compiled, readable
 from modeharvest.util.errors import InputError
 
+ORDERS = (3, 5, 11)
+"""Of splines."""
+
 
 @cache
 def poles(order: int) -> FloatArray:
     """Roots inside the unit circle of the z-transform of a B-spline's samples, largest first."""
+    if order not in ORDERS:
+        raise InputError(f"expected a spline of order 3, 5 or 11, got {order}")
     knots = np.arange(order + 2.0)
     samples = BSpline.basis_element(knots)(knots[1:-1])
     polynomial = np.polynomial.Polynomial(samples)
@@ -55,9 +59,8 @@ _NEGLIGIBLE = 1e-18
 def border_reach(order: int, share: float) -> int:
     """How far from an image's border its continuation matters by more than a share [px].
 
-    A spline passes through every pixel whatever continues the image; between the pixels the
-    continuation matters less with every pixel by the largest pole, 0.27, 0.43 or 0.66. ``share``
-    is of what it is at the border itself [-].
+    It matters less with every pixel by the largest pole, 0.27, 0.43 or 0.66; ``share`` is of what
+    it matters at the border itself [-].
     """
     return int(np.ceil(np.log(share) / np.log(abs(poles(order)).max())))
 
@@ -65,16 +68,9 @@ def border_reach(order: int, share: float) -> int:
 def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[Any]:
     """Coefficients of the spline of order 3, 5 or 11 that passes through every pixel.
 
-    Parameters
-    ----------
-    image : (rows, cols) grey levels, float32 or float64, at least 2 x 2; mirrored about its
-        outermost pixels.
-    order, pad : 3, 5 or 11; rows and columns of mirrored coefficients to put around it [px].
-
-    Returns
-    -------
-    (rows + 2 pad, cols + 2 pad)
-        Of the image's type; the recursion itself runs in float64.
+    (rows + 2 pad, cols + 2 pad), of the image's type; the recursion itself runs in float64. The
+    image (rows, cols), of float32 or float64, at least 2 x 2, is mirrored about its outermost
+    pixels, and so are the coefficients: ``pad`` [px] rows and columns of them are put around it.
     """
     rows, cols = image.shape
     padded = np.empty((rows + 2 * pad, cols + 2 * pad), dtype=image.dtype)
@@ -284,48 +280,36 @@ eleventh_at = cast(Any, _sampler(11))
 that count from the sixth."""
 
 
-ORDERS = (3, 5, 11)
-"""Of splines."""
 PAD = 6
 """Rows and columns of mirrored coefficients around the image, so that no tap needs a test."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplineImage:
-    """An image that can be evaluated anywhere.
+    """An image that can be evaluated anywhere, by a spline of order 3, 5 or 11.
 
-    coefficients : (rows + 2 PAD, cols + 2 PAD) B-spline coefficients, float32 or float64.
-    order : 3, 5 or 11.
+    ``coefficients`` are (rows + 2 PAD, cols + 2 PAD), float32 or float64.
     """
 
     coefficients: NDArray[Any]
     order: int
 
     def __post_init__(self) -> None:
-        if self.order not in ORDERS:
-            raise InputError(f"expected a spline of order 3, 5 or 11, got {self.order}")
+        poles(self.order)  # or an InputError
         if self.coefficients.ndim != 2 or min(self.coefficients.shape) < 2 * PAD + 2:
-            raise InputError(
-                f"expected padded coefficients of at least {2 * PAD + 2} x {2 * PAD + 2}, "
-                f"got shape {self.coefficients.shape}"
-            )
+            shape, least = self.coefficients.shape, 2 * PAD + 2
+            raise InputError(f"expected padded coefficients of {least} x {least}, got {shape}")
 
     @classmethod
     def of(cls, image: ArrayLike, order: int = 5, dtype: Any = np.float32) -> SplineImage:
-        """Prefilter an image (mirrored at its border) and keep the coefficients.
+        """Prefilter an image (rows, cols), mirrored at its border, and keep the coefficients.
 
-        InputError if the image isn't of 2 x 2 px or more, or the order is not among the three.
-
-        Parameters
-        ----------
-        image, order : (rows, cols) grey levels; 3, 5 or 11.
-        dtype : how the coefficients are stored: float32 costs 1e-7 of full scale.
+        ``dtype`` is how these are stored: float32 costs 1e-7 of full scale. InputError if the image
+        isn't of 2 x 2 px or more, or the order is not 3, 5 or 11.
         """
         pixels = np.asarray(image, dtype=np.dtype(dtype))
         if pixels.ndim != 2 or min(pixels.shape) < 2:
             raise InputError(f"expected an image of at least 2 x 2 px, got shape {pixels.shape}")
-        if order not in ORDERS:
-            raise InputError(f"expected a spline of order 3, 5 or 11, got {order}")
         return cls(spline_coefficients(pixels, order, PAD), order)
 
     @property
@@ -336,8 +320,7 @@ class SplineImage:
     def sample(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(value, d_row, d_col) [grey levels, and per px] at positions (row, col) [px].
 
-        The positions may be of any common shape; those outside the image give NaN. d_row is along
-        *increasing row*, i.e. down.
+        They may be of any common shape; NaN outside the image. d_row is along *increasing row*.
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         value, d_row, d_col = (np.empty(row.size) for _ in range(3))

@@ -87,8 +87,7 @@ class Dispersion:
     """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors.
 
     labels, stops : names of the path's corners, and their places among its points.
-    waves, distances : (p, 2) phases (k . a1, k . a2) [rad] and (p,) length of the path so far
-        [rad/mm].
+    waves, distances : (p, 2) phases (k . a1, k . a2) [rad]; (p,) length of the path [rad/mm].
     loads : (s,) [-].
     eigenvalues : (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
     zone : maps of the zone, one for each requested load.
@@ -133,8 +132,7 @@ class Dispersion:
         """Read what ``write`` wrote; an InputError refuses any other file."""
         with open_hdf5(path, "a dispersion file (HDF5)") as file:
             arrays = {name: file[name][()] for name in _ARRAYS}
-            labels = tuple(str(label) for label in file.attrs["labels"])
-            stops = tuple(int(k) for k in file["stops"])
+            labels, stops = tuple(map(str, file.attrs["labels"])), tuple(map(int, file["stops"]))
             zone = tuple(
                 ZoneMap(float(group.attrs["load"]), *(group[name][()] for name in _MAP_ARRAYS))
                 for group in file.get("zone", {}).values()
@@ -150,18 +148,14 @@ def dispersion(
     bands: int = 3,
     progress: Progress = silent,
 ) -> Dispersion:
-    """The lowest eigenvalues along a zone path, at several loads of a primitive cell's path.
+    """The lowest eigenvalues along a zone path, at several loads [-] of a primitive cell's path.
+
+    An InputError refuses other wave vectors than two finite phases, and loads out of reach.
 
     Parameters
     ----------
-    corners
-        Names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
-    loads
-        [-].
-    count, bands
-        Number of wave vectors, corners included, and of eigenvalues at each.
-
-    An InputError refuses other wave vectors than two finite phases, and loads out of reach.
+    corners : names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
+    count, bands : number of wave vectors, corners included, and of eigenvalues at each.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
     from modeharvest.fem.bloch.zone import zone_path
@@ -224,11 +218,10 @@ def _along(waves: BlochWaves, points: Sequence[Wave], bands: int) -> FloatArray:
     """(p, bands) eigenvalues, the translations' two zeros among those of Γ."""
     from modeharvest.fem.bloch.eigen import scan
 
-    centre = [max(abs(p), abs(q)) < 1e-12 for p, q in points]
-    elsewhere = [wave for wave, is_centre in zip(points, centre, strict=True) if not is_centre]
+    centre = np.abs(points).max(axis=1) < 1e-12
     values = np.empty((len(points), bands))
-    values[~np.array(centre)] = scan(waves, elsewhere, bands)
-    if any(centre):
+    values[~centre] = scan(waves, [points[k] for k in np.flatnonzero(~centre)], bands)
+    if centre.any():
         others = waves.lowest(CENTRE, bands).eigenvalues
         values[centre] = np.sort([0.0, 0.0, *others])[:bands]
     return values

@@ -50,10 +50,7 @@ class BlochModes:
 
 
 class BlochWaves:
-    """All Bloch waves on one state of a primitive cell; the stiffness is sorted once.
-
-    ``factorisations`` counts those of reduced matrices.
-    """
+    """All Bloch waves on one state of a primitive cell; counts factorisations of its matrices."""
 
     def __init__(self, cell: PeriodicCell, state: CellState) -> None:
         self.cell, self.state = cell, state
@@ -92,7 +89,10 @@ class BlochWaves:
             return T.restrict(applied(self.cell.nodal_mass.__matmul__, T.expand(block)))
 
         start = self._start(T.dtype, count, near)[:, None]
-        fixed = self._translations() if _are_centre(waves).all() else start[:, :, :0]
+        fixed = start[:, :, :0]
+        if _are_centre(waves).all():  # orthonormal translations along x and y
+            moves = np.stack([self.cell.reduction.order % 2 == axis for axis in (0, 1)], axis=1)
+            fixed = moves[:, None] / math.sqrt(self.cell.filling * self.cell.cell.area)
         start, fixed = (np.repeat(vectors, len(waves), axis=1) for vectors in (start, fixed))
         inverse, vectors = largest(solver.solve, weigh, start, fixed, tolerance)
         return 1.0 / inverse - below, vectors
@@ -135,15 +135,13 @@ class BlochWaves:
 
     def long_wave(self) -> tuple[float, float]:
         """The smallest acoustic eigenvalue over all directions [MPa], and its angle [rad]."""
-        angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+        angles, width = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS, np.pi / _DIRECTIONS
         best = float(min(angles, key=self.acoustic))
-        width = np.pi / _DIRECTIONS
         found = minimize_scalar(
             lambda turn: self.acoustic(best + turn), bounds=(-width, width), method="bounded"
         )
-        if found.fun < self.acoustic(best):
-            return float(found.fun), best + float(found.x)
-        return self.acoustic(best), best
+        turned = (float(found.fun), best + float(found.x))
+        return min((self.acoustic(best), best), turned, key=lambda pair: pair[0])
 
     def _solver_below(self, waves: FloatArray) -> tuple[CondensedWaves, float]:
         """The inverses of K + s M, and s; from now on a larger s where that isn't enough."""
@@ -172,12 +170,6 @@ class BlochWaves:
             return np.asarray(noise)
         sizes = np.linalg.norm(near.vectors, axis=0) / np.linalg.norm(noise, axis=0)
         return np.asarray(near.vectors + _NOISE * sizes * noise)
-
-    def _translations(self) -> FloatArray:
-        """(size, 1, 2) orthonormal translations along x and y."""
-        axis = self.cell.reduction.order % 2
-        moves = np.stack([axis == 0, axis == 1], axis=1)[:, None]
-        return np.asarray(moves / math.sqrt(self.cell.filling * self.cell.cell.area))
 
 
 def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArray:
@@ -231,7 +223,7 @@ def largest(
     images, spaces = [weigh(fixed)], [fixed]
     block = start - _mixed(fixed, _products(images[0], start))
     block, image, _ = _orthonormal(block, weigh)
-    projected: Batch = np.zeros((width, 0, 0))
+    projected: Batch = np.zeros((width, 0, 0), dtype=block.dtype)
     for _ in range(_LARGEST_SPACE):
         spaces.append(block)
         images.append(image)
@@ -239,7 +231,9 @@ def largest(
         columns = [_products(weighted, block) for weighted in images]
         for vectors, column in zip(spaces, columns, strict=True):
             block = block - _mixed(vectors, column)
-        projected = _bordered(projected, np.concatenate(columns[1:], axis=1))
+        column, old = np.concatenate(columns[1:], axis=1), projected.shape[1]
+        upper, corner = column[:, :old], column[:, old:]
+        projected = np.block([[projected, upper], [upper.conj().transpose(0, 2, 1), corner]])
         block, image, rest = _orthonormal(block, weigh)
         values, mix = np.linalg.eigh(projected)
         values, mix = values[:, ::-1][:, :count], mix[:, :, ::-1][:, :, :count]
@@ -267,13 +261,3 @@ def _orthonormal(block: Batch, weigh: Operator) -> tuple[Batch, Batch, Batch]:
     R = np.linalg.cholesky(_products(block, image)).conj().transpose(0, 2, 1)
     inverse = np.linalg.inv(R)
     return _mixed(block, inverse), _mixed(image, inverse), R
-
-
-def _bordered(projected: Batch, column: Batch) -> Batch:
-    """The projected matrices with one block column more, Hermitian."""
-    old, new = projected.shape[1], column.shape[1]
-    result = np.zeros((len(column), new, new), dtype=column.dtype)
-    result[:, :old, :old] = projected
-    result[:, :, old:] = column
-    result[:, old:, :old] = column[:, :old].conj().transpose(0, 2, 1)
-    return result

@@ -28,10 +28,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import meshio
 import numpy as np
 
-from modeharvest.fem.field import COMPRESSED, Mesh, read_mesh, write_mesh
+from modeharvest.fem.field import COMPRESSED, Mesh, in_space, read_mesh, write_mesh
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -74,9 +73,8 @@ class ModeSet:
         for name, shape in expected.items():
             values = getattr(self, name)
             if values.shape != shape or not np.isfinite(values).all():
-                raise InputError(
-                    f"modes: expected finite {name} of shape {shape}, got {values.shape}"
-                )
+                what = f"finite {name} of shape {shape}"
+                raise InputError(f"modes: expected {what}, got {values.shape}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +149,13 @@ def write_modes(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = (
 def read_modes(path: Path | str) -> tuple[ModeSet, tuple[Branch, ...]]:
     """Read what :func:`write_modes` wrote; an InputError refuses any other file."""
     with open_hdf5(path, "modes (HDF5)", "make it again with 'modeharvest modes'", FORMAT) as file:
-        modes = _read_set(file)
+        modes = ModeSet(
+            mesh=read_mesh(file),
+            waves=tuple((float(p), float(q)) for p, q in file["waves"][:]),
+            load=float(file.attrs["load"]),
+            info=json.loads(file.attrs["info"]),
+            **{name: file[name][:] for name in ("shapes", *_OF_SET)},
+        )
         groups = file.get("branches", {})
         branches = tuple(_read_branch(groups[name], modes) for name in sorted(groups))
         return modes, branches
@@ -165,16 +169,6 @@ def write_vtu(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ())
 def write_xdmf(path: Path | str, modes: ModeSet, branches: Sequence[Branch] = ()) -> None:
     """Write modes and branches as XDMF with all numbers in the one file, atomically."""
     _write_meshio(path, modes, branches, "xdmf", data_format="XML")
-
-
-def _read_set(file: h5py.File) -> ModeSet:
-    return ModeSet(
-        mesh=read_mesh(file),
-        waves=tuple((float(p), float(q)) for p, q in file["waves"][:]),
-        load=float(file.attrs["load"]),
-        info=json.loads(file.attrs["info"]),
-        **{name: file[name][:] for name in ("shapes", *_OF_SET)},
-    )
 
 
 def _write_branch(group: h5py.Group, branch: Branch) -> None:
@@ -192,10 +186,9 @@ def _write_branch(group: h5py.Group, branch: Branch) -> None:
 def _read_branch(group: h5py.Group, modes: ModeSet) -> Branch:
     groups = group.get("states", {})
     states = tuple(_read_state(groups[name]) for name in sorted(groups))
-    for state in states:
-        if state.displacement.shape != modes.mesh.nodes.shape:
-            shape, count = state.displacement.shape, len(modes.mesh.nodes)
-            raise InputError(f"displacements of shape {shape} on {count} nodes")
+    for shape in (state.displacement.shape for state in states):
+        if shape != modes.mesh.nodes.shape:
+            raise InputError(f"displacements of shape {shape} on {len(modes.mesh.nodes)} nodes")
     combination = tuple(float(c) for c in group["combination"][:])
     return Branch(combination, states, str(group.attrs["outcome"]), group["curve"][:])
 
@@ -209,9 +202,7 @@ def _read_state(group: h5py.Group) -> BranchState:
 def _write_meshio(
     path: Path | str, modes: ModeSet, branches: Sequence[Branch], kind: str, **options: str
 ) -> None:
-    points = _in_space(modes.mesh.nodes)
-    fields = {name: _in_space(values) for name, values in _fields(modes, branches).items()}
-    mesh = meshio.Mesh(points, [("triangle6", modes.mesh.cells)], point_data=fields)
+    mesh = in_space(modes.mesh, _fields(modes, branches))
     with atomic(path) as temporary:
         mesh.write(temporary, file_format=kind, **options)
         _comment(temporary, _described(modes, branches))
@@ -233,6 +224,7 @@ def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, FloatArray]
 
 def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
     """All that isn't a nodal field, as plain JSON values."""
+    starts = [{"combination": list(b.combination), "outcome": b.outcome} for b in branches]
     return {
         "format": FORMAT,
         "normalisation": NORMALISATION,
@@ -242,10 +234,7 @@ def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
         "primitive_mm": modes.primitive.tolist(),
         "waves_rad": [list(wave) for wave in modes.waves],
         "eigenvalues_N_per_mm4": modes.eigenvalues.tolist(),
-        "branches": [
-            {"combination": list(branch.combination), "outcome": branch.outcome}
-            for branch in branches
-        ],
+        "branches": starts,
         "info": dict(modes.info),
     }
 
@@ -257,8 +246,3 @@ def _comment(path: Path, content: dict[str, Any]) -> None:
     words = json.dumps(content).replace("--", "-\\u002d")
     start = text.index("?>") + 2 if text.startswith("<?xml") else 0
     path.write_text(f"{text[:start]}\n<!-- {words} -->{text[start:]}".lstrip(), "utf-8")
-
-
-def _in_space(values: FloatArray) -> FloatArray:
-    """(n, 3) of (n, 2): VTK knows no plane."""
-    return np.hstack([values, np.zeros((len(values), 1))])

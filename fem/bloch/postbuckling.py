@@ -40,24 +40,18 @@ def follow(
 ) -> Branch:
     """Follow the branch that starts along a combination of critical modes.
 
-    Only the amplitude of the combination is prescribed; all else, other modes included, is free
-    to follow, and ``BranchState.amplitudes`` have the result.
+    Only the amplitude of the combination is prescribed; all else, other modes included, is free to
+    follow, and ``BranchState.amplitudes`` have the result. An InputError refuses another cell than
+    that of the modes, and a combination that doesn't fit them. A branch that can't be followed is
+    an outcome, not an exception.
 
     Parameters
     ----------
-    path, modes
-        Primary path of the commensurate cell, that of ``modes.mesh``, such as
+    path, modes : primary path of the commensurate cell, that of ``modes.mesh``, such as
         ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``; its critical modes.
-    combination
-        (m,) coefficients; only their ratios and signs count. The opposite is the other half of
-        the branch.
-    loads
-        At which to report states [-]. One that the branch meets twice is reported twice.
-    options, progress
-        Step lengths; called with the load reached.
-
-    An InputError refuses another cell than that of the modes, and a combination that doesn't fit
-    them. A branch that can't be followed is an outcome, not an exception.
+    combination : (m,) coefficients; only their ratios and signs count. The opposite is the other
+        half of the branch.
+    loads : at which to report states [-]. One that the branch meets twice is reported twice.
     """
     _check(path.cell, modes, combination, loads)
     mix = np.asarray(combination, dtype=np.float64)
@@ -134,8 +128,10 @@ class _Tracing:
                     self.stopped = found
                     return
                 continue
-            if len(self.points) == 1:
-                self.points[0] = self._reoriented(start, found)
+            if len(self.points) == 1:  # the direction in which the branch leaves
+                mix = self.weights @ (found.value[4:] - self.origin)
+                rate = self._direction(mix) * (1.0 / found.amplitude)
+                self.points[0] = replace(start, rate=rate)
             self.points.append(found)
             yield
             step = min(options.growth * step, options.longest * self.pitch)
@@ -151,10 +147,8 @@ class _Tracing:
         scale = np.linalg.norm(below.moduli) / (self.cell.filling * self.cell.cell.area)
         largest = float(np.abs(self.modes.eigenvalues[self.mix != 0]).max())
         if largest > _CRITICAL * scale:
-            self.stopped = (
-                f"the modes are not critical at the load {load:.6g}, their largest eigenvalue is "
-                f"{largest:.3g} N/mm^4"
-            )
+            where, size = f"at the load {load:.6g}", f"{largest:.3g} N/mm^4"
+            self.stopped = f"the modes are not critical {where}, their largest eigenvalue is {size}"
             return None
         value = _stacked(below.gradient, below.fluctuation)
         value += (load - below.load) * _stacked(below.gradient_rate, below.fluctuation_rate)
@@ -167,11 +161,6 @@ class _Tracing:
         at_masters = np.empty((periodicity.count, 2))
         at_masters[periodicity.master] = np.tensordot(mix, self.modes.shapes, 1)
         return _stacked(np.zeros((2, 2)), (at_masters - at_masters[0]).ravel()[order])
-
-    def _reoriented(self, start: BranchPoint, first: BranchPoint) -> BranchPoint:
-        """The start with the direction in which the branch leaves, by its first point."""
-        amplitudes = self.weights @ (first.value[4:] - self.origin)
-        return replace(start, rate=self._direction(amplitudes) * (1.0 / first.amplitude))
 
     def _at_amplitude(self, points: Sequence[BranchPoint], amplitude: float) -> BranchPoint | str:
         """The point of the branch at an amplitude, from one or two before it; or why not."""
@@ -186,13 +175,9 @@ class _Tracing:
         if off @ (self.mass @ off) > (_NEAR * (amplitude - points[-1].amplitude)) ** 2:
             return "another branch is nearer"
         rate = float(weights @ found.fluctuation_rate)
-        return BranchPoint(
-            amplitude,
-            found.load,
-            1.0 / rate,
-            _stacked(found.gradient, found.fluctuation),
-            _stacked(found.gradient_rate, found.fluctuation_rate) / rate,
-        )
+        value = _stacked(found.gradient, found.fluctuation)
+        value_rate = _stacked(found.gradient_rate, found.fluctuation_rate) / rate
+        return BranchPoint(amplitude, found.load, 1.0 / rate, value, value_rate)
 
     def _corrected(
         self, load: float, guess: FloatArray, amplitude: Amplitude | None = None
@@ -225,15 +210,15 @@ class _Tracing:
     def _report(self, state: CellState) -> BranchState:
         """The state as plain numpy, beside the primary path at the same load."""
         cell, primary = self.cell, self.primary.at(state.load)
-        before = self.origin if primary is None else primary.fluctuation
-        u = cell.displacement(state)
-        on_path = None if primary is None else cell.body.energy(cell.displacement(primary))
+        u, before, on_path = cell.displacement(state), self.origin, math.nan
+        if primary is not None:
+            before, on_path = primary.fluctuation, cell.body.energy(cell.displacement(primary))
         return BranchState(
             load=state.load,
             gradient=state.gradient,
             stress=state.stress,
             energy=cell.body.energy(u) / cell.cell.area,
-            primary_energy=math.nan if on_path is None else on_path / cell.cell.area,
+            primary_energy=on_path / cell.cell.area,
             negative_eigenvalues=cell.negative_eigenvalues(self.loading, state),
             displacement=u,
             amplitudes=self.weights @ (state.fluctuation - before),
@@ -248,9 +233,8 @@ def _stacked(gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
 def _check(
     cell: PeriodicCell, modes: ModeSet, combination: Sequence[float], loads: Sequence[float]
 ) -> None:
-    if cell.cell.mesh.nodes.shape != modes.mesh.nodes.shape or not np.allclose(
-        cell.cell.mesh.nodes, modes.mesh.nodes, atol=1e-9 * np.abs(modes.lattice).max()
-    ):
+    nodes, near = cell.cell.mesh.nodes, 1e-9 * np.abs(modes.lattice).max()
+    if nodes.shape != modes.mesh.nodes.shape or not np.allclose(nodes, modes.mesh.nodes, atol=near):
         raise InputError(
             "branch: expected the path of the cell the modes live on, got another mesh; make it "
             f"with cell.enlarged{tuple(modes.info.get('copies', ('m', 'n')))}"

@@ -45,23 +45,20 @@ def real_modes(
 ) -> ModeSet:
     """The lowest modes at some waves as real fields on their smallest common m x n cell.
 
-    A wave with phases 0 or pi gives one mode (or all of a degenerate eigenvalue), any other
-    twice as many. Waves within a thousandth of a rad of a fraction are taken for it; a wave given
-    twice, or as k and -k, counts once.
+    A wave with phases 0 or pi gives one mode (or all of a degenerate eigenvalue), any other twice
+    as many. Waves within a thousandth of a rad of a fraction are taken for it; a wave given twice,
+    or as k and -k, counts once. An InputError refuses no wave at all (long ones are modes of no
+    finite cell), and one that doesn't repeat within ``largest`` cells.
 
     Parameters
     ----------
-    cell, state, waves
-        Primitive; its equilibrium and phases [rad], usually those of a ``LatticeCritical``.
-    info
-        Plain JSON values to be kept with the modes.
-    largest
-        The most copies along a1 or a2.
-
-    An InputError refuses no wave at all (long ones are modes of no finite cell), and one that
-    doesn't repeat within ``largest`` cells.
+    cell, state, waves : primitive; its equilibrium and phases [rad], such as of a critical point.
+    info, largest : plain JSON values to be kept with the modes; the most copies along a1 or a2.
     """
-    turns = _distinct([_commensurate(wave, largest) for wave in waves])
+    turns: list[Turns] = []
+    for turn in (_commensurate(wave, largest) for wave in waves):
+        if not any(is_same(_phases(turn), _phases(other)) for other in turns):
+            turns.append(turn)
     if not turns:
         raise InputError(
             "modes: expected at least one wave, got none; waves much longer than the cell (loss of "
@@ -112,20 +109,11 @@ def _phases(turns: Turns) -> Wave:
     return (p, q)
 
 
-def _distinct(turns: Sequence[Turns]) -> list[Turns]:
-    kept: list[Turns] = []
-    for turn in turns:
-        if not any(is_same(_phases(turn), _phases(other)) for other in kept):
-            kept.append(turn)
-    return kept
-
-
 def _lowest_set(bloch: BlochWaves, wave: Wave) -> BlochModes:
     """The lowest eigenvalue at one wave with all of its eigenvectors."""
     found = bloch.lowest(wave, _MULTIPLICITY, tolerance=_TOLERANCE)
-    cell = bloch.cell
+    cell, values = bloch.cell, found.eigenvalues
     scale = np.linalg.norm(bloch.state.moduli) / (cell.filling * cell.cell.area)
-    values = found.eigenvalues
     count = int(np.sum(values - values[0] < _DEGENERATE * scale))
     return BlochModes(wave, values[:count], found.vectors[:, :count])
 
@@ -158,10 +146,8 @@ def _real_fields(
 ) -> FloatArray:
     """(c, n, 2) orthonormal real fields on the enlarged cell that the Bloch vectors amount to."""
     material = cell.filling * cell.cell.area
-    copies = np.rint(
-        (enlarged.mesh.nodes[places[:, 0]] - cell.cell.mesh.nodes[0])
-        @ np.linalg.inv(cell.cell.lattice)
-    )
+    moves = enlarged.mesh.nodes[places[:, 0]] - cell.cell.mesh.nodes[0]
+    copies = np.rint(moves @ np.linalg.inv(cell.cell.lattice))
     phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
     at_nodes = np.stack(
         [cell.reduction.displacement(vector, modes.wave).ravel() for vector in modes.vectors.T], 1

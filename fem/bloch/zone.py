@@ -50,10 +50,9 @@ class Zone:
         inverse = np.linalg.inv(cell.cell.lattice)
         self._metric = inverse.T @ inverse  # |k|^2 = phases . metric . phases
         self._spacing = 2.0 * math.pi / divisions
-        steps = np.arange(divisions) - (divisions - 1) // 2
-        phases = [self._spacing * int(n) for n in steps]
+        phases = [self._spacing * (n - (divisions - 1) // 2) for n in range(divisions)]
         points = [(p, q) for p in phases for q in phases if (p, q) != CENTRE]
-        self.grid = [wave for wave in points if folded(wave) >= folded(_opposite(wave))]
+        self.grid = [(p, q) for p, q in points if folded((p, q)) >= folded((-p, -q))]
 
     def least_stable(self, state: CellState) -> LeastStable:
         """The wave with the smallest measure, over all of the zone."""
@@ -157,7 +156,3 @@ def is_same(a: Wave, b: Wave) -> bool:
     """Whether two waves are the same one, or each other's opposites."""
     differences = (folded((a[0] - s * b[0], a[1] - s * b[1])) for s in (1.0, -1.0))
     return any(max(abs(d[0]), abs(d[1])) < _SAME for d in differences)
-
-
-def _opposite(wave: Wave) -> Wave:
-    return (-wave[0], -wave[1])

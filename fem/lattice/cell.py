@@ -78,10 +78,8 @@ class LinearisedCell:
         fluctuation: FloatArray,
         amplitude: Amplitude | None = None,
     ) -> None:
-        self.cell, self.loading, self.load = cell, loading, load
-        self.amplitude = amplitude
-        self.gradient, self.fluctuation = gradient, fluctuation
-        self.area = cell.cell.area
+        self.cell, self.loading, self.load, self.amplitude = cell, loading, load, amplitude
+        self.gradient, self.fluctuation, self.area = gradient, fluctuation, cell.cell.area
         u = cell.displaced(gradient, fluctuation)
         forces = cell.body.forces(u)
         self.forces = cell.reduction.restricted(forces)[cell.free_dofs]
@@ -92,13 +90,11 @@ class LinearisedCell:
 
     def _eliminate(self, stiffness: csr_array) -> None:
         """Condense the fluctuation: how it, and the forces, follow F̄ and the load."""
-        cell, dofs = self.cell, np.flatnonzero(self.cell.free_dofs)
+        cell = self.cell
         self.stiffness, self.on_affine = stiffness, stiffness @ cell.affine
-        self.coupling = cell.reduction.restricted(self.on_affine)[dofs]
-        inner = cell.reduction.reduced(stiffness).at(CENTRE)[dofs][:, dofs]
-        cell.factorisations += 1
+        self.coupling = cell.reduction.restricted(self.on_affine)[cell.free_dofs]
         try:
-            self._factor: Any = factorise(csc_array(inner))
+            self._factor = cell.factor(stiffness)
         except RuntimeError:  # SuperLU: exactly singular
             self.is_regular = False
             return
@@ -119,21 +115,14 @@ class LinearisedCell:
 
     @property
     def is_solved(self) -> bool:
-        """Whether all forces, internal and macroscopic, are in equilibrium."""
-        inner = _LOAD_TOLERANCE * np.linalg.norm(self.on_affine @ self.rate)
-        outer = _LOAD_TOLERANCE * np.linalg.norm(self.condensed) * np.linalg.norm(self.rate)
-        return bool(
-            np.linalg.norm(self.forces) <= inner
-            and np.linalg.norm(self._unbalanced) <= outer
-            and self._has_amplitude
-        )
-
-    @property
-    def _has_amplitude(self) -> bool:
-        amplitude = self.amplitude
-        return amplitude is None or (
+        """Whether forces, internal and macroscopic, balance, and the amplitude is met."""
+        size, amplitude = np.linalg.norm, self.amplitude
+        inner = _LOAD_TOLERANCE * size(self.on_affine @ self.rate)
+        outer = _LOAD_TOLERANCE * size(self.condensed) * size(self.rate)
+        is_met = amplitude is None or (
             abs(self._excess(amplitude)) <= _AMPLITUDE_TOLERANCE * abs(amplitude.value)
         )
+        return bool(size(self.forces) <= inner and size(self._unbalanced) <= outer and is_met)
 
     def _excess(self, prescribed: Amplitude) -> float:
         """The amplitude in excess of what is prescribed [mm]."""
@@ -251,9 +240,8 @@ class PeriodicCell:
             if not system.is_regular:
                 return Failure.NOT_CONVERGED
             if system.is_solved:
-                u = self.displaced(F, w)
-                sound = self.body.smallest_jacobian(u) > 0
-                return system.state() if sound else Failure.REVERSED
+                is_sound = self.body.smallest_jacobian(self.displaced(F, w)) > 0
+                return system.state() if is_sound else Failure.REVERSED
             try:
                 change, dF, dw = system.step()
             except np.linalg.LinAlgError:  # exactly singular
@@ -267,13 +255,16 @@ class PeriodicCell:
         Those of w with F̄ fixed, and of the moduli of the free components (Haynsworth, Linear
         Algebra Appl. 1 (1968) 73-81). Zero: stable against all that has the cell's period.
         """
-        dofs = np.flatnonzero(self.free_dofs)
-        inner = self.reduction.reduced(state.stiffness).at(CENTRE)[dofs][:, dofs]
-        self.factorisations += 1
         free = loading.free
         moduli = state.moduli.reshape(4, 4)[np.ix_(free, free)]
         outer = np.linalg.eigvalsh(0.5 * (moduli + moduli.T))
-        return negative_pivots(factorise(csc_array(inner))) + int(np.sum(outer < 0))
+        return negative_pivots(self.factor(state.stiffness)) + int(np.sum(outer < 0))
+
+    def factor(self, stiffness: csr_array) -> Any:
+        """Factorise the stiffness (2 n, 2 n) of the free fluctuations; RuntimeError if singular."""
+        self.factorisations += 1
+        dofs = np.flatnonzero(self.free_dofs)
+        return factorise(csc_array(self.reduction.reduced(stiffness).at(CENTRE)[dofs][:, dofs]))
 
     def displaced(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes for F̄ (4,) and w (2 count,) [mm]."""

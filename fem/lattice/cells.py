@@ -27,6 +27,7 @@ import numpy as np
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.periodicity import Periodicity, find_periodicity
 from modeharvest.fem.meshing import (
+    SIGNS,
     MeshBlock,
     divisions_of,
     join,
@@ -36,8 +37,6 @@ from modeharvest.fem.meshing import (
 )
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-
-_MIRRORED = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +76,10 @@ class UnitCell:
         return UnitCell(join(blocks, 1e-7 * shortest), self.lattice * [[m], [n]])
 
 
+_HEXAGONAL = [[1.0, 0.0], [0.5, 0.5 * math.sqrt(3.0)]]
+"""Lattice vectors as rows, of length 1."""
+
+
 def square(pitch: float, diameter: float, size: float) -> UnitCell:
     """The primitive cell of circular holes in square stacking, a hole's centre at the origin.
 
@@ -84,7 +87,7 @@ def square(pitch: float, diameter: float, size: float) -> UnitCell:
     """
     _check(pitch, diameter, size)
     quarter = quarter_cell(pitch, diameter, size)
-    mesh = join([quarter.placed(s, (0.0, 0.0)) for s in _MIRRORED], 1e-7 * pitch)
+    mesh = join([quarter.placed(s, (0.0, 0.0)) for s in SIGNS], 1e-7 * pitch)
     return UnitCell(mesh, pitch * np.eye(2))
 
 
@@ -95,23 +98,15 @@ def hexagonal(pitch: float, diameter: float, size: float) -> UnitCell:
     4-hole cell, which has room for the modes of all three M points. Lengths as in :func:`square`.
     """
     _check(pitch, diameter, size)
-    wedge = _wedge(pitch, diameter, size)
-    blocks = []
-    for k in range(6):
-        for sign in (1.0, -1.0):
-            blocks.append(wedge.placed((1.0, sign), (0.0, 0.0)).turned(k * math.pi / 3))
-    a2 = [0.5, 0.5 * math.sqrt(3.0)]
-    return UnitCell(join(blocks, 1e-7 * pitch), pitch * np.array([[1.0, 0.0], a2]))
-
-
-def _wedge(pitch: float, diameter: float, size: float) -> MeshBlock:
-    """A twelfth of the hexagon, from the middle of a ligament up to a junction."""
     half, radius, angle = 0.5 * pitch, 0.5 * diameter, math.pi / 6
-    long = half / math.cos(angle)
-    arc_end = (radius * math.cos(angle), radius * math.sin(angle))
-    corners = [(radius, 0.0), (half, 0.0), (half, half * math.tan(angle)), arc_end]
-    lengths = [half - radius, half * math.tan(angle), long - radius, angle * radius]
-    return mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[3])
+    rise, long = half * math.tan(angle), half / math.cos(angle)
+    # A twelfth of the hexagon, from the middle of a ligament up to a junction.
+    corners = [(radius, 0.0), (half, 0.0), (half, rise), _polar(radius, angle)]
+    lengths = [half - radius, rise, long - radius, angle * radius]
+    wedge = mesh_block(corners, [divisions_of(length, size) for length in lengths], arcs=[3])
+    halves = [wedge.placed((1.0, sign), (0.0, 0.0)) for sign in (1.0, -1.0)]
+    mesh = join([block.turned(k * math.pi / 3) for k in range(6) for block in halves], 1e-7 * pitch)
+    return UnitCell(mesh, pitch * np.array(_HEXAGONAL))
 
 
 def _check(pitch: float, diameter: float, size: float) -> None:
@@ -143,23 +138,19 @@ def chiral(
     """The primitive cell of a ring-and-ligament lattice, a ring's centre at the origin.
 
     a1 points along x; a2 stands 90 degrees (tetrachiral) or 60 degrees (hexachiral) from it.
-    ``enlarged(2, 2)`` has room for modes that change sign from ring to ring.
+    ``enlarged(2, 2)`` has room for modes that change sign from ring to ring. An InputError refuses
+    rings that touch, and ligaments too thick to leave their ring apart from each other or to have a
+    free length.
 
     Parameters
     ----------
-    pitch, size
-        Distance of neighbouring rings' centres, and edge length of the elements, at most as long
-        as a wall is thick [mm]. Half of that thickness is a good choice.
-    ligaments
-        Of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
-    ring_radius, ring_thickness, ligament_thickness
-        Outer radius, 0.25 pitch unless given; thickness of the walls, 0.1 and 0.05 pitch [mm].
-    handedness
-        The sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
+    pitch, size : distance of neighbouring rings' centres, and edge length of the elements, at most
+        as long as a wall is thick [mm]. Half of that thickness is a good choice.
+    ligaments : of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
+    ring_radius, ring_thickness, ligament_thickness : outer radius, 0.25 pitch unless given;
+        thickness of the walls, 0.1 and 0.05 pitch [mm].
+    handedness : the sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
         leaves its ring. One lattice is the mirror image of the other.
-
-    An InputError refuses rings that touch, and ligaments too thick to leave their ring apart from
-    each other or to have a free length.
     """
     usual = (RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS)
     given = (ring_radius, ring_thickness, ligament_thickness)
@@ -170,17 +161,14 @@ def chiral(
     shape = _RingAndLigaments(pitch, radius, wall, ligament, ligaments)
     require_size(size, pitch**2)
     if handedness not in HANDEDNESS:
-        raise InputError(
-            f"chiral cell: expected handedness {' or '.join(map(repr, HANDEDNESS))}, got "
-            f"{handedness!r}"
-        )
+        known = " or ".join(map(repr, HANDEDNESS))
+        raise InputError(f"chiral cell: expected handedness {known}, got {handedness!r}")
     sector = shape.sector(min(size, shape.ring_thickness, shape.ligament_thickness))
     if handedness == "counterclockwise":
         sector = sector.placed((1.0, -1.0), (0.0, 0.0))
     angle = 2 * math.pi / ligaments
     mesh = join([sector.turned(k * angle) for k in range(ligaments)], 1e-7 * pitch)
-    a2 = [0.0, 1.0] if ligaments == 4 else [0.5, 0.5 * math.sqrt(3.0)]
-    return UnitCell(mesh, pitch * np.array([[1.0, 0.0], a2]))
+    return UnitCell(mesh, pitch * np.array(np.eye(2) if ligaments == 4 else _HEXAGONAL))
 
 
 @dataclass(frozen=True)
@@ -200,24 +188,25 @@ class _RingAndLigaments:
     def __post_init__(self) -> None:
         radius, wall, ligament = self.ring_radius, self.ring_thickness, self.ligament_thickness
         most = radius * (1.0 - math.cos(2 * math.pi / max(self.ligaments, 1)))
-        fault = ""
         if self.ligaments not in (4, 6):
             fault = f"4 (tetrachiral) or 6 (hexachiral) ligaments, got {self.ligaments}"
         elif not 0 < 2 * radius < self.pitch < math.inf:
-            fault = "0 < 2 ring_radius < pitch (rings must not touch), got "
-            fault += f"ring_radius = {radius} mm, pitch = {self.pitch} mm"
+            got = f"ring_radius = {radius} mm, pitch = {self.pitch} mm"
+            fault = f"0 < 2 ring_radius < pitch (rings must not touch), got {got}"
         elif not 0 < wall < radius:
-            fault = "0 < ring_thickness < ring_radius, got "
-            fault += f"ring_thickness = {wall} mm, ring_radius = {radius} mm"
+            got = f"ring_thickness = {wall} mm, ring_radius = {radius} mm"
+            fault = f"0 < ring_thickness < ring_radius, got {got}"
         elif not 0 < ligament < most:
             fault = f"0 < ligament_thickness < {most:.4g} mm (the ligaments of a ring must not "
             fault += f"touch), got {ligament} mm; make ligaments thinner or rings larger"
         elif not self.middle > self.foot:
-            fault = f"ligaments with a free length, got rings {self.pitch - 2 * radius:.4g} mm "
-            fault += f"apart with ligaments {ligament} mm thick; make rings smaller or ligaments "
-            fault += "thinner"
-        if fault:
-            raise InputError(f"chiral cell: expected {fault}")
+            fault = (
+                f"ligaments with a free length, got rings {self.pitch - 2 * radius:.4g} mm apart "
+            )
+            fault += f"with ligaments {ligament} mm thick; make rings smaller or ligaments thinner"
+        else:
+            return
+        raise InputError(f"chiral cell: expected {fault}")
 
     @property
     def middle(self) -> float:

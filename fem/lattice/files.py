@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import gmsh
@@ -23,7 +22,7 @@ from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading, require_file
 
-Cells = dict[str, IntArray]  # by meshio's names of the elements
+Blocks = dict[str, list[IntArray]]  # of elements, by meshio's names of these
 
 GEOMETRY = (".geo", ".geo_unrolled", ".step", ".stp", ".brep", ".iges", ".igs")
 """Suffixes of the files that gmsh meshes."""
@@ -45,20 +44,17 @@ def read_cell(
 ) -> UnitCell:
     """Read the unit cell of a lattice from a file.
 
+    An InputError refuses one that can't be read, is no plane mesh of sound triangles, or is not
+    periodic.
+
     Parameters
     ----------
-    path
-        A plane mesh [mm] of six-node triangles, in any format of meshio or gmsh; three-node
+    path : a plane mesh [mm] of six-node triangles, in any format of meshio or gmsh; three-node
         triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
         (suffixes ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
-    lattice
-        (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x and
-        y, as wide and as high as its material.
-    size
-        Largest edge length [mm] of the elements of a geometry; None: what it says itself.
-
-    An InputError refuses a file that can't be read, is no plane mesh of sound triangles, or is not
-    periodic.
+    lattice : (2, 2) lattice vectors a1 and a2 as rows [mm]. None: the cell is a rectangle along x
+        and y, as wide and as high as its material.
+    size : largest edge length [mm] of the elements of a geometry; None: what it says itself.
     """
     path = Path(path)
     require_file(path, "a cell (mesh or geometry)", "draw or export one")
@@ -74,8 +70,7 @@ def read_cell(
     blocks: dict[str, list[IntArray]] = {}
     for block in source.cells:
         blocks.setdefault(block.type, []).append(np.asarray(block.data, dtype=np.int64))
-    cells = {name: np.vstack(parts) for name, parts in blocks.items()}
-    return _unit_cell(np.asarray(source.points, dtype=np.float64), cells, lattice, str(path))
+    return _unit_cell(np.asarray(source.points, dtype=np.float64), blocks, lattice, str(path))
 
 
 def cell_from_gmsh(lattice: ArrayLike | None = None, size: float | None = None) -> UnitCell:
@@ -145,10 +140,9 @@ def _mesh_periodically(lattice: ArrayLike | None) -> None:
     surfaces = gmsh.model.getEntities(2)
     _refuse_crossing({tag for _, tag in gmsh.model.getBoundary(surfaces, False, False)})
     curves = [tag for _, tag in gmsh.model.getBoundary(surfaces, combined=True, oriented=False)]
-    outline = [_ends_and_middle(tag) for tag in curves]
-    if outline:
+    if curves:
         vectors = _lattice(lattice, mesh.getNodes()[1].reshape(-1, 3)[:, :2])
-        for a, b, shift in _translates(outline, vectors):
+        for a, b, shift in _translates([_ends_and_middle(tag) for tag in curves], vectors):
             if mesh.getPeriodicNodes(1, curves[b])[0] == curves[b]:  # not set by the user
                 affine = np.eye(4)
                 affine[:2, 3] = shift
@@ -212,29 +206,27 @@ def _translates(
     return found
 
 
-def _current_mesh() -> tuple[FloatArray, Cells]:
+def _current_mesh() -> tuple[FloatArray, Blocks]:
     """Nodes (n, 3) [mm] and elements of gmsh's current model: of its material, if it names one."""
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
-    groups = gmsh.model.getPhysicalGroups(2)
-    named = [
-        int(e) for _, group in groups for e in gmsh.model.getEntitiesForPhysicalGroup(2, group)
-    ]
-    cells: dict[str, list[IntArray]] = {}
+    of_group = gmsh.model.getEntitiesForPhysicalGroup
+    named = [int(e) for _, n in gmsh.model.getPhysicalGroups(2) for e in of_group(2, n)]
+    cells: Blocks = {}
     for entity in named or [tag for _, tag in gmsh.model.getEntities(2)]:
         for kind, _, nodes in zip(*gmsh.model.mesh.getElements(2, entity), strict=True):
             _, _, degree, count, *_ = gmsh.model.mesh.getElementProperties(kind)
             name = {(1, 3): "triangle", (2, 6): "triangle6"}.get((degree, count), f"{count}-node")
             place = np.searchsorted(tags[order], nodes).reshape(-1, count)
             cells.setdefault(name, []).append(place.astype(np.int64))
-    points = coordinates.reshape(-1, 3)[order]
-    return points, {name: np.vstack(blocks) for name, blocks in cells.items()}
+    return coordinates.reshape(-1, 3)[order], cells
 
 
 def _unit_cell(
-    points: FloatArray, cells: Mapping[str, IntArray], lattice: ArrayLike | None, source: str
+    points: FloatArray, blocks: Blocks, lattice: ArrayLike | None, source: str
 ) -> UnitCell:
     """Check a mesh as it is in files, put it in order, and find its periodicity."""
+    cells = {name: np.vstack(parts) for name, parts in blocks.items()}
     kinds = sorted(name for name in cells if not name.startswith(_LOWER) and len(cells[name]))
     if kinds not in (["triangle"], ["triangle6"]):
         got = " and ".join(kinds) or "no elements"
@@ -296,8 +288,20 @@ def sound_t6(points: FloatArray, cells: IntArray) -> Mesh:
     clockwise = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0
     cells = np.where(clockwise[:, None], cells[:, REVERSED_T6], cells)
     mesh = Mesh(nodes, cells, "T6")
-    _refuse_stacked(mesh)
-    _refuse_folded(mesh)
+    middle, count = np.unique(cells[:, 3:], return_counts=True)
+    if count.max() > 2:
+        x, y = nodes[middle[np.argmax(count)]]
+        raise InputError(
+            f"expected sides of one or two elements, got one of {count.max()} at ({x:.5g}, "
+            f"{y:.5g}) mm; elements must not lie upon each other"
+        )
+    bad = np.flatnonzero(_smallest_jacobians(mesh) <= 0)
+    if len(bad):
+        x, y = nodes[cells[bad[0], :3]].mean(axis=0)
+        raise InputError(
+            f"expected elements that are neither flat nor folded, got {len(bad)}, the first at "
+            f"({x:.5g}, {y:.5g}) mm"
+        )
     return mesh
 
 
@@ -317,26 +321,6 @@ def _with_mid_sides(nodes: FloatArray, cells: IntArray) -> tuple[FloatArray, Int
     sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
     middles = nodes[sides].mean(axis=1)
     return np.vstack([nodes, middles]), np.hstack([cells, len(nodes) + number.reshape(-1, 3)])
-
-
-def _refuse_stacked(mesh: Mesh) -> None:
-    middle, count = np.unique(mesh.cells[:, 3:], return_counts=True)
-    if count.max() > 2:
-        x, y = mesh.nodes[middle[np.argmax(count)]]
-        raise InputError(
-            f"expected sides of one or two elements, got one of {count.max()} at ({x:.5g}, "
-            f"{y:.5g}) mm; elements must not lie upon each other"
-        )
-
-
-def _refuse_folded(mesh: Mesh) -> None:
-    bad = np.flatnonzero(_smallest_jacobians(mesh) <= 0)
-    if len(bad):
-        x, y = mesh.nodes[mesh.cells[bad[0], :3]].mean(axis=0)
-        raise InputError(
-            f"expected elements that are neither flat nor folded, got {len(bad)}, the first at "
-            f"({x:.5g}, {y:.5g}) mm"
-        )
 
 
 def _smallest_jacobians(mesh: Mesh) -> FloatArray:

@@ -128,14 +128,17 @@ class MacroLoading:
         return np.where(self.free, np.ravel(self.stress), 0.0)
 
 
-def uniaxial(axis: int = 0) -> MacroLoading:
-    """Compression by the nominal strain e along an axis (0: x, 1: y), the other side free."""
-    return _compression(axis, None)
+def uniaxial(axis: int = 0, lateral: float | None = None) -> MacroLoading:
+    """Compression by e along an axis (0: x, 1: y), the other side free or strained by lateral e."""
+    if axis not in (0, 1):
+        raise InputError(f"macroscopic loading: expected the axis 0 (x) or 1 (y), got {axis}")
+    x, y = (-1.0, lateral) if axis == 0 else (lateral, -1.0)
+    return MacroLoading(((x, 0.0), (0.0, y)))
 
 
 def uniaxial_strain(axis: int = 0) -> MacroLoading:
     """Compression by the nominal strain e along an axis (0: x, 1: y), no lateral strain."""
-    return _compression(axis, 0.0)
+    return uniaxial(axis, lateral=0.0)
 
 
 def equibiaxial() -> MacroLoading:
@@ -146,11 +149,3 @@ def equibiaxial() -> MacroLoading:
 def simple_shear() -> MacroLoading:
     """F̄ = I + e · (x ⊗ y): planes y = const slide along x."""
     return MacroLoading(((0.0, 1.0), (0.0, 0.0)))
-
-
-def _compression(axis: int, lateral: float | None) -> MacroLoading:
-    if axis not in (0, 1):
-        raise InputError(f"macroscopic loading: expected the axis 0 (x) or 1 (y), got {axis}")
-    if axis == 0:
-        return MacroLoading(((-1.0, 0.0), (0.0, lateral)))
-    return MacroLoading(((lateral, 0.0), (0.0, -1.0)))

@@ -54,10 +54,9 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -
     lattice = np.asarray(lattice, dtype=np.float64)
     if mesh.element != "T6":
         raise InputError(f"periodic cell: expected a T6 mesh, got {mesh.element}")
-    lengths = np.linalg.norm(lattice, axis=1) if lattice.shape == (2, 2) else np.zeros(2)
-    if lattice.shape != (2, 2) or not (
-        1e-6 * np.prod(lengths) < abs(np.linalg.det(lattice)) < np.inf
-    ):
+    is_2x2 = lattice.shape == (2, 2)
+    lengths = np.linalg.norm(lattice, axis=1) if is_2x2 else np.zeros(2)
+    if not is_2x2 or not 1e-6 * np.prod(lengths) < abs(np.linalg.det(lattice)) < np.inf:
         raise InputError(
             "periodic cell: expected two lattice vectors that are not parallel, as rows [mm], "
             f"got {lattice.tolist()}"
@@ -67,7 +66,12 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -
     sides = boundary_sides(mesh)
     _refuse_overlap(mesh, lattice, np.unique(sides))
     _refuse_hanging(mesh, lattice, sides, pairs)
-    found = _classes(mesh.nodes, lattice, pairs)
+    n = len(mesh.nodes)
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(n, n))
+    _, master = connected_components(links, directed=False)
+    _, first = np.unique(master, return_index=True)
+    shift = np.rint((mesh.nodes - mesh.nodes[first[master]]) @ np.linalg.inv(lattice))
+    found = Periodicity(lattice, master.astype(np.int64), shift.astype(np.int64))
     _refuse_loose(mesh, found, sides)
     return found
 
@@ -80,15 +84,6 @@ def _pairs(nodes: FloatArray, lattice: FloatArray, distance: float) -> IntArray:
         mine = np.flatnonzero(np.isfinite(near))
         found.append(np.stack([mine, partner[mine]], axis=1))
     return np.vstack(found).astype(np.int64)
-
-
-def _classes(nodes: FloatArray, lattice: FloatArray, pairs: IntArray) -> Periodicity:
-    n = len(nodes)
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(n, n))
-    _, master = connected_components(links, directed=False)
-    _, first = np.unique(master, return_index=True)
-    shift = np.rint((nodes - nodes[first[master]]) @ np.linalg.inv(lattice))
-    return Periodicity(lattice, master.astype(np.int64), shift.astype(np.int64))
 
 
 def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None:
@@ -110,8 +105,9 @@ def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: Int
     outside = middle + 0.02 * np.stack([along[:, 1], -along[:, 0]], axis=1)
     covered = _covered(mesh, lattice, outside)
     if covered.any():
-        lost = np.setdiff1d(sides[~matched][covered], pairs)
-        lost = lost if len(lost) else np.unique(sides[~matched][covered])
+        mine = np.unique(sides[~matched][covered])
+        alone = np.setdiff1d(mine, pairs)
+        lost = alone if len(alone) else mine
         raise InputError(
             "periodic cell: expected a partner, one lattice translation away, for every node on "
             f"the cell's outline, got none for {_named(lost, mesh.nodes)}; divide opposite sides "

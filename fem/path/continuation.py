@@ -13,20 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from petsc4py import PETSc
 
-from modeharvest.fem.experiment import PathOptions
+from modeharvest.fem.experiment import SMALLEST_STEP, PathOptions
 from modeharvest.fem.path.equilibrium import Structure
-from modeharvest.fem.path.newton import (
-    Constraint,
-    Linearisation,
-    NewtonOutcome,
-    correct,
-    path_tangent,
-)
+from modeharvest.fem.path.newton import Constraint, Linearisation, correct, path_tangent
 from modeharvest.fem.path.predictor import extrapolate
 from modeharvest.fem.path.stability import Mode, lowest_modes
 from modeharvest.util.progress import Progress, silent
 
-_SMALLEST_STEP = 1e-5  # of nominal strain
 _MISS = 0.2  # of a step, by which a prediction may be off on a path without a bifurcation
 _STRETCH = 0.1  # of a step, by which steps may be longer if one is saved
 _MODES = 3  # computed, or all that are negative and one more
@@ -81,8 +74,7 @@ class PathFollower:
         None if Newton does not get there, or gets to a state with a reversed element.
         """
         found = correct(self.structure, guess, strain, self.linearisation, constraint)
-        is_there = found.outcome is NewtonOutcome.CONVERGED
-        if not is_there or self.structure.smallest_jacobian(found.u) <= 0.0:
+        if not found.is_converged or self.structure.smallest_jacobian(found.u) <= 0.0:
             self.linearisation = None  # it may be that of a wrong state
             return None
         return self._settle(found.u, found.strain, found.load, with_modes)
@@ -132,7 +124,7 @@ class PathFollower:
                 if state is None or (refuse_unstable and _is_slip(states[-1], state, guess)):
                     self.linearisation = None  # it may be that of the state refused
                     step = 0.5 * (strain - here)
-                    if step < _SMALLEST_STEP:
+                    if step < SMALLEST_STEP:
                         return False
                     continue
                 states.append(state)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -129,7 +128,10 @@ class _CriticalBracket:
             self.low, self.is_over = above or below, above is None
             return None
         beyond = follower.structure.curvature(above.u, mode.vector)
-        values = [(s.strain, _most_similar(mode, known).eigenvalue) for s, known in self._visited]
+        values = []
+        for state, known in self._visited:
+            most_similar = max(known, key=lambda other: abs(mode.overlap(other.vector)))
+            values.append((state.strain, most_similar.eigenvalue))
         values.append((above.strain, beyond))
         (last, final), (far, first) = values[-2], values[0]
         # In proportion to the distance, unless the two states are not on one path.
@@ -141,8 +143,3 @@ class _CriticalBracket:
             strain = last + 2 * tolerance * final / (final - beyond)
         pivots = below.negative_pivots, above.negative_pivots
         return Critical(strain, displacement_at([below], strain), modes, values, *pivots)
-
-
-def _most_similar(mode: Mode, modes: Sequence[Mode]) -> Mode:
-    """That of another state's modes which overlaps most with a mode."""
-    return max(modes, key=lambda other: abs(mode.overlap(other.vector)))

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from modeharvest.fem import dolfinx_api
-from modeharvest.fem.experiment import EDGES
+from modeharvest.fem.experiment import require_edges
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.hyperelastic import Hyperelastic
 from modeharvest.fem.materials import Material
@@ -47,10 +47,7 @@ class EdgeCompression:
     pins: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.edges not in EDGES:
-            raise InputError(
-                f"loaded edges: expected {' or '.join(map(repr, EDGES))}, got {self.edges!r}"
-            )
+        require_edges(self.edges)
 
 
 class SymmetricFactor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from enum import Enum
 
 from petsc4py import PETSc
 
@@ -20,14 +19,6 @@ _SMALLEST_SHARE = 1 / 64  # of a Newton step, before giving up
 _MAX_ITERATIONS = 60
 # The residual must be smaller than what a change of the nominal strain by this would make.
 STRAIN_TOLERANCE = 1e-11
-
-
-class NewtonOutcome(Enum):
-    """Why a Newton iteration ended; the value is a sentence."""
-
-    CONVERGED = "the residual is below the tolerance"
-    DIVERGED = "the residual kept growing or is not a number"
-    SLOW = "the residual did not fall below the tolerance in the iterations allowed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +38,9 @@ class Constraint:
 class Linearisation:
     """How the structure answers to small changes of an equilibrium: serves states nearby, too.
 
-    The factor of its tangent stiffness, ``tangent`` du/d(strain) along the path [mm], and the norm
-    of ``Structure.load`` [N/mm].
+    factor : of the tangent stiffness.
+    tangent : du/d(strain) along the path [mm].
+    load_size : norm of ``Structure.load`` [N/mm].
     """
 
     factor: SymmetricFactor
@@ -58,12 +50,12 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Where Newton's method arrived, and why it stopped; where that is an equilibrium, its load."""
+    """Where Newton's method arrived, and whether that is an equilibrium; if it is, its load."""
 
     u: PETSc.Vec
     strain: float
     load: PETSc.Vec | None
-    outcome: NewtonOutcome
+    is_converged: bool
 
 
 def correct(
@@ -79,16 +71,13 @@ def correct(
     that is prescribed or, with a constraint, its own start. ``near`` is that of a state nearby.
     """
     iterate = _Iterate(structure, guess, strain, near, constraint)
-    outcome = NewtonOutcome.SLOW
+    is_converged = False
     for _ in range(_MAX_ITERATIONS):
         iterate.evaluate()
-        if iterate.is_solved:
-            outcome = NewtonOutcome.CONVERGED
+        is_converged = iterate.is_solved
+        if is_converged or not iterate.advance():
             break
-        if not iterate.advance():
-            outcome = NewtonOutcome.DIVERGED
-            break
-    return Correction(iterate.u, iterate.strain, iterate.load, outcome)
+    return Correction(iterate.u, iterate.strain, iterate.load, is_converged)
 
 
 class _Iterate:
@@ -150,7 +139,7 @@ class _Iterate:
         if last is not None and not rate < 1.0:
             self.u, self.strain = last.start.copy(), last.strain
             if last.is_fresh:
-                step = last.halved()
+                step = replace(last, share=0.5 * last.share)
                 if step.share < _SMALLEST_SHARE:
                     return False
             else:
@@ -167,7 +156,10 @@ class _Iterate:
                 self._weigh()
                 self.tangent = path_tangent(self.structure, self.factor, self.load)
             step = self._step(is_fresh=True)
-        self._take(step)
+        self.u, self.last = step.start.copy(), step
+        self.u.axpy(step.share, step.direction)
+        self.strain = step.strain + step.share * step.change
+        self.structure.prescribe(self.u, self.strain)
         return True
 
     def _iterations_left(self, rate: float) -> float:
@@ -186,12 +178,6 @@ class _Iterate:
             step.axpy(change, self.tangent)
         return _NewtonStep(self.u, self.strain, step, change, float(step.norm()), is_fresh)
 
-    def _take(self, step: _NewtonStep) -> None:
-        self.u, self.last = step.start.copy(), step
-        self.u.axpy(step.share, step.direction)
-        self.strain = step.strain + step.share * step.change
-        self.structure.prescribe(self.u, self.strain)
-
 
 @dataclass(frozen=True, eq=False)
 class _NewtonStep:
@@ -204,9 +190,6 @@ class _NewtonStep:
     length: float
     is_fresh: bool
     share: float = 1.0
-
-    def halved(self) -> _NewtonStep:
-        return replace(self, share=0.5 * self.share)
 
 
 def path_tangent(structure: Structure, factor: SymmetricFactor, load: PETSc.Vec) -> PETSc.Vec:

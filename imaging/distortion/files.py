@@ -10,23 +10,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from modeharvest.imaging.distortion.lens import (
-    CameraDistortion,
-    PolynomialDistortion,
-    SampledDistortion,
-)
+from modeharvest.imaging.distortion import lens
+from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading, write_json
-from modeharvest.util.typed import made
+from modeharvest.util.typed import made, to_plain
 
-AnyDistortion = PolynomialDistortion | CameraDistortion | SampledDistortion
+AnyDistortion = lens.PolynomialDistortion | CameraDistortion | lens.SampledDistortion
+_KINDS: dict[str, type[AnyDistortion]] = {
+    "polynomial": lens.PolynomialDistortion,
+    "camera": CameraDistortion,
+    "sampled": lens.SampledDistortion,
+}
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "M")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "D1")
@@ -36,16 +38,9 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 def write_distortion(path: Path | str, distortion: AnyDistortion) -> None:
     """Write a distortion as JSON, whole or not at all; every number is kept exactly."""
-    content: dict[str, Any] = {"frame": "px; components along rows (down), columns (right)"}
-    if isinstance(distortion, PolynomialDistortion):
-        content |= {"kind": "polynomial", "shape": list(distortion.shape)}
-        content |= {"coefficients": distortion.coefficients.tolist()}
-    elif isinstance(distortion, CameraDistortion):
-        content |= {"kind": "camera", **asdict(distortion)}
-    else:
-        content |= {"kind": "sampled"}
-        content |= {f.name: getattr(distortion, f.name).tolist() for f in fields(distortion)}
-    write_json(path, content)
+    kind = next(name for name, known in _KINDS.items() if isinstance(distortion, known))
+    frame = "px; components along rows (down), columns (right)"
+    write_json(path, {"frame": frame, "kind": kind, **to_plain(distortion)})
 
 
 def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
@@ -64,7 +59,8 @@ def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
             root = ElementTree.fromstring(text)
             if root.tag == "ParameterList":
                 return _from_dice(root, camera, path)
-            return _camera({child.tag: _numbers(child) for child in root}, path)
+            matrices = {child.tag: _numbers(child.findtext("data") or "") for child in root}
+            return _camera(matrices, path)
         if suffix in (".yml", ".yaml"):
             return _camera(_opencv_yaml(text), path)
         raise InputError(f"expected a distortion as .json, .xml, .yml or .yaml, got {path}")
@@ -73,38 +69,27 @@ def read_distortion(path: Path | str, camera: int | str = 0) -> AnyDistortion:
 def _from_json(content: Any, path: Path) -> AnyDistortion:
     if not isinstance(content, dict):
         raise InputError(f"expected a distortion at {path}, got {type(content).__name__}")
-    kinds: dict[str, Any] = {
-        "polynomial": PolynomialDistortion,
-        "camera": CameraDistortion,
-        "sampled": SampledDistortion,
-    }
     if "kind" not in content:  # OpenCV's storage can be JSON, too
         entries = {k: v.get("data") for k, v in content.items() if isinstance(v, dict)}
         return _camera(entries, path)
-    if not isinstance(content["kind"], str) or content["kind"] not in kinds:
-        raise InputError(
-            f"expected a distortion of a kind among {list(kinds)} at {path}, "
-            f"got {content['kind']!r}"
-        )
+    name, known = content["kind"], list(_KINDS)
+    if name not in known:
+        raise InputError(f"expected a distortion of a kind among {known} at {path}, got {name!r}")
     values = {k: v for k, v in content.items() if k not in ("kind", "frame")}
-    kind = kinds[content["kind"]]
+    kind: Any = _KINDS[name]
     found: AnyDistortion = made(kind, values) if kind is CameraDistortion else kind(**values)
     return found
 
 
-def _numbers(element: ElementTree.Element) -> list[float]:
-    """Numbers of an OpenCV matrix in XML."""
-    data = element.findtext("data") or ""
+def _numbers(data: str) -> list[float]:
+    """Numbers of an OpenCV matrix."""
     return [float(number) for number in re.findall(_NUMBER, data)]
 
 
 def _opencv_yaml(text: str) -> dict[str, list[float]]:
     """Matrices of OpenCV's YAML: ``name: !!opencv-matrix`` with ``data: [ ... ]``."""
     matrix = r"^(\w+):\s*(?:!!opencv-matrix)?\s*\n(?:\s+\w+:[^\[\n]*\n)*?\s+data:\s*\[([^\]]*)\]"
-    return {
-        name: [float(number) for number in re.findall(_NUMBER, data)]
-        for name, data in re.findall(matrix, text, re.MULTILINE)
-    }
+    return {name: _numbers(data) for name, data in re.findall(matrix, text, re.MULTILINE)}
 
 
 def _camera(entries: Mapping[str, Any], path: Path) -> CameraDistortion:

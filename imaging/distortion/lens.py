@@ -2,9 +2,8 @@
 
 A lens shows the ideal image position p at phi_S(p) = p + S(p), the paper's Eq. (r2). Here S is in
 px and in the image frame: components along the rows' index (down) and the columns' index (right).
-
-Source of the camera model: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html, without thin
-prisms and tilts.
+Source of the camera model, here without thin prisms and tilts:
+https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, require_within
 
 _CHUNK = 8192
 """Points that are inverted at a time, so that they stay in the cache."""
@@ -222,10 +221,8 @@ class CameraDistortion(Distortion):
 
     def __post_init__(self) -> None:
         require_finite(np.array(astuple(self)), "camera parameters")
-        if not (self.fx > 0.0 and self.fy > 0.0):
-            raise InputError(
-                f"distortion: expected focal lengths above 0 px, got {self.fx} and {self.fy}"
-            )
+        for focal in (self.fx, self.fy):
+            require_within("distortion: expected focal lengths", focal, 0.0, above=True)
 
     def normalised(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """x and y of image positions [-]."""
@@ -268,9 +265,7 @@ class CameraDistortion(Distortion):
 
 @dataclass(frozen=True, eq=False)
 class SampledDistortion(Distortion):
-    """S given on a grid, with a bicubic spline through it.
-
-    Beyond the grid it goes on linearly from the edge.
+    """S given on a grid, with a bicubic spline through it; beyond, it goes on linearly.
 
     rows, cols : (n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each.
     field : (2, n, m) S along the rows' and the columns' index [px].
@@ -284,25 +279,21 @@ class SampledDistortion(Distortion):
         for name in ("rows", "cols", "field"):
             object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
             require_finite(getattr(self, name), name)
-        if any(a.ndim != 1 or a.size < 4 or (np.diff(a) <= 0).any() for a in self._axes):
+        axes, shape = (self.rows, self.cols), (2, self.rows.size, self.cols.size)
+        if any(a.ndim != 1 or a.size < 4 or (np.diff(a) <= 0).any() for a in axes):
             raise InputError(
                 "distortion: expected at least 4 ascending rows and cols of a sampled field [px], "
                 f"got {self.rows.size} and {self.cols.size}"
             )
-        if self.field.shape != (2, self.rows.size, self.cols.size):
+        if self.field.shape != shape:
             raise InputError(
-                f"distortion: expected a field of shape {(2, self.rows.size, self.cols.size)} "
-                f"like its rows and cols, got {self.field.shape}"
+                f"distortion: expected a field of shape {shape} like its rows and cols, got "
+                f"{self.field.shape}"
             )
 
-    @property
-    def _axes(self) -> tuple[FloatArray, FloatArray]:
-        return self.rows, self.cols
-
     @cached_property
-    def _splines(self) -> tuple[RectBivariateSpline, RectBivariateSpline]:
-        along_row, along_col = (RectBivariateSpline(*self._axes, f, s=0) for f in self.field)
-        return along_row, along_col
+    def _splines(self) -> list[RectBivariateSpline]:
+        return [RectBivariateSpline(self.rows, self.cols, f, s=0) for f in self.field]
 
     def _evaluate(
         self, row: ArrayLike, col: ArrayLike, orders: tuple[tuple[int, int], ...]

@@ -22,9 +22,7 @@ from modeharvest.util.errors import InputError, require_within
 
 @dataclass(frozen=True)
 class CalibrationTarget:
-    """A target and the shifts of the stage that carries it.
-
-    InputError if a value is out of its range.
+    """A target and its stage's shifts; InputError if a value is out of its range.
 
     shifts_px : intended shifts (along columns, along rows) [px], one for each photograph.
     stage_sd_px : standard deviation of the stage's error, of each component of each shift [px].
@@ -68,13 +66,11 @@ def photograph_target(
     points : (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.
     """
     rows, cols = points[0].shape
-    pattern = Speckle(_reseeded(target.speckle or speckle, target.seed), (rows, cols))
+    speckle = replace(target.speckle or speckle, seed=target.seed)
+    if speckle.ink is not None:
+        speckle = replace(speckle, ink=replace(speckle.ink, seed=target.seed))
+    pattern = Speckle(speckle, (rows, cols))
     for k, (down, right) in enumerate(target.true_shifts):
         name = f"calibration_{k:02d}"
         irradiance = pattern(points[0] - down, points[1] - right).astype(np.float32)
         yield name, sensor.expose(np.float32(sensor.illumination(name)) * irradiance, bits, name)
-
-
-def _reseeded(speckle: SpeckleSpec, seed: int) -> SpeckleSpec:
-    ink = None if speckle.ink is None else replace(speckle.ink, seed=seed)
-    return replace(speckle, seed=seed, ink=ink)

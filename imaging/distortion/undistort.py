@@ -18,8 +18,10 @@ from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
+Positions = tuple[FloatArray, FloatArray]
+"""(row, col) [px], both of one shape."""
 _BAND = 64
-"""Rows that are resampled in one go."""
+"""Rows that are resampled, or inverted, in one go."""
 
 
 def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDArray[np.float32]:
@@ -60,20 +62,15 @@ def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool
     return result
 
 
-def _observed_from(
-    distortion: Distortion, shape: tuple[int, ...], band: slice
-) -> tuple[FloatArray, FloatArray]:
+def _observed_from(distortion: Distortion, shape: tuple[int, ...], band: slice) -> Positions:
     """phi_S at the pixels of some rows."""
     row = np.arange(shape[0], dtype=np.float64)[band, None]
     col = np.arange(shape[1], dtype=np.float64)[None, :]
     return distortion.observed(row, col)
 
 
-Positions = tuple[FloatArray, FloatArray]
-
 _DEGREE = 9
 _NEGLIGIBLE_PX = 1e-12
-_STRIP = 64  # rows that a thread takes at a time
 
 
 def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
@@ -82,7 +79,7 @@ def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
     InputError if the distortion folds in the image.
     """
     row, col = np.ogrid[: shape[0], : shape[1]]
-    strips = [slice(k, k + _STRIP) for k in range(0, shape[0], _STRIP)]
+    strips = [slice(k, k + _BAND) for k in range(0, shape[0], _BAND)]
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         found = list(pool.map(lambda strip: distortion.ideal(row[strip], col), strips))
     return np.concatenate([r for r, _ in found]), np.concatenate([c for _, c in found])
@@ -104,9 +101,6 @@ def without_affine(distortion: Distortion, shape: tuple[int, int]) -> Polynomial
     orders = PolynomialDistortion.orders(_DEGREE)
     coefficients = np.array([[s[j, i] for i, j in orders] for s in series])
     coefficients[:, :3] = 0.0
-    degree = max(
-        (i + j for (i, j), c in zip(orders, coefficients.T, strict=True)
-         if np.abs(c).max() > _NEGLIGIBLE_PX),
-        default=0,
-    )  # fmt: skip
+    is_large = np.abs(coefficients).max(axis=0) > _NEGLIGIBLE_PX
+    degree = int(np.max(np.sum(orders, axis=1)[is_large], initial=0))
     return PolynomialDistortion(shape, coefficients[:, : PolynomialDistortion.size_of(degree)])

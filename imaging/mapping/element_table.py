@@ -240,27 +240,36 @@ def proved_reach(polynomial: FloatArray, slopes: FloatArray, centre: float) -> f
     return 0.0
 
 
-@compiled()
-def bands(
-    row_from: IntArray, row_to: IntArray, rows: int, height: int
-) -> tuple[IntArray, IntArray]:
+def bands(elements: ElementTable, rows: int, height: int) -> tuple[IntArray, IntArray]:
     """(start, visits): the elements that reach into each band of ``height`` rows.
 
     Those of band b are ``visits[start[b]:start[b + 1]]``, ascending.
     """
-    count = (rows + height - 1) // height
-    start = np.zeros(count + 1, dtype=np.int64)
-    for e in range(row_from.size):
-        if row_to[e] > row_from[e]:
-            for b in range(row_from[e] // height, (row_to[e] - 1) // height + 1):
-                start[b + 1] += 1
-    for b in range(count):
+    first, past = elements.row_from // height, (elements.row_to - 1) // height + 1
+    past = np.where(elements.row_to > elements.row_from, past, first)
+    ranges = np.stack([first, np.zeros_like(first), past, np.ones_like(first)], axis=1)
+    return fill_buckets(ranges, (rows + height - 1) // height, 1)
+
+
+@compiled()
+def fill_buckets(ranges: IntArray, rows: int, cols: int) -> tuple[IntArray, IntArray]:
+    """(start, members): the elements that reach into each bucket of a grid of them.
+
+    ``ranges`` (m, 4) are each element's first row and column of buckets, and those past its last.
+    Of bucket b, by rows, they are ``members[start[b]:start[b + 1]]``, ascending.
+    """
+    start = np.zeros(rows * cols + 1, dtype=np.int64)
+    for top, left, bottom, right in ranges:
+        for i in range(top, bottom):
+            for j in range(left, right):
+                start[i * cols + j + 1] += 1
+    for b in range(rows * cols):
         start[b + 1] += start[b]
-    visits = np.empty(start[-1], dtype=np.int64)
+    members = np.empty(start[-1], dtype=np.int64)
     cursor = start[:-1].copy()
-    for e in range(row_from.size):
-        if row_to[e] > row_from[e]:
-            for b in range(row_from[e] // height, (row_to[e] - 1) // height + 1):
-                visits[cursor[b]] = e
-                cursor[b] += 1
-    return start, visits
+    for e in range(len(ranges)):
+        for i in range(ranges[e, 0], ranges[e, 2]):
+            for j in range(ranges[e, 1], ranges[e, 3]):
+                members[cursor[i * cols + j]] = e
+                cursor[i * cols + j] += 1
+    return start, members

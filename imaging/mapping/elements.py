@@ -18,7 +18,7 @@ proved. Only then is the element's map one to one.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import factorial
+from math import comb
 
 import numpy as np
 from numba import prange
@@ -138,18 +138,13 @@ def bernstein(triangular: bool, degree: int, xi: FloatArray) -> FloatArray:
     for u, v in lattice_points(triangular, degree):
         if triangular:
             i, j = round(u * degree), round(v * degree)
-            k = degree - i - j
-            count = factorial(degree) // (factorial(i) * factorial(j) * factorial(k))
+            k, count = degree - i - j, comb(degree, i) * comb(degree - i, j)
             columns.append(count * x**i * y**j * (1.0 - x - y) ** k)
         else:
             i, j = round((u + 1) * degree / 2), round((v + 1) * degree / 2)
-            count = factorial(degree) ** 2 // (
-                factorial(i) * factorial(degree - i) * factorial(j) * factorial(degree - j)
-            )
+            p, q, count = degree - i, degree - j, comb(degree, i) * comb(degree, j)
             s, t = 0.5 * (1.0 + x), 0.5 * (1.0 + y)
-            columns.append(
-                count * s**i * (1.0 - s) ** (degree - i) * t**j * (1.0 - t) ** (degree - j)
-            )
+            columns.append(count * s**i * (1.0 - s) ** p * t**j * (1.0 - t) ** q)
     return np.stack(columns, axis=-1)
 
 
@@ -195,11 +190,12 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
         return np.empty(0, dtype=np.int64)
     unproved = np.flatnonzero(~proved)
     coefficients = all_coefficients[unproved]
-    corners = _corners(triangular, degree)
-    split = np.stack(
-        [convert @ bernstein(triangular, degree, s[:2] + s[2] * points)
-         for s in sub_elements(triangular)]
-    )  # fmt: skip
+    # Where a Bernstein coefficient is the polynomial's value.
+    ends = np.column_stack([points, 1 - points.sum(axis=1)]) if triangular else np.abs(points)
+    is_one = np.isclose(ends, 1.0)
+    corners = np.flatnonzero(is_one.any(axis=1) if triangular else is_one.all(axis=1))
+    parts = [s[:2] + s[2] * points for s in sub_elements(triangular)]
+    split = np.stack([convert @ bernstein(triangular, degree, part) for part in parts])
     owner = np.arange(len(unproved))
     threshold = _ROUNDING * np.abs(coefficients).max(axis=1)
     bad = np.zeros(len(unproved), dtype=np.bool_)
@@ -277,13 +273,3 @@ def require_positive_jacobian(
             f"{bad[0]} near ({centre[0]:.4g}, {centre[1]:.4g}); repair the mesh or take a "
             "smaller displacement"
         )
-
-
-def _corners(triangular: bool, degree: int) -> IntArray:
-    """Lattice points where a Bernstein coefficient is the polynomial's value."""
-    points = lattice_points(triangular, degree)
-    if triangular:
-        at_corner = np.isclose(np.column_stack([points, 1 - points.sum(axis=1)]).max(axis=1), 1.0)
-    else:
-        at_corner = np.isclose(np.abs(points), 1.0).all(axis=1)
-    return np.flatnonzero(at_corner)

@@ -83,7 +83,7 @@ def locate(
     """
     require_positive_jacobian(nodes, cells, element, where)
     elements = tabulate_elements(nodes, cells, element, grid)
-    start, visits = bands(elements.row_from, elements.row_to, grid.rows, rasterise.BAND)
+    start, visits = bands(elements, grid.rows, rasterise.BAND)
     fields = polynomials(element, cells, np.empty((len(nodes), 0)) if nodal is None else nodal)
     size = grid.rows * grid.cols
     pixels = Pixels(

@@ -15,13 +15,8 @@ from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import (
-    bezier_matrix,
-    polynomials,
-    reference_element,
-    require_positive_jacobian,
-    sub_elements,
-)
+from modeharvest.imaging.mapping.element_table import ElementTable, fill_buckets, tabulate_elements
+from modeharvest.imaging.mapping.elements import require_positive_jacobian
 from modeharvest.imaging.mapping.inversion import (
     ON_EDGE,
     Coefficients,
@@ -43,35 +38,16 @@ _RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
 _SLACK_PX = 1e-7
 
 
-class _Elements(NamedTuple):
-    """A mesh as the kernels see it: m elements.
-
-    polynomials : (m, 2, 9) (row, col) relative to the centre [px].
-    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
-    boxes : (m, 4) least row and column, greatest row and column [px].
-    centres : (m, 2) whole pixels (row, col).
-    bezier : (p, 9) from polynomials to control points.
-    quarters : (4, 3) sub-elements.
-    triangular : triangles or quadrilaterals.
-    """
-
-    polynomials: FloatArray
-    absolute: FloatArray
-    boxes: FloatArray
-    centres: FloatArray
-    bezier: FloatArray
-    quarters: FloatArray
-    triangular: bool
-
-
 class _Buckets(NamedTuple):
     """Which elements may hold the points of a square of the image plane.
 
+    boxes : (m, 4) each element's least row and column, greatest row and column [px].
     start, members : members[start[b]:start[b + 1]] are the elements of bucket b, ascending.
     top, left : where the first bucket begins [px].
     rows, cols : how many buckets.
     """
 
+    boxes: FloatArray
     start: IntArray
     members: IntArray
     top: float
@@ -107,69 +83,34 @@ def locate_points(
     """
     require_positive_jacobian(nodes, cells, element, where)
     row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
-    elements = _elements(nodes, cells, element, grid)
+    elements = tabulate_elements(nodes, cells, element, grid)
     owner = np.empty(row.size, dtype=np.int32)
     xi = np.empty((row.size, 2))
     residual = np.empty(row.size, dtype=np.float32)
     frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
     points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
-    _locate(elements, _buckets(elements.boxes), *points, frame, owner, xi, residual)
+    _locate(elements, _buckets(elements), *points, frame, owner, xi, residual)
     shape = row.shape
     return Located(
         owner.reshape(shape), np.moveaxis(xi.reshape(*shape, 2), -1, 0), residual.reshape(shape)
     )
 
 
-def _elements(nodes: FloatArray, cells: IntArray, element: str, grid: PixelGrid) -> _Elements:
-    triangular = reference_element(element).triangular
-    position = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[cells]
-    centres = np.rint(position.mean(axis=1))
-    relative = polynomials(element, np.arange(cells.size).reshape(cells.shape),
-                           (position - centres[:, None]).reshape(-1, 2))  # fmt: skip
-    bezier = bezier_matrix(triangular)
-    control = relative @ bezier.T
-    boxes = np.concatenate(
-        [centres + control.min(axis=2) - _SLACK_PX, centres + control.max(axis=2) + _SLACK_PX],
-        axis=1,
-    )
-    absolute = polynomials(element, cells, nodes)
-    quarters = sub_elements(triangular)
-    return _Elements(relative, absolute, boxes, centres, bezier, quarters, triangular)
-
-
-def _buckets(boxes: FloatArray) -> _Buckets:
-    top, left = boxes[:, :2].min(axis=0)
-    first = ((boxes[:, :2] - [top, left]) // _BUCKET_PX).astype(np.int64)
-    last = ((boxes[:, 2:] - [top, left]) // _BUCKET_PX).astype(np.int64)
+def _buckets(elements: ElementTable) -> _Buckets:
+    control = elements.polynomials @ elements.bezier.T
+    low = elements.centres + control.min(axis=2) - _SLACK_PX
+    high = elements.centres + control.max(axis=2) + _SLACK_PX
+    top, left = low.min(axis=0)
+    first, last = (((at - [top, left]) // _BUCKET_PX).astype(np.int64) for at in (low, high))
     rows, cols = (int(n) for n in last.max(axis=0) + 1)
-    start, members = _fill_buckets(first, last, rows, cols)
-    return _Buckets(start, members, float(top), float(left), rows, cols)
-
-
-@compiled()
-def _fill_buckets(
-    first: IntArray, last: IntArray, rows: int, cols: int
-) -> tuple[IntArray, IntArray]:
-    start = np.zeros(rows * cols + 1, dtype=np.int64)
-    for e in range(first.shape[0]):
-        for i in range(first[e, 0], last[e, 0] + 1):
-            for j in range(first[e, 1], last[e, 1] + 1):
-                start[i * cols + j + 1] += 1
-    for b in range(rows * cols):
-        start[b + 1] += start[b]
-    members = np.empty(start[-1], dtype=np.int64)
-    cursor = start[:-1].copy()
-    for e in range(first.shape[0]):
-        for i in range(first[e, 0], last[e, 0] + 1):
-            for j in range(first[e, 1], last[e, 1] + 1):
-                members[cursor[i * cols + j]] = e
-                cursor[i * cols + j] += 1
-    return start, members
+    start, members = fill_buckets(np.hstack([first, last + 1]), rows, cols)
+    boxes = np.hstack([low, high])
+    return _Buckets(boxes, start, members, float(top), float(left), rows, cols)
 
 
 @compiled(parallel=True)
 def _locate(
-    elements: _Elements,
+    elements: ElementTable,
     buckets: _Buckets,
     row: FloatArray,
     col: FloatArray,
@@ -189,7 +130,7 @@ def _locate(
 
 @compiled()
 def _owner(
-    elements: _Elements, buckets: _Buckets, row: float, col: float
+    elements: ElementTable, buckets: _Buckets, row: float, col: float
 ) -> tuple[int, float, float]:
     """(element, xi, eta) of a point: first by Newton's method alone, then exhaustively."""
     i = np.floor((row - buckets.top) / _BUCKET_PX)
@@ -197,10 +138,10 @@ def _owner(
     if not (0 <= i < buckets.rows and 0 <= j < buckets.cols):
         return -1, np.nan, np.nan
     bucket = int(i) * buckets.cols + int(j)
-    triangular, middle = elements.triangular, 1.0 / 3.0 if elements.triangular else 0.0
+    triangular, middle = elements.triangular, elements.middle
     for exhaustively in (False, True):
         for e in buckets.members[buckets.start[bucket] : buckets.start[bucket + 1]]:
-            box = elements.boxes[e]
+            box = buckets.boxes[e]
             if not (box[0] <= row <= box[2] and box[1] <= col <= box[3]):
                 continue
             polynomial = elements.polynomials[e]
@@ -242,7 +183,7 @@ def _newton(
 
 @compiled(inline=True)
 def _residual(
-    elements: _Elements,
+    elements: ElementTable,
     e: int,
     s: float,
     t: float,

@@ -54,7 +54,7 @@ def render_rows_average(
     for (down, right), weight in zip(offsets, weights, strict=True):
         moved = PixelGrid(*grid.shape, h, float(grid.x0 + h * right), float(grid.y0 - h * down))
         elements = tabulate_elements(nodes, mesh.cells, mesh.element, moved)
-        start, visits = bands(elements.row_from, elements.row_to, grid.rows, _BAND)
+        start, visits = bands(elements, grid.rows, _BAND)
         order = in_turn(start.size - 1)
         _add(elements, place, pattern.table, background, start, visits, order,
              float(weight), np.ascontiguousarray(selected), total)  # fmt: skip

@@ -6,7 +6,6 @@ float TIFF, PNG and JPEG are read; what was changed on the way is in ``Photograp
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from modeharvest.imaging.photographs.files import (
-    LUMA,
-    luma,
-    read_stored,
-    require_grey_levels,
-    require_same_shape,
-    require_visible,
-)
+from modeharvest.imaging.photographs import files
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 
@@ -50,7 +42,6 @@ class Photograph:
     stored_bits : bits of a number in the file: 8, 16, or 32 or 64 for floats.
     full_scale : the grey level that counts as white: 2^bits - 1; for floats 1, or the largest level
         if that is above 1.
-    was_colour : whether it was made grey from colour.
     saturated, black : (rows, cols) True where a channel is at the level beyond which the camera or
         the file cuts off, or at 0.
     notes : sentences about what was changed when it was read.
@@ -61,7 +52,6 @@ class Photograph:
     bits: int
     stored_bits: int
     full_scale: float
-    was_colour: bool
     saturated: BoolArray
     black: BoolArray
     notes: tuple[str, ...] = ()
@@ -72,20 +62,9 @@ class Photograph:
         return self.image.shape[0], self.image.shape[1]
 
     @property
-    def saturated_share(self) -> float:
-        """Share of the pixels that are saturated [-]."""
-        return float(self.saturated.mean())
-
-    @property
     def contrast(self) -> float:
         """Standard deviation of the grey levels, as a share of full scale [-]."""
         return float(self.image.std(dtype=np.float64) / self.full_scale)
-
-    def rescaled(self, bits: int) -> Photograph:
-        """The same grey levels on the scale of ``bits`` bits (a darker frame of a series)."""
-        if bits == self.bits:
-            return self
-        return replace(self, bits=bits, full_scale=float(2**bits - 1))
 
 
 def read_photograph(path: Path | str) -> Photograph:
@@ -95,17 +74,18 @@ def read_photograph(path: Path | str) -> Photograph:
     tell of it. InputError, in one line that names the file: it is missing, damaged, not a picture
     of grey or colour levels, holds NaN or infinity, or every pixel has the same level.
     """
-    stored = read_stored(Path(path))
-    require_grey_levels(stored.levels, path)
-    levels = _without_equal_channels(stored.levels)
-    image = np.ascontiguousarray(luma(levels.astype(np.float32)))
-    require_visible(image, path)
-    was_colour = levels.ndim == 3
+    stored = files.read_stored(Path(path))
+    files.require_grey_levels(stored.levels, path)
+    levels = stored.levels
+    if levels.ndim == 3 and (levels == levels[..., :1]).all():  # grey, stored as colour
+        levels = levels[..., 0]
+    image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
+    files.require_visible(image, path)
     bits, full_scale = _scale(levels)
     saturated, black = _cut_off(levels, full_scale)
     notes = list(stored.notes)
-    if was_colour:
-        notes.append("Colour was turned to grey: {} R + {} G + {} B.".format(*LUMA))
+    if levels.ndim == 3:
+        notes.append("Colour was turned to grey: {} R + {} G + {} B.".format(*files.LUMA))
     if levels.dtype == np.uint16 and bits < 16:
         notes.append(f"Its 16-bit numbers fill {bits} bits.")
     return Photograph(
@@ -114,7 +94,6 @@ def read_photograph(path: Path | str) -> Photograph:
         bits=bits,
         stored_bits=8 * levels.dtype.itemsize,
         full_scale=full_scale,
-        was_colour=was_colour,
         saturated=saturated,
         black=black,
         notes=tuple(notes),
@@ -129,13 +108,13 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
     of the image) is saturated or black, or if there is nothing but noise.
     """
     notes = []
+    area, most = ("image", 0.95) if mask is None else ("material", MOSTLY)
     for name, where, remedy in (
         ("saturated", photograph.saturated, "a shorter exposure"),
         ("black", photograph.black, "a longer exposure, or the right mask"),
     ):
         share = float((where if mask is None else where[mask]).mean())
-        area = "image" if mask is None else "material"
-        if share > (MOSTLY if mask is not None else 0.95):
+        if share > most:
             raise InputError(
                 f"expected grey levels between black and white in {photograph.path}, got "
                 f"{100 * share:.1f} % of the {area} {name}; take it again with {remedy}"
@@ -154,22 +133,23 @@ def require_usable(photograph: Photograph, mask: BoolArray | None = None) -> tup
 
 def require_alike(reference: Photograph, frame: Photograph) -> Photograph:
     """The frame, its grey levels on the reference's scale; InputError for another size or depth."""
-    require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
+    files.require_same_shape(reference.image, frame.image, str(reference.path), str(frame.path))
     other = _other_depth(reference, frame)
     if other:
         raise InputError(
             f"expected photographs of one bit depth, got {_depth(reference)} in {reference.path} "
             f"and {_depth(frame)} in {frame.path}{other}; export them alike"
         )
-    if 0 in (reference.bits, frame.bits):
+    bits = max(reference.bits, frame.bits)
+    if frame.bits in (0, bits):  # else a darker frame of the series
         return frame
-    return frame.rescaled(max(reference.bits, frame.bits))
+    return replace(frame, bits=bits, full_scale=float(2**bits - 1))
 
 
 def read_reference(path: Path | str, mask: BoolArray | None = None) -> Photograph:
     """Read the reference and refuse it if it shows no pattern; see ``require_usable``."""
     reference = read_photograph(path)
-    return _with_notes(reference, require_usable(reference, mask))
+    return replace(reference, notes=reference.notes + require_usable(reference, mask))
 
 
 def read_frame(path: Path | str, reference: Photograph) -> Photograph:
@@ -179,7 +159,7 @@ def read_frame(path: Path | str, reference: Photograph) -> Photograph:
     depth: a sequence skips the frame, reports the line and goes on.
     """
     frame = require_alike(reference, read_photograph(path))
-    return _with_notes(frame, require_usable(frame))
+    return replace(frame, notes=frame.notes + require_usable(frame))
 
 
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:
@@ -195,10 +175,6 @@ def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> f
         return 0.0
     pairs = 0.5 * (np.mean(fine[1:] * fine[:-1]) + np.mean(fine[:, 1:] * fine[:, :-1]))
     return float(pairs / power)
-
-
-def _with_notes(photograph: Photograph, notes: tuple[str, ...]) -> Photograph:
-    return replace(photograph, notes=(*photograph.notes, *notes)) if notes else photograph
 
 
 def _other_depth(reference: Photograph, frame: Photograph) -> str:
@@ -221,25 +197,13 @@ def _depth(photograph: Photograph) -> str:
     return f"{photograph.bits} bits in {photograph.stored_bits}"
 
 
-def _without_equal_channels(levels: NDArray[Any]) -> NDArray[Any]:
-    """Grey that was stored as colour as (rows, cols)."""
-    if levels.ndim == 3 and (levels == levels[..., :1]).all():
-        return np.asarray(levels[..., 0])
-    return levels
-
-
 def _scale(levels: NDArray[Any]) -> tuple[int, float]:
     """Bits that the levels fill, and the level that counts as white."""
     top = float(levels.max())
     if levels.dtype.kind == "f":
         return 0, max(1.0, top)
-    stored = 8 * levels.dtype.itemsize
-    bits = next(b for b in _fitting(stored) if top <= 2**b - 1)
+    bits = next(b for b in _BITS if top <= 2**b - 1)
     return bits, float(2**bits - 1)
-
-
-def _fitting(stored: int) -> Iterable[int]:
-    return (stored,) if stored not in (8, 16) else (b for b in _BITS if b <= stored)
 
 
 def _cut_off(levels: NDArray[Any], full_scale: float) -> tuple[BoolArray, BoolArray]:

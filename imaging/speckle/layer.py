@@ -9,8 +9,7 @@ Gaussian are a trigonometric polynomial
 because the Gaussian's transfer function at the samples' Nyquist frequency is 3e-9 or less: for
 blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole
 pixels, a non-uniform FFT [2]_ at any other point, both to rounding. Where millions of points are
-needed, a B-spline of its waves is twenty times faster; unlike an interpolated image it comes with
-a proof of how far it may be off.
+needed, a B-spline of its waves is twenty times faster, and its error is proved to be small.
 
 References
 ----------
@@ -72,7 +71,6 @@ class BinaryField:
     blur_px : standard deviation of the Gaussian blur [px].
     levels : values outside and inside the second phase, before the blur.
     coverage : share of the area of the second phase [-].
-    seed : seed of the random numbers.
     """
 
     cycles_per_px: float
@@ -105,13 +103,11 @@ class Layer:
     def __init__(self, field: BinaryField, shape: tuple[int, int]) -> None:
         self.field, self.shape = field, shape
         rows, cols = (int(scipy.fft.next_fast_len(n, real=True)) for n in shape)
-        self.period: tuple[int, int] = (rows, cols)
-        self.samples: tuple[int, int] = (field.finer * rows, field.finer * cols)
+        self.period, self.samples = (rows, cols), (field.finer * rows, field.finer * cols)
         blur = field.finer * field.blur_px
         transfer = np.exp(-2.0 * (math.pi * blur) ** 2 * _squared_frequency(self.samples))
-        spectrum = scipy.fft.rfft2(self.binary())
-        spectrum *= transfer / math.prod(self.samples)
-        self._spectrum: ComplexArray = spectrum
+        self._spectrum: ComplexArray = scipy.fft.rfft2(self.binary())
+        self._spectrum *= transfer / math.prod(self.samples)
 
     def binary(self) -> FloatArray:
         """(rows, cols) of the samples: the two levels before the blur."""
@@ -160,18 +156,12 @@ class Layer:
     def _evaluate(
         self, row: ArrayLike, col: ArrayLike, eps: float, *, gradient: bool
     ) -> FloatArray:
-        row, col = np.broadcast_arrays(
-            np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
-        )
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         scale = 2.0 * math.pi / np.asarray(self.period)
         row_angle, col_angle = scale[0] * row.ravel(), scale[1] * col.ravel()
         modes, k_row, k_col = self._modes(eps)
-        if gradient:
-            modes = np.stack(
-                [1j * scale[0] * k_row[:, None] * modes, 1j * scale[1] * k_col[None, :] * modes]
-            )
-        else:
-            modes = modes[None]
+        along_row, along_col = 1j * scale[0] * k_row[:, None], 1j * scale[1] * k_col[None, :]
+        modes = np.stack([along_row * modes, along_col * modes]) if gradient else modes[None]
         if row_angle.size == 0:
             return np.zeros((len(modes), *row.shape))
         values = finufft.nufft2d2(

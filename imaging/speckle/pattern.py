@@ -2,11 +2,8 @@
 
 The one layer is a thresholded and blurred Gaussian field (see ``layer``). The second is ink that an
 air brush leaves on a powdered surface, as on the specimen of the paper's section "Real
-Experiments": the ink's own field i, 0 ... 1, darkens what it lies on,
-
-    I = p (1 - darkness i).
-
-Both are trigonometric polynomials, hence their product is; it is evaluated factor by factor.
+Experiments": the ink's own field i, 0 ... 1, darkens what it lies on, I = p (1 - darkness i). Both
+are trigonometric polynomials, hence their product is; it is evaluated factor by factor.
 """
 
 from __future__ import annotations
@@ -34,15 +31,13 @@ _WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations a
 
 @dataclass(frozen=True)
 class Ink:
-    """A second layer: dots of ink, thresholded from a Gaussian field of their own and blurred.
-
-    InputError if a value is out of its range.
+    """Dots of ink on the first layer, from a field of their own; InputError if out of range.
 
     standard_deviation : standard deviation of the Gaussian field's spectral density [cycles/px].
     blur_px : standard deviation of the Gaussian blur [px].
     coverage : share of the area under ink [-].
     darkness : share of the light that ink takes away [-].
-    seed : seed of the random numbers; streams differ from those of the layer below.
+    seed : of the random numbers; streams differ from those of the layer below.
     """
 
     standard_deviation: float = 0.05
@@ -121,21 +116,14 @@ def _require_band_limited(cycles_per_px: float, blur_px: float, what: str) -> No
 class Speckle:
     """One speckle pattern: exact intensities at whole pixels and anywhere between.
 
-    Parameters
-    ----------
-    spec, shape
-        What it looks like; (rows, cols) of the image it has to cover [px], see :class:`Layer`.
-
-    Attributes
-    ----------
-    period : (rows, cols) of the period [px].
+    ``shape`` (rows, cols) is that of the image to cover [px], see :class:`Layer`, ``period`` (rows,
+    cols) that after which it repeats itself [px].
     """
 
     def __init__(self, spec: SpeckleSpec, shape: tuple[int, int]) -> None:
         if min(shape) < 8:
             raise InputError(f"speckle: expected an image of at least 8 x 8 px, got {shape}")
-        self.spec = spec
-        self.shape = shape
+        self.spec, self.shape = spec, shape
         self._base = Layer(spec.binary_field, shape)
         self._ink = None if spec.ink is None else Layer(spec.ink.binary_field, shape)
         self._darkness = 0.0 if spec.ink is None else spec.ink.darkness
@@ -151,10 +139,9 @@ class Speckle:
         return self._product(lambda layer: layer.image(transfer))
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """Intensities at image positions (row, col) [px], of the positions' shape.
+        """Intensities at image positions (row, col) [px], of their shape; NaN where they are.
 
-        They are off by at most ``bound``, at most 6e-8 of full scale a layer, and in fact by
-        less than a hundredth of that; NaN where a position is.
+        Off by at most ``bound``, 6e-8 of full scale a layer; in fact by less than 1 % of that.
         """
         return self._product(lambda layer: layer(row, col))
 

@@ -81,17 +81,15 @@ class PeriodicSpline:
     def of(
         cls, spectrum: ComplexArray, period: tuple[int, int], tolerance: float
     ) -> PeriodicSpline:
-        """Make the spline of a real pattern.
+        """Make the spline of a real pattern by its waves c_k (rows, cols // 2 + 1), as of an FFT.
 
-        Parameters
-        ----------
-        spectrum, period : (rows, cols // 2 + 1) c_k in the layout of a real FFT; (rows, cols) of
-            the period [px].
-        tolerance : what the bound has to be, if 4 x 4 samples per pixel suffice for that.
+        ``period`` is (rows, cols) [px]; the bound is below ``tolerance`` if 4 x 4 samples per pixel
+        suffice for that.
         """
         size = np.abs(spectrum)
         for finer in _FINER:
-            fine = _fine_period(period, finer)
+            rows, cols = (math.ceil(finer * n) for n in period)
+            fine = (scipy.fft.next_fast_len(rows, True), scipy.fft.next_fast_len(cols, True))
             errors = [_wave_errors(n, m) for n, m in zip(period, fine, strict=True)]
             bound = _bound(size, errors[0], errors[1][: spectrum.shape[1]])
             if bound <= tolerance:
@@ -103,9 +101,7 @@ class PeriodicSpline:
 
     def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """Values at positions (row, col) [px], of the positions' shape; NaN where they are."""
-        row, col = np.broadcast_arrays(
-            np.asarray(row, dtype=np.float64), np.asarray(col, dtype=np.float64)
-        )
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         out = np.empty(row.size)
         _sample(self.table, row.ravel(), col.ravel(), out)
         return out.reshape(row.shape)
@@ -113,14 +109,8 @@ class PeriodicSpline:
     @property
     def table(self) -> SplineTable:
         """The spline as kernels take it."""
-        finer_row = (self.coefficients.shape[0] - DEGREE) / self.period[0]
-        finer_col = (self.coefficients.shape[1] - DEGREE) / self.period[1]
-        return SplineTable(self.coefficients, _weights(), finer_row, finer_col)
-
-
-def _fine_period(period: tuple[int, int], finer: float) -> tuple[int, int]:
-    rows, cols = (int(scipy.fft.next_fast_len(math.ceil(finer * n), real=True)) for n in period)
-    return rows, cols
+        finer = np.subtract(self.coefficients.shape, DEGREE) / self.period
+        return SplineTable(self.coefficients, _weights(), float(finer[0]), float(finer[1]))
 
 
 def _wave_errors(period: int, fine: int) -> FloatArray:

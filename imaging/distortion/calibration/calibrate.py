@@ -1,11 +1,9 @@
 """Optical distortion from photographs of a speckled flat target that a stage has shifted.
 
-A distortion S makes a rigid shift t look like t + S(x + t) - S(x): the apparent motion varies
-over the image, and S follows from how. All photographs are fitted at once, grey level by grey
-level (:mod:`modeharvest.imaging.distortion.calibration.fit`); the shifts are found along with S.
-
-Source of the idea: Maraghechi et al. 2019, the paper's reference for S. The fit is this
-project's own.
+A distortion S makes a rigid shift t look like t + S(x + t) - S(x): the apparent motion varies over
+the image, and S follows from how. All photographs are fitted at once, grey level by grey level
+(:mod:`modeharvest.imaging.distortion.calibration.fit`); the shifts are found along with S. Source
+of the idea: Maraghechi et al. 2019, the paper's reference for S; the fit is this project's own.
 """
 
 from __future__ import annotations
@@ -54,10 +52,8 @@ _LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
 class CalibrationOptions:
     """How to calibrate.
 
-    degrees : total degrees of S to compare, ascending, from 2 on, until the criterion rises two
-        times.
-    rotations : whether the target may turn a little between photographs; only where shifts are not
-        known.
+    degrees : of S, total, to compare, ascending, from 2 on, until the criterion rises two times.
+    rotations : whether the target may turn a little in photographs whose shifts are not known.
     blurs_px : blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
         correlation and S leave; the last makes the spline's noise independent of where between
         pixels it samples, which would else draw S towards half pixels.
@@ -98,15 +94,17 @@ def calibrate(
         directions.
     shifts : (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
         goes into S. Not needed: without them the affine part of S isn't observable and is zero.
-    options : how.
-    progress : listener.
     """
     options = options or CalibrationOptions()
     photographs = _checked(images)
     known = shifts is not None
     start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
     free = (not known, not known, not known and options.rotations)
-    report = _reporter(progress, len(options.blurs_px) + len(options.degrees))
+    steps, done = len(options.blurs_px) + len(options.degrees), itertools.count(1)
+
+    def report() -> None:
+        progress(next(done), steps, "calibrate")
+
     coarse, fit = _coarse_fit(
         photographs, normalised_illumination(photographs, start), free, options, report
     )
@@ -161,9 +159,10 @@ def _trials(
         c, views = fit.coefficients, with_poses(views, fit.poses)
         trials.append((model, fit))
         report()
-        if _has_risen_twice([fit.bic for _, fit in trials]):
+        criteria = [fit.bic for _, fit in trials]
+        if len(criteria) > 2 and criteria[-3] < criteria[-2] < criteria[-1]:
             break
-    best = int(np.argmin([fit.bic for _, fit in trials]))
+    best = int(np.argmin(criteria))
     model, fit = trials[best]
     settled = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
     trials[best] = model, settled
@@ -194,20 +193,14 @@ def _rough_shifts(photographs: Sequence[FloatImage]) -> FloatArray:
     """(m, 2) shifts since the first photograph [px], within some px, from binned photographs."""
     factor = max(1, max(photographs[0].shape) // _COARSE_PX)
     register: Any = phase_cross_correlation  # which has no types
-    small = [_binned(image, factor) for image in photographs]
-    everywhere = np.ones(small[0].shape, dtype=np.bool_)
-    found = np.zeros((len(small), 2))
-    for n, image in enumerate(small[1:], start=1):
-        found[n] = -register(
-            small[0], image, reference_mask=everywhere, moving_mask=everywhere, overlap_ratio=0.2
-        )[0]
-    return found * factor
-
-
-def _binned(image: FloatImage, factor: int) -> FloatImage:
-    rows, cols = (n // factor for n in image.shape)
-    blocks = image[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor)
-    return np.asarray(blocks.mean(axis=(1, 3)))
+    rows, cols = (n // factor for n in photographs[0].shape)
+    whole = np.s_[: rows * factor, : cols * factor]
+    blocks = [image[whole].reshape(rows, factor, cols, factor) for image in photographs]
+    first, *others = (block.mean(axis=(1, 3)) for block in blocks)
+    everywhere = np.ones((rows, cols), dtype=np.bool_)
+    options = {"reference_mask": everywhere, "moving_mask": everywhere, "overlap_ratio": 0.2}
+    found = [-register(first, image, **options)[0] for image in others]
+    return np.array([np.zeros(2), *found]) * factor
 
 
 def _views(
@@ -242,19 +235,6 @@ def _points(
     axes = [np.arange(a, b, stride) for a, b in zip(low, high, strict=True)]
     row, col = np.meshgrid(*axes, indexing="ij")
     return (row.ravel(), col.ravel()), stride
-
-
-def _reporter(progress: Progress, steps: int) -> Callable[[], None]:
-    done = itertools.count(1)
-
-    def report() -> None:
-        progress(next(done), steps, "calibrate")
-
-    return report
-
-
-def _has_risen_twice(values: Sequence[float]) -> bool:
-    return len(values) > 2 and values[-3] < values[-2] < values[-1]
 
 
 def _require_matches(fit: Fit) -> None:

@@ -46,12 +46,9 @@ class Pose:
 
     def stepped(self, step: FloatArray) -> Pose:
         """Add the five unknowns' changes."""
-        return Pose(
-            (self.shift[0] + float(step[0]), self.shift[1] + float(step[1])),
-            self.angle + float(step[2]),
-            self.contrast + float(step[3]),
-            self.brightness + float(step[4]),
-        )
+        now = (*self.shift, self.angle, self.contrast, self.brightness)
+        row, col, *others = (float(value) for value in np.add(now, step))
+        return Pose((row, col), *others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +59,7 @@ class View:
     pose : where the target is in it.
     free : (5,) whether shift (2), rotation, contrast and brightness are unknown.
     distorted : False if the photograph has no distortion, as one of a known pair.
-    border_px : width of the margin that is left out: spline and blur know only its mirror image
-        [px].
+    border_px : width of the margin left out [px]: spline and blur know only its mirror image.
     """
 
     spline: SplineImage
@@ -125,8 +121,7 @@ class Fit:
     inverse : (K, K) inverse of the normal matrix: of the coefficients, then of each view's
         unknowns.
     free : (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
-    sum_of_squares, freedom : scatter about the mean [grey levels squared], and its degrees of
-        freedom.
+    sum_of_squares, freedom : scatter about the mean [grey levels squared], its degrees of freedom.
     matches : (views,) correlation of each photograph with the mean of the others [-].
     iterations, converged : how many steps, and whether the last one was short enough.
     condition_number : of the normal matrix, scaled to a unit diagonal.
@@ -178,9 +173,9 @@ def fit_views(
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        equations = _assemble(model, c, views, poses, points)
-        eigen = ScaledEigen.of(equations.matrix)
-        step = -eigen.solve(equations.gradient)
+        matrix, gradient, squares, freedom, matches = _assemble(model, c, views, poses, points)
+        eigen = ScaledEigen.of(matrix)
+        step = -eigen.solve(gradient)
         own = np.zeros(free.shape)
         own[free] = step[len(c) :]
         c = c + step[: len(c)]
@@ -193,31 +188,13 @@ def fit_views(
         poses=tuple(poses),
         inverse=eigen.inverse(),
         free=free,
-        sum_of_squares=equations.sum_of_squares,
-        freedom=max(1, equations.freedom - len(step)),
-        matches=equations.matches,
+        sum_of_squares=squares,
+        freedom=max(1, freedom - len(step)),
+        matches=matches,
         iterations=iterations,
         converged=bool(length < tolerance_px),
         condition_number=eigen.condition_number,
     )
-
-
-@dataclass
-class _Equations:
-    matrix: FloatArray
-    gradient: FloatArray
-    sum_of_squares: float
-    freedom: int
-    matches: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _ViewSample:
-    """A view at some points: grey levels v and their derivatives, 0 where it doesn't show them."""
-
-    inside: NDArray[np.bool_]
-    value: FloatArray
-    columns: FloatArray
 
 
 def _assemble(
@@ -226,18 +203,17 @@ def _assemble(
     views: Sequence[View],
     poses: Sequence[Pose],
     points: tuple[FloatArray, FloatArray],
-) -> _Equations:
-    """Normal equations of the scatter about the mean, chunk by chunk."""
-    k = len(c)
-    last = k + np.cumsum([sum(view.free) for view in views])
-    where = [
-        np.r_[np.arange(k), np.arange(end - sum(view.free), end)]
-        for view, end in zip(views, last, strict=True)
-    ]
-    size = int(last[-1])
-    matrix, gradient = np.zeros((size, size)), np.zeros(size)
-    squares, freedom = 0.0, 0
-    sums = np.zeros((len(views), 6))  # what each view's correlation with the mean needs
+) -> tuple[FloatArray, FloatArray, float, int, FloatArray]:
+    """Normal equations of the scatter about the mean, chunk by chunk: matrix and gradient.
+
+    And its sum of squares, the degrees of freedom, and each view's correlation with the mean.
+    """
+    k, own = len(c), [sum(view.free) for view in views]
+    ends = k + np.cumsum(own)
+    where = [np.r_[:k, end - n : end] for n, end in zip(own, ends, strict=True)]
+    size = int(ends[-1])
+    matrix, gradient, squares, freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0
+    sums = np.zeros((len(views), 6))  # of 1, a, b, a^2, b^2, a b: a view, and the mean of others
     distortion = model.distortion(c)
     for first in range(0, points[0].size, _CHUNK):
         row, col = (a[first : first + _CHUNK] for a in points)
@@ -245,24 +221,23 @@ def _assemble(
             _sample(model, c, distortion, view, pose, row, col)
             for view, pose in zip(views, poses, strict=True)
         ]
-        count = np.sum([sample.inside for sample in samples], axis=0)
+        count = np.sum([inside for inside, _, _ in samples], axis=0)
         weight = 1.0 / np.maximum(count, 1)
-        mean = weight * np.sum([sample.value for sample in samples], axis=0)
+        mean = weight * np.sum([value for _, value, _ in samples], axis=0)
         shared = count > 1
         total = np.zeros((size, row.size))
-        for n, (sample, at) in enumerate(zip(samples, where, strict=True)):
-            used = sample.inside & shared
-            deviation = np.where(used, sample.value - mean, 0.0)
-            columns = sample.columns * used
+        for n, ((inside, value, slopes), at) in enumerate(zip(samples, where, strict=True)):
+            used = inside & shared
+            deviation, columns = np.where(used, value - mean, 0.0), slopes * used
             matrix[np.ix_(at, at)] += columns @ columns.T
             gradient[at] += columns @ deviation
             total[at] += columns
             squares += float(deviation @ deviation)
-            others = (mean * count - sample.value)[used] / (count[used] - 1)
-            sums[n] += _moments(sample.value[used], others)
+            a, b = value[used], (mean * count - value)[used] / (count[used] - 1)
+            sums[n] += a.size, a.sum(), b.sum(), a @ a, b @ b, a @ b
         matrix -= (total * weight) @ total.T
         freedom += int((count[shared] - 1).sum())
-    return _Equations(matrix, gradient, squares, freedom, _correlations(sums))
+    return matrix, gradient, squares, freedom, _correlations(sums)
 
 
 def _sample(
@@ -273,7 +248,8 @@ def _sample(
     pose: Pose,
     row: FloatArray,
     col: FloatArray,
-) -> _ViewSample:
+) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    """Where a view shows the points; grey levels and their derivatives, 0 elsewhere."""
     rows, cols = view.spline.shape
     arm_row, arm_col = row - 0.5 * (rows - 1), col - 0.5 * (cols - 1)
     cos, sin = np.cos(pose.angle), np.sin(pose.angle)
@@ -295,11 +271,7 @@ def _sample(
     columns[len(c) :] = [*slope, slope[0] * turn_row + slope[1] * turn_col, value, inside]
     kept = np.r_[np.ones(len(c), np.bool_), view.free]
     normalised = np.where(inside, pose.contrast * value + pose.brightness, 0.0)
-    return _ViewSample(inside, normalised, columns[kept])
-
-
-def _moments(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.array([a.size, a.sum(), b.sum(), a @ a, b @ b, a @ b])
+    return inside, normalised, columns[kept]
 
 
 def _correlations(sums: FloatArray) -> FloatArray:

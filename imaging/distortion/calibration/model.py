@@ -1,7 +1,4 @@
-"""Distortions with unknown coefficients, for a calibration to find.
-
-A model turns its coefficients into a distortion and says how S depends on them.
-"""
+"""Distortions with unknown coefficients, for a calibration to find."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from modeharvest.util.errors import InputError
 
 
 class DistortionModel(Protocol):
-    """Distortions with unknown coefficients c."""
+    """Turns coefficients c into a distortion, and says how S depends on them."""
 
     @property
     def start(self) -> FloatArray:
@@ -94,8 +91,7 @@ class CameraModel:
     """A camera, some parameters of which are unknown.
 
     camera : the parameters that are known, and where the unknown ones begin.
-    unknown : names among cx, cy and k1 ... p2. The focal lengths are not: another f with other k is
-        the same S.
+    unknown : names among cx, cy and k1 ... p2; not focal lengths: another f with other k is that S.
     """
 
     camera: CameraDistortion
@@ -126,8 +122,7 @@ class CameraModel:
 
     def sensitivities(self, c: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
         """(2, k, n) derivatives of S(row, col) [px] with respect to the parameters."""
-        camera = self.distortion(c)
-        model = CameraModel(camera, self.unknown)
+        model = replace(self, camera=self.distortion(c))
         return np.stack([model._coefficient(name, row, col) for name in self.unknown], axis=1)
 
     def _coefficient(self, name: str, row: FloatArray, col: FloatArray) -> FloatArray:

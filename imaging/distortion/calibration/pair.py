@@ -60,12 +60,14 @@ def recover_camera(
     """
     images = checked_images((undistorted, distorted), ("undistorted", "distorted"))
     rows, cols = images[0].shape
-    model = model or _unknown_camera(rows, cols)
+    focal = float(max(rows, cols))
+    camera = CameraDistortion(focal, focal, 0.5 * (cols - 1), 0.5 * (rows - 1))
+    model = model or CameraModel(camera)
     # Far from the solution a cubic is led less astray than a camera or a high degree.
     coarse: DistortionModel = PolynomialModel((rows, cols), _COARSE_DEGREE, fixed=0)
     c, poses = coarse.start, normalised_illumination(images)
+    at, _ = _points(rows, cols, _COARSE_POINTS, mask)
     for blur in _BLURS_PX[:-1]:
-        at, _ = _points(rows, cols, _COARSE_POINTS, mask)
         fit = fit_views(coarse, c, _views(images, poses, blur, order, False), at, 0.02, 10)
         c = fit.coefficients
     at, stride = _points(rows, cols, points, mask)
@@ -75,8 +77,7 @@ def recover_camera(
     if fit.matches.min() < 0.5 or not fit.converged:
         raise InputError(
             "expected two images of one scene, without and with distortion, got a pair whose grey "
-            f"levels correlate by {fit.matches.min():.2f} only; check the files, or try another "
-            "model"
+            f"levels correlate by {fit.matches.min():.2f} only; check files, or try another model"
         )
     return LensEstimate.of(model, fit, sampled_noise(_BLURS_PX[-1], order, stride))
 
@@ -106,11 +107,6 @@ def _nearest(model: DistortionModel, distortion: Distortion, shape: tuple[int, i
 
     found = least_squares(misfit, model.start / scale, slope, method="lm")
     return np.asarray(found.x * scale)
-
-
-def _unknown_camera(rows: int, cols: int) -> CameraModel:
-    focal = float(max(rows, cols))
-    return CameraModel(CameraDistortion(focal, focal, 0.5 * (cols - 1), 0.5 * (rows - 1)))
 
 
 def _points(

@@ -27,18 +27,14 @@ _FINE = 16
 def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, float]:
     """Variance of a sample, and of the mean of many samples, of white noise of variance 1.
 
+    The former is the mean over all positions between pixels; the latter that times how much
+    neighbouring samples have in common: the variance that a field sees that varies slowly from
+    sample to sample. It is 1 for a stride of 1 px: no information is lost there.
+
     Parameters
     ----------
-    blur_px, order : standard deviation of the blur before the spline [px]; the spline's order, 3 or
-        5.
+    blur_px, order : standard deviation of the blur before the spline [px]; its order, 3 or 5.
     stride_px : distance between samples along rows and columns [px].
-
-    Returns
-    -------
-    one, many
-        Mean variance of a sample over all positions between pixels; and that times how much
-        neighbouring samples have in common: the variance that a field sees that varies slowly
-        from sample to sample. ``many`` is 1 for a stride of 1 px: no information is lost there.
     """
     lags, correlations = sampled_correlations(blur_px, order, stride_px)
     one = float(correlations[lags == 0.0].sum())
@@ -71,10 +67,8 @@ class LensEstimate:
     coefficients, covariance : (k,) and (k, k) of the model's unknowns.
     model : which these are.
     noise_sd : noise of an image, estimated from the residual [grey levels].
-    matches : (m,) correlation of each image with the mean of the others, the distortion taken out
-        [-].
-    bic : Bayesian information criterion; of two models of one set take that with the lower one. NaN
-        if it was not kept.
+    matches : (m,) correlation of each image with the mean of the others, without distortion [-].
+    bic : Bayesian information criterion, the lower the better, of one set; NaN if not kept.
     """
 
     distortion: Distortion
@@ -140,8 +134,7 @@ class Calibration(LensEstimate):
     distortion, model : S; the model's ``fixed`` terms could not be observed and are zero.
     shifts, shifts_sd : (m, 2) motion of the target since the first photograph, along rows and
         columns [px], and its standard deviation; 0 where given.
-    angles, angles_sd : (m,) its rotation, from the columns' to the rows' axis [rad], and its
-        standard deviation.
+    angles, angles_sd : (m,) likewise its rotation, from the columns' to the rows' axis [rad].
     trials : one for each degree.
     """
 
@@ -160,10 +153,8 @@ def calibration_of(
     """Choose the degree with the lowest BIC; ``noise`` is what :func:`sampled_noise` gives."""
     model, fit = min(trials, key=lambda trial: trial[1].bic)
     one, many = noise
-    own = np.zeros(fit.free.shape)
-    own[fit.free] = np.sqrt(
-        np.diag(fit.inverse * (fit.variance * many / one))[len(fit.coefficients) :]
-    )
+    own, covariance = np.zeros(fit.free.shape), fit.inverse * (fit.variance * many / one)
+    own[fit.free] = np.sqrt(np.diag(covariance)[len(fit.coefficients) :])
     return Calibration(
         **vars(LensEstimate.of(model, fit, noise)),
         shifts=np.array([pose.shift for pose in fit.poses]),
