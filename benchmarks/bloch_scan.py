@@ -54,7 +54,7 @@ def cost(per_pitch: int, ratio: float) -> str:
     state = CellPath(cell, uniaxial()).at(0.002)
     assert state is not None
     points, _ = zone_path(ZONES["oblique"], cell.cell.lattice, POINTS)
-    matrix = BlochWaves(cell, state).stiffness.at((0.7, 2.1))
+    matrix = BlochWaves(cell, state).stiffness((0.7, 2.1))
 
     def factorisations(order: str) -> Callable[[], None]:
         return lambda: [factorise(matrix, order) for _ in range(POINTS)] and None

@@ -83,17 +83,13 @@ def gather_nodes(V: Any, values: NDArray[np.float64], count: int) -> NDArray[np.
     ``values`` is the local array of a function of the vector space ``V`` (quadratic, as the
     geometry). Every rank gets the whole array.
     """
-    mesh = V.mesh
-    given = np.asarray(mesh.geometry.input_global_indices)
-    result = np.zeros((count, 2))
-    owned = np.zeros((count, 1))
-    geometry = mesh.geometry  # "dofmap" became "dofmaps", one for each cell type, in 0.10
+    geometry = V.mesh.geometry  # "dofmap" became "dofmaps", one for each cell type, in 0.10
     dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
-    nodes, dofs = dofmap.ravel(), V.dofmap.list.ravel()
-    result[given[nodes]] = values.reshape(-1, 2)[dofs]
-    owned[given[nodes]] = 1.0
-    mesh.comm.Allreduce(MPI.IN_PLACE, result)
-    mesh.comm.Allreduce(MPI.IN_PLACE, owned)
+    nodes = np.asarray(geometry.input_global_indices)[dofmap.ravel()]
+    result, owned = np.zeros((count, 2)), np.zeros((count, 1))
+    result[nodes], owned[nodes] = values.reshape(-1, 2)[V.dofmap.list.ravel()], 1.0
+    V.mesh.comm.Allreduce(MPI.IN_PLACE, result)
+    V.mesh.comm.Allreduce(MPI.IN_PLACE, owned)
     return np.asarray(result / owned)
 
 

@@ -141,10 +141,7 @@ class Solution:
         return Specimen(**self.info["specimen"])
 
     def at(self, nominal_strain: float) -> Snapshot:
-        """The stable snapshot at a nominal strain (the first one listed, if several).
-
-        An InputError names the strains there are if there is none.
-        """
+        """The stable snapshot at a nominal strain, the first if several; InputError without one."""
         found = [s for s in self.snapshots if abs(s.nominal_strain - nominal_strain) < 1e-9]
         if not found:
             have = ", ".join(f"{s.nominal_strain:.4f}" for s in self.snapshots) or "none"

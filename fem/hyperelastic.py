@@ -25,9 +25,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _THREE_POINTS = {"quadrature_degree": 2}  # on a triangle: the three-point Gauss rule
-_CORNERS_AND_MIDDLES = np.array(
-    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]
-)
+_CORNERS_AND_MIDDLES = 0.5 * np.array([[0, 0], [2, 0], [0, 2], [1, 1], [0, 1], [1, 0]])
 
 
 class Hyperelastic:
@@ -45,9 +43,8 @@ class Hyperelastic:
         self.V = dolfinx.fem.functionspace(domain, ("Lagrange", 2, (2,)))
         self.u = dolfinx.fem.Function(self.V)
         test, trial = ufl.TestFunction(self.V), ufl.TrialFunction(self.V)
-        dx = ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
         F = ufl.Identity(2) + ufl.grad(self.u)
-        energy = material.energy(F) * dx
+        energy = material.energy(F) * ufl.Measure("dx", domain=domain, metadata=_THREE_POINTS)
         self._forces: Any = ufl.derivative(energy, self.u, test)
         form = dolfinx.fem.form
         self.energy: Any = form(energy)
@@ -55,8 +52,7 @@ class Hyperelastic:
         self.stiffness: Any = form(ufl.derivative(self._forces, self.u, trial))
         self.mass: Any = form(ufl.inner(trial, test) * ufl.dx(domain))
         self._det_f = dolfinx.fem.Expression(ufl.det(F), _CORNERS_AND_MIDDLES)
-        count = domain.topology.index_map(2).size_local
-        self._own_cells = np.arange(count, dtype=np.int32)
+        self._own_cells = np.arange(domain.topology.index_map(2).size_local, dtype=np.int32)
 
     def stiffness_along(self, direction: dolfinx.fem.Function) -> Any:
         """The form of the stiffness times a displacement: how forces change along it."""
@@ -75,14 +71,10 @@ class FreeBody:
         self.mesh = mesh
         self._forms = Hyperelastic(mesh, material, MPI.COMM_SELF)
         self._V = self._forms.V
-        size = 2 * len(mesh.nodes)
-        numbers = np.arange(size, dtype=np.float64)
+        count = len(mesh.nodes)
+        numbers = dolfinx_api.gather_nodes(self._V, np.arange(2 * count, dtype=np.float64), count)
         # Position in dolfinx's order of every component in the order of the nodes.
-        self._order = (
-            np.rint(dolfinx_api.gather_nodes(self._V, numbers, len(mesh.nodes)))
-            .astype(np.int64)
-            .ravel()
-        )
+        self._order = np.rint(numbers).astype(np.int64).ravel()
         self._tangent: Any = None
 
     def energy(self, u: FloatArray) -> float:
@@ -115,8 +107,6 @@ class FreeBody:
 
     def _reordered(self, matrix: Any) -> csr_array:
         indptr, indices, values = matrix.getValuesCSR()
-        place = np.empty_like(self._order)
-        place[self._order] = np.arange(len(place))
+        place = np.argsort(self._order)
         rows = np.repeat(place, np.diff(indptr))
-        size = len(place)
-        return csr_array((values, (rows, place[indices])), shape=(size, size))
+        return csr_array((values, (rows, place[indices])), shape=(len(place),) * 2)

@@ -43,10 +43,7 @@ class PixelQuadrature:
 def integrate(
     scene: ImagedState, aperture: Aperture, mask: BoolArray
 ) -> tuple[FloatArray, PixelQuadrature]:
-    """(rows, cols) intensity averaged over every pixel's aperture, and how.
-
-    ``mask`` tells material (at pixel centres) from background.
-    """
+    """(rows, cols) intensity averaged over pixels' apertures, and how; ``mask``: material."""
     near = near_edges(mask, aperture.reach_px)
     inside = mask & ~near
     image = np.full(mask.shape, scene.background)
@@ -123,10 +120,7 @@ class ImageRecord:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A lens and a sensor that expose images into a folder.
-
-    ``points`` are the ideal positions that the pixels show; None for a perfect lens.
-    """
+    """A lens and a sensor; ``points`` are the ideal ones that pixels show, None without a lens."""
 
     spec: ImagingSpec
     points: Positions | None

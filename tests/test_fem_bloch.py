@@ -84,7 +84,7 @@ def critical(kind: str, loading: str) -> LatticeCritical:
 
 
 def dense(waves: BlochWaves, wave: Wave) -> FloatArray:
-    matrices = (waves.stiffness.at(wave).toarray(), waves.cell.mass.at(wave).toarray())
+    matrices = (waves.stiffness(wave).toarray(), waves.cell.mass(wave).toarray())
     return np.asarray(eigh(*matrices, eigvals_only=True))
 
 
@@ -104,7 +104,7 @@ def test_the_reduced_matrix_is_the_product_with_the_transformation(kind: str, wa
     waves = waves_of(kind, 0.02)
     T = transformation(waves, wave)
     product = T.conj().T @ (waves.state.stiffness @ T)
-    assert np.allclose(waves.stiffness.at(wave).toarray(), product, atol=1e-12)
+    assert np.allclose(waves.stiffness(wave).toarray(), product, atol=1e-12)
     x = np.random.default_rng(1).standard_normal(T.shape[1])
     moved = waves.cell.reduction.displacement(x, wave)
     assert np.allclose(moved.ravel(), T @ x, atol=1e-13)
@@ -119,7 +119,7 @@ def test_lowest_eigenvalues_and_their_signs_are_those_of_the_dense_matrix(
     found = waves.lowest(wave, count=4)
     assert np.allclose(found.eigenvalues, exact[:4], rtol=1e-7, atol=1e-9)
     assert waves.unstable(wave) == np.sum(exact < 0)
-    K, mass = waves.stiffness.at(wave), waves.cell.mass.at(wave)
+    K, mass = waves.stiffness(wave), waves.cell.mass(wave)
     residual = K @ found.vectors[:, 0] - found.eigenvalues[0] * (mass @ found.vectors[:, 0])
     assert np.linalg.norm(residual) < 1e-4 * np.linalg.norm(K @ found.vectors[:, 0] + 1.0)
 
@@ -130,7 +130,7 @@ def test_condensing_the_interior_leaves_the_inverse_as_it_is(kind: str, wave: Wa
     waves = waves_of(kind, 0.01)
     solver = Condensation(waves.state.stiffness, waves.cell.reduction.boundary).at(np.array([wave]))
     assert solver is not None
-    K = waves.stiffness.at(wave)
+    K = waves.stiffness(wave)
     x = np.random.default_rng(2).standard_normal((K.shape[0], 3)).astype(K.dtype)
     assert np.allclose(solver.solve((K @ x)[:, None])[:, 0], x, atol=1e-9)
 
@@ -240,7 +240,7 @@ def test_the_corners_of_the_hexagonal_zone_are_where_geometry_has_them() -> None
 
 def test_inertia_counts_negative_eigenvalues_and_refuses_to_guess() -> None:
     waves = waves_of("square", 0.02)
-    K, mass = waves.stiffness.at(GENERAL), waves.cell.mass.at(GENERAL)
+    K, mass = waves.stiffness(GENERAL), waves.cell.mass(GENERAL)
     middle = float(dense(waves, GENERAL)[6:8].mean())
     assert negative_pivots(factorise(K - middle * mass)) == 7
 

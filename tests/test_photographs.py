@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from modeharvest.imaging.photographs.files import _upright
+from modeharvest.imaging.photographs.files import LUMA, _upright
 from modeharvest.imaging.photographs.photograph import (
-    LUMA,
     neighbour_correlation,
     read_frame,
     read_photograph,

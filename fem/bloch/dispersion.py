@@ -67,10 +67,7 @@ class ZoneMap:
 
     @property
     def least_stable(self) -> tuple[float, Wave]:
-        """The eigenvalue [N/mm^4] and phases [rad] where lambda / |k|^2 is lowest, Γ left out.
-
-        |k| is that of the shortest of the equivalent wave vectors.
-        """
+        """The eigenvalue [N/mm^4] and phases [rad] of the lowest lambda / |k|^2, Γ left out."""
         half = self.phases[1:]  # -pi and pi are the same
         turns = 2.0 * _PI * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
         grid = np.stack(np.meshgrid(half, half, indexing="ij"), axis=-1)

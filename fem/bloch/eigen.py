@@ -100,7 +100,7 @@ class BlochWaves:
     def unstable(self, wave: Wave) -> int:
         """Number of negative eigenvalues, by the inertia of one factor; not for Γ itself."""
         self.factorisations += 1
-        return negative_pivots(factorise(self.stiffness.at(wave_of(wave))))
+        return negative_pivots(factorise(self.stiffness(wave_of(wave))))
 
     def unstable_among(self, points: Sequence[Wave]) -> tuple[Wave, ...]:
         """Those wave vectors, not Γ, at which K is not positive definite: proven by Cholesky."""
@@ -173,10 +173,7 @@ class BlochWaves:
 
 
 def scan(waves: BlochWaves, points: Sequence[Wave], count: int = 1) -> FloatArray:
-    """(n, count) lowest eigenvalues at many wave vectors [N/mm^4].
-
-    All of them are iterated together, and each factorises but a small dense matrix.
-    """
+    """(n, count) lowest eigenvalues at many wave vectors, iterated together [N/mm^4]."""
     phases = phases_of(points)
     values = np.empty((len(points), count))
     for group in _groups(phases):

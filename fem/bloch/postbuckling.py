@@ -72,7 +72,7 @@ class _Tracing:
         shapes, material = modes.shapes.reshape(len(mix), -1), 0.5 * float(mass.sum())
         # (m, size): times the fluctuation they are the amplitudes of the modes.
         self.weights = reduction.restricted(np.asarray(mass @ shapes.T)).T / material
-        self.mass = self.cell.mass.at(CENTRE) / material
+        self.mass = self.cell.mass(CENTRE) / material
         below = path.at((1.0 - _BEFORE) * modes.load)
         self.primary = CellPath(self.cell, self.loading, [] if below is None else [below])
         self.points: list[BranchPoint] = []

@@ -40,10 +40,7 @@ class LeastStable:
 
 
 class Zone:
-    """The measure of stability over all wave vectors of a cell.
-
-    An even number of ``divisions`` of each axis has the points M and X on the grid.
-    """
+    """Stability over all waves; an even number of ``divisions`` has the points M and X."""
 
     def __init__(self, cell: PeriodicCell, divisions: int) -> None:
         self.cell = cell

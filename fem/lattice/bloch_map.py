@@ -177,8 +177,7 @@ class Reduction:
 
         ``bloch_map`` has the components of the mesh's nodes as copies of the reduced unknowns.
         """
-        components = 2 * np.repeat(self.periodicity.master, 2)
-        components[1::2] += 1
+        components = (2 * self.periodicity.master[:, None] + np.arange(2)).ravel()
         places = np.argsort(self.order)[components]
         shift = np.repeat(self.periodicity.shift, 2, axis=0)
         self.bloch_map = BlochMap(places, shift)
@@ -191,9 +190,13 @@ class Reduction:
         self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         self._entries = ShiftedEntries(shift[columns] - shift[rows], entry, len(entries))
 
-    def reduced(self, matrix: csr_array) -> Reduced:
-        """The matrix (of the pattern this was made for), ready for any wave vector."""
-        return Reduced(self, self._entries, self._entries.summed(matrix.data))
+    def reduced(self, matrix: csr_array) -> Callable[[Wave], csc_array]:
+        """T(k)^H K T(k), Hermitian, as a function of the phases [rad], real at multiples of pi.
+
+        K is of the pattern that this was made for.
+        """
+        blocks = self._entries.summed(matrix.data)
+        return lambda wave: self.assembled(self._entries.at(blocks, np.array([wave]))[0])
 
     def assembled(self, data: NDArray[Any]) -> csc_array:
         """The sparse matrix with these entries."""
@@ -211,20 +214,8 @@ class Reduction:
 
     def restricted(self, forces: FloatArray) -> FloatArray:
         """T(0)^T f for f (2 n,) or (2 n, m)."""
-        T = self.bloch_map.at(np.array([CENTRE]))
-        result = T.restrict(forces.reshape(len(forces), 1, -1))
+        result = self.bloch_map.at(np.array([CENTRE])).restrict(forces.reshape(len(forces), 1, -1))
         return result.reshape(self.size, *forces.shape[1:])
-
-
-class Reduced:
-    """One matrix K as T(k)^H K T(k), a function of the phases k = (k . a1, k . a2) [rad]."""
-
-    def __init__(self, reduction: Reduction, entries: ShiftedEntries, blocks: FloatArray) -> None:
-        self._reduction, self._entries, self._blocks = reduction, entries, blocks
-
-    def at(self, wave: Wave) -> csc_array:
-        """The Hermitian matrix; real where both phases are multiples of pi."""
-        return self._reduction.assembled(self._entries.at(self._blocks, np.array([wave]))[0])
 
 
 def factorise(matrix: csc_array, order: str = "NATURAL") -> Any:
@@ -284,14 +275,11 @@ class CondensedWaves:
         whole, dofs = self._whole, self._whole.dofs
         relaxed = applied(whole.factor.solve, forces[dofs.interior_places])
         reaction = self._T.restrict(applied(whole.transposed.__matmul__, relaxed))
-        complement = self._solved(forces[dofs.boundary_places] - reaction)
+        complement = forces[dofs.boundary_places] - reaction
+        for k, factor in enumerate(self._factors):
+            complement[:, k] = cho_solve(factor, complement[:, k], check_finite=False)
         result = np.empty_like(forces)
         result[dofs.boundary_places] = complement
         moved = applied(whole.response.__matmul__, self._T.expand(complement))
         result[dofs.interior_places] = relaxed - moved
         return result
-
-    def _solved(self, forces: Batch) -> Batch:
-        for k, factor in enumerate(self._factors):
-            forces[:, k] = cho_solve(factor, forces[:, k], check_finite=False)
-        return forces

@@ -64,10 +64,7 @@ class Amplitude:
 
 
 class LinearisedCell:
-    """The equations of a cell at a trial state of load [-], F̄ (4,) and w (2 count,) [mm].
-
-    With a prescribed amplitude the load is an unknown.
-    """
+    """The equations of a cell at a trial state of load [-], F̄ (4,) and w (2 count,) [mm]."""
 
     def __init__(
         self,
@@ -228,10 +225,7 @@ class PeriodicCell:
         fluctuation: FloatArray,
         amplitude: Amplitude | None = None,
     ) -> CellState | Failure:
-        """The equilibrium that Newton's method finds from a guess of F̄ (2, 2) and w.
-
-        With an ``amplitude`` prescribed the load is a guess, too.
-        """
+        """The equilibrium near a guess of F̄ (2, 2), w and, with an amplitude, the load."""
         F: FloatArray = gradient.ravel()
         w = fluctuation
         for _ in range(_ITERATIONS):
@@ -264,7 +258,7 @@ class PeriodicCell:
         """Factorise the stiffness (2 n, 2 n) of the free fluctuations; RuntimeError if singular."""
         self.factorisations += 1
         dofs = np.flatnonzero(self.free_dofs)
-        return factorise(csc_array(self.reduction.reduced(stiffness).at(CENTRE)[dofs][:, dofs]))
+        return factorise(csc_array(self.reduction.reduced(stiffness)(CENTRE)[dofs][:, dofs]))
 
     def displaced(self, gradient: FloatArray, fluctuation: FloatArray) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes for F̄ (4,) and w (2 count,) [mm]."""
@@ -281,10 +275,7 @@ class CellPath:
     states: list[CellState] = field(default_factory=list)
 
     def at(self, load: float) -> CellState | None:
-        """The equilibrium at a load [-], from the nearest state known by as many steps as needed.
-
-        None where steps down to 1e-6 don't converge.
-        """
+        """The equilibrium at a load [-], from the nearest known; None if steps of 1e-6 fail."""
         if not self.states:
             start = self.cell.equilibrium(self.loading, 0.0)
             if start is None:

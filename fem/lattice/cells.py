@@ -6,13 +6,12 @@ that partner nodes agree to rounding and the mesh has the lattice's own symmetri
 The paper shows a chiral metamaterial without its measures, so that geometry is this project's own
 choice: that of Prall & Lakes (1997), doi 10.1016/S0020-7403(96)00025-2, with six ligaments or four:
 
-- Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest
-  neighbours by straight ligaments of constant thickness.
-- A ligament's outer edge is tangent to the outer edge of the ring at either end, on opposite
-  sides of the line between the centres. So a ring turns when its ligaments are pushed.
-- No fillets: where a ligament's inner edge meets a ring, the boundary has a sharp notch, at
-  which strains are singular. Energies and eigenvalues therefore converge more slowly with the
-  mesh than those of round holes.
+- Rings (annuli) sit on a hexagonal or square lattice. Each is tied to all its nearest neighbours by
+  straight ligaments of constant thickness.
+- A ligament's outer edge is tangent to the outer edge of the ring at either end, on opposite sides
+  of the line between the centres. So a ring turns when its ligaments are pushed.
+- No fillets: at the notch where a ligament's inner edge meets a ring, strains are singular, so
+  energies and eigenvalues converge more slowly with the mesh than those of round holes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Total-Lagrangian equilibrium of a loaded specimen (dolfinx): forms and LDL^T factor.
 
-The nominal strain e is the only load: constrained displacements are e * d with a fixed
-direction d. Everything a path follower asks of the structure is here: residual, tangent,
-load direction, energy, reaction, mass; how the path is followed is in ``continuation``.
+The nominal strain e is the only load: constrained displacements are e * d with a fixed direction d.
 """
 
 from __future__ import annotations
@@ -114,12 +112,10 @@ class Structure:
     ) -> None:
         self.mesh, self.comm = mesh, comm
         self._forms = Hyperelastic(mesh, material, comm)
-        self.V = self._forms.V
-        self._u = self._forms.u
-        self._direction = dolfinx.fem.Function(self.V)
+        self.V, self._u = self._forms.V, self._forms.u
+        self._direction, self._along = (dolfinx.fem.Function(self.V) for _ in range(2))
         self._constrain(loading)
         self._load_form = self._forms.stiffness_along(self._direction)
-        self._along = dolfinx.fem.Function(self.V)
         self._along_form = self._forms.stiffness_along(self._along)
         self.factorisations = 0
         self.tangent = dolfinx_api.create_symmetric_matrix(self._forms.stiffness)
@@ -174,17 +170,15 @@ class Structure:
 
     def from_function(self, field: Callable[[FloatArray], FloatArray]) -> PETSc.Vec:
         """The vector of a displacement field: (n, 2) values at points (n, 2) [mm]."""
-        vector = self.zero()
-        count = self.V.dofmap.index_map.size_local
-        points = self.V.tabulate_dof_coordinates()[:count, :2]
-        vector.array[:] = field(points).ravel()
+        vector, count = self.zero(), self.V.dofmap.index_map.size_local
+        vector.array[:] = field(self.V.tabulate_dof_coordinates()[:count, :2]).ravel()
         vector.array[self._fixed_owned] = 0.0
         return vector
 
     def largest(self, u: PETSc.Vec) -> float:
         """The largest nodal displacement of ``u`` [mm]."""
-        length = np.linalg.norm(u.array.reshape(-1, 2), axis=1)
-        return float(self.comm.allreduce(float(np.max(length, initial=0.0)), MPI.MAX))
+        lengths = np.linalg.norm(u.array.reshape(-1, 2), axis=1)
+        return float(self.comm.allreduce(float(np.max(lengths, initial=0.0)), MPI.MAX))
 
     def residual(self, u: PETSc.Vec) -> PETSc.Vec:
         """Internal forces [N/mm], zero at the constrained components."""
@@ -204,10 +198,7 @@ class Structure:
         return float(direction.dot(self._assemble(self._along_form, u)))
 
     def stiffness(self, u: PETSc.Vec) -> PETSc.Mat:
-        """Tangent stiffness at ``u`` [N/mm^2], constrained rows replaced by identity.
-
-        The matrix is the same object at every call, assembled anew.
-        """
+        """Tangent stiffness at ``u`` [N/mm^2], constrained rows identity; the same object again."""
         self._load(u)
         return dolfinx_api.assemble_matrix(self._forms.stiffness, self._bcs, 1.0, self.tangent)
 
@@ -235,8 +226,7 @@ class Structure:
 
         By virtual work: d(energy)/d(strain) = force * length (+ moment * tilt) at equilibrium.
         """
-        forces = self._assemble(self._forms.forces, u)
-        fixed = self._fixed_owned
+        forces, fixed = self._assemble(self._forms.forces, u), self._fixed_owned
         work = float(forces.array[fixed] @ self._shortening[fixed])
         return float(self.comm.allreduce(work)) / length
 

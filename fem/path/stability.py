@@ -148,10 +148,7 @@ class _Krylov:
     def _normalised(
         self, block: FloatArray, image: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Orthonormal combinations of vectors; those that depend on others are left out.
-
-        And the smallest eigenvalue of the normalised Gram matrix.
-        """
+        """Orthonormal combinations, dependent vectors left out, and the least Gram eigenvalue."""
         gram = self._products(block, image)
         size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         squares, turn = np.linalg.eigh(gram / np.outer(size, size))

@@ -74,10 +74,7 @@ _NEGLIGIBLE_PX = 1e-12
 
 
 def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
-    """(row, col), each (rows, cols) [px]: the ideal positions that an image's pixels show.
-
-    InputError if the distortion folds in the image.
-    """
+    """Ideal positions, each (rows, cols) [px], that the pixels show; InputError if S folds."""
     row, col = np.ogrid[: shape[0], : shape[1]]
     strips = [slice(k, k + _BAND) for k in range(0, shape[0], _BAND)]
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:

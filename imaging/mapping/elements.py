@@ -172,10 +172,7 @@ def sub_elements(triangular: bool) -> FloatArray:
 
 
 def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str) -> IntArray:
-    """Numbers of the cells whose Jacobian isn't positive everywhere, ascending.
-
-    ``positions`` (n, 2) are in a right-handed frame (x right, y up).
-    """
+    """Cells whose Jacobian isn't positive everywhere at ``positions`` (n, 2) (x right, y up)."""
     triangular = reference_element(element).triangular
     degree = 2 if triangular else 3
     points = lattice_points(triangular, degree)

@@ -80,10 +80,7 @@ def invert(
     t: FloatArray,
     count: int,
 ) -> None:
-    """Solve position(s, t) = (row, col) for the first ``count`` pixels from the start in s, t.
-
-    What it gives may be wrong.
-    """
+    """Solve position(s, t) = (row, col) for ``count`` pixels from s, t; it may be wrong."""
     a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
     for _ in range(_BATCH_STEPS):
         if _step(a, b, not triangular, row, col, s, t, count) <= _NEARLY_PX**2:

@@ -45,11 +45,7 @@ _ORIENTATION = 274
 
 @dataclass(frozen=True, eq=False)
 class StoredImage:
-    """What a file holds.
-
-    levels : (rows, cols), or (rows, cols, 3) colour.
-    notes : sentences about pages left out and turns made.
-    """
+    """What a file holds: levels (rows, cols), or (rows, cols, 3) colour; what was changed."""
 
     levels: NDArray[Any]
     notes: tuple[str, ...]
@@ -107,8 +103,8 @@ def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
 
 def require_visible(image: NDArray[Any], path: Path | str) -> None:
     """Raise InputError for an image (rows, cols) with NaN or infinity, or of one level."""
-    if not np.isfinite(image).all():
-        count = int((~np.isfinite(image)).sum())
+    count = int(np.count_nonzero(~np.isfinite(image)))
+    if count:
         raise InputError(
             f"expected finite grey levels at {path}, got {count} NaN or infinite px; "
             "replace them and exclude them by a mask"
@@ -247,9 +243,7 @@ def read_mask(path: Path | str) -> BoolArray:
     levels = read_stored(Path(path), single=True).levels
     mask = (levels if levels.ndim == 2 else levels.max(axis=2)) != 0
     if not mask.any():
-        raise InputError(
-            f"expected a mask with material (values above 0) at {path}, got black everywhere"
-        )
+        raise InputError(f"expected a mask with material (above 0) at {path}, got black everywhere")
     return np.asarray(mask)
 
 
@@ -258,9 +252,10 @@ def require_same_shape(
 ) -> None:
     """Raise InputError unless two images, of these names, have the same size."""
     if image.shape != other.shape:
+        size, other_size = (" x ".join(map(str, each.shape)) for each in (image, other))
         raise InputError(
-            f"expected images of one size, got {what} with {_size(image)} and {other_what} with "
-            f"{_size(other)} (rows x cols px); crop or make them again so that they match"
+            f"expected images of one size, got {what} with {size} and {other_what} with "
+            f"{other_size} (rows x cols px); crop or make them again so that they match"
         )
 
 
@@ -287,7 +282,3 @@ def write_image(path: Path | str, image: NDArray[Any]) -> None:
     with atomic(path) as temporary:
         # Not its buffer: memory that is lent to a failed write can't be freed.
         temporary.write_bytes(memory.getvalue())
-
-
-def _size(image: NDArray[Any]) -> str:
-    return " x ".join(str(n) for n in image.shape)

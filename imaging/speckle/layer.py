@@ -143,10 +143,7 @@ class Layer:
         return PeriodicSpline.of(self._spectrum, self.samples, TOLERANCE)
 
     def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
-        """Exact values at image positions (row, col) [px], of the positions' shape.
-
-        ``eps`` is the relative precision of the non-uniform FFT.
-        """
+        """Exact values at positions (row, col) [px]; ``eps``: the FFT's relative precision."""
         return np.asarray(self._evaluate(row, col, eps, gradient=False)[0])
 
     def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:

@@ -225,10 +225,7 @@ def _views(
 def _points(
     shape: tuple[int, ...], poses: Sequence[Pose], count: int
 ) -> tuple[tuple[FloatArray, FloatArray], float]:
-    """Even grid of ideal positions that any photograph may show, about ``count`` in each.
-
-    Returns ((rows, columns), stride) [px].
-    """
+    """Ideal positions on an even grid, about ``count`` a photograph, and its stride [px]."""
     shifts = np.array([pose.shift for pose in poses])
     low, high = -shifts.max(axis=0) - 20.0, np.array(shape) - shifts.min(axis=0) + 20.0
     stride = max(1.0, float(np.sqrt(np.prod(shape) / count)))

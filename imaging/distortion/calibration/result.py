@@ -95,10 +95,7 @@ class LensEstimate:
         )
 
     def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Standard deviation of S along rows and columns [px] at ideal positions [px].
-
-        That of the images' noise; what the model can't follow is not in it.
-        """
+        """Standard deviation of S [px] at ideal positions [px], by the images' noise alone."""
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
         products = np.einsum("ckn,kl->cln", columns, self.covariance, optimize=True)
