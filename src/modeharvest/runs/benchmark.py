@@ -25,6 +25,7 @@ from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import exclusive
 from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
 from modeharvest.validation.resolution.star import StarSet
+from modeharvest.validation.scoring import score as scoring
 from modeharvest.validation.scoring.benchmark import (
     SOLUTION,
     BenchmarkTruth,
@@ -35,16 +36,11 @@ from modeharvest.validation.scoring.benchmark import (
 from modeharvest.validation.scoring.conventions import check_conventions
 from modeharvest.validation.scoring.fields import Declared, read_measured
 from modeharvest.validation.scoring.grading import Grading
-from modeharvest.validation.scoring.score import (
-    EDGE_PX,
-    Score,
-    error_spectrum,
-    ranked,
-    regions,
-)
-from modeharvest.validation.scoring.score import (
-    score as score_field,
-)
+
+REACH_CELLS = 0.25
+"""How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""
+
+T = TypeVar("T")
 
 
 def grade_star(
@@ -54,7 +50,7 @@ def grade_star(
     out: Path | str,
     progress: Progress = silent,
 ) -> StarGrading:
-    """Grade fields measured on a star set; leaves a report, JSON and CSV.
+    """Grade fields measured on a star set; leaves a report, JSON and CSV in ``out``.
 
     Parameters
     ----------
@@ -64,10 +60,6 @@ def grade_star(
         Files of the image without motion, one for each field in the same order; or none.
     folder
         The star set.
-    out
-        Folder for the report.
-    progress
-        Listener.
 
     Returns
     -------
@@ -110,12 +102,6 @@ def _read_star_field(path: Path, declared: Declared, star_set: StarSet) -> Local
     return read_measured(path, star_set.spec.star.grid, star_set.id, declared)
 
 
-REACH_CELLS = 0.25
-"""How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""
-
-T = TypeVar("T")
-
-
 def make_benchmark(
     case: str | Path | Case,
     public: Path | str,
@@ -123,22 +109,17 @@ def make_benchmark(
     solution: Path | str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Simulate a case, image it, and part the images from their truth.
-
-    What is finished is not done again, as in every run.
+    """Simulate a case, image it, and part the images from their truth; resumed as every run.
 
     Parameters
     ----------
     case
         A shipped case's name, the path of a TOML file, or a Case.
-    public
-        Folder for what anybody may have.
-    truth
-        Folder for the truth; by default beside the public one, with "-truth" after its name.
+    public, truth
+        Folder for what anybody may have, and for the truth; that is by default beside the public
+        one, with "-truth" after its name.
     solution
         Use this solution (HDF5) instead of simulating.
-    progress
-        Listener.
 
     Returns
     -------
@@ -175,7 +156,7 @@ def score(
     truth: Path | str,
     strain: float,
     out: Path | str,
-    edge_px: int = EDGE_PX,
+    edge_px: int = scoring.EDGE_PX,
     progress: Progress = silent,
 ) -> Grading:
     """Grade displacement fields and write ``report.html``, ``scores.json`` and ``scores.csv``.
@@ -184,16 +165,12 @@ def score(
     ----------
     fields
         Their files, with what the files don't say themselves.
-    truth
-        The truth's folder.
+    truth, out
+        The truth's folder, and that for the report.
     strain
         Nominal strain of the image that they were measured on [-].
-    out
-        Folder for the report.
     edge_px
         Material closer than this to a hole or to the outside counts as edge [px].
-    progress
-        Listener.
 
     Returns
     -------
@@ -211,23 +188,20 @@ def score(
     every = fields if isinstance(fields, Mapping) else {Path(f): Declared() for f in fields}
     known = BenchmarkTruth.read(truth)
     require_writable(out)
-    grid = known.grid
-    labels = regions(known.mask, grid, known.specimen, edge_px)
-    true = partial(known.displacement, strain)
+    grid, true = known.grid, partial(known.displacement, strain)
+    labels = scoring.regions(known.mask, grid, known.specimen, edge_px)
     reach_px = REACH_CELLS * known.specimen.pitch / grid.pixel_size
 
-    def grade(path: Path, declared: Declared) -> tuple[Score, tuple[str, ...]]:
+    def grade(path: Path, declared: Declared) -> tuple[scoring.Score, tuple[str, ...]]:
         field = read_measured(path, grid, known.id, declared)
-        graded = score_field(field, true(field.x, field.y), labels, grid, reach_px)
+        graded = scoring.score(field, true(field.x, field.y), labels, grid, reach_px)
         return graded, check_conventions(field, true, grid)[1]
 
     graded, refused = _graded(every, grade, progress, "score")
-    best_first = ranked([one for one, _ in graded])
-    remarks = [note for _, notes in graded for note in notes]
-    spectra = {one.source: error_spectrum(one, grid) for one in best_first}
-    done = Grading(
-        known, strain, edge_px, labels, tuple(best_first), spectra, tuple(remarks), refused
-    )
+    best_first = tuple(scoring.ranked([one for one, _ in graded]))
+    remarks = tuple(note for _, notes in graded for note in notes)
+    spectra = {one.source: scoring.error_spectrum(one, grid) for one in best_first}
+    done = Grading(known, strain, edge_px, labels, best_first, spectra, remarks, refused)
     write_grading(out, done)
     progress(1, 1, "score")
     return done
@@ -241,10 +215,7 @@ def _graded(
 ) -> tuple[list[T], dict[str, str]]:
     """The grades of the fields that have one, and why others have none.
 
-    Raises
-    ------
-    InputError
-        If there is no field, two have one name, or none can be graded.
+    Raises InputError if there is no field, two have one name, or none can be graded.
     """
     if not fields:
         raise InputError("expected fields to score, got none")
@@ -278,42 +249,35 @@ def declarations(
 ) -> dict[Path, Declared]:
     """What a command line declares of each file.
 
-    Parameters
-    ----------
-    paths
-        The files.
-    names
-        One for each, or none.
-    units, y_axes, first_pixels
-        One for all, or one for each; "file" where the columns' names say it.
-    columns
-        "u=NAME" or "u=7", for all files.
-
-    Raises
-    ------
-    InputError
-        If there are neither one nor as many as files.
+    ``units``, ``y_axes`` and ``first_pixels``: one for all, or one for each; "file" where the
+    columns' names say it. ``columns``: "u=NAME" or "u=7", for all files. Raises InputError if there
+    are neither one nor as many as files, or not one of ``names`` for each.
     """
     if len(set(paths)) < len(paths):
         raise InputError(f"expected different files to score, got {', '.join(map(str, paths))}")
     if names and len(names) != len(paths):
         raise InputError(f"expected a --name for each of {len(paths)} files, got {len(names)}")
-    named = _each(names, paths, "--name")
-    in_units = _each(units, paths, "--unit")
-    axes = _each(y_axes, paths, "--y-axis")
     first = _each(first_pixels, paths, "--first-pixel")
     if not set(first) <= {None, 0, 1}:
         raise InputError(f"expected --first-pixel 0 or 1, got {', '.join(map(str, first))}")
     roles = dict(map(_column, columns or ()))
+    each = zip(
+        paths,
+        _each(names, paths, "--name"),
+        _each(units, paths, "--unit"),
+        _each(y_axes, paths, "--y-axis"),
+        first,
+        strict=True,
+    )
     return {
         path: Declared(
-            name=named[k],
-            units=None if in_units[k] == "file" else in_units[k],
-            y_axis=None if axes[k] == "file" else axes[k],
-            first_pixel=first[k] or 0,
+            name=name,
+            units=None if unit == "file" else unit,
+            y_axis=None if y_axis == "file" else y_axis,
+            first_pixel=pixel or 0,
             columns=roles,
         )
-        for k, path in enumerate(paths)
+        for path, name, unit, y_axis, pixel in each
     }
 
 
@@ -327,7 +291,7 @@ def _each(given: Sequence[T] | None, paths: Sequence[Path], option: str) -> Sequ
         raise InputError(
             f"expected {option} once, or once for each of {len(paths)} files, got {len(given)}"
         )
-    return list(given)
+    return given
 
 
 def _column(text: str) -> tuple[str, str | int]:

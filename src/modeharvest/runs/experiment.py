@@ -51,12 +51,7 @@ T = TypeVar("T")
 class Run(StagedRun[Case]):
     """The stages of a virtual experiment.
 
-    Parameters
-    ----------
-    case, folder, progress
-        As of every run.
-    solution
-        A solution file to use instead of simulating.
+    ``solution``: a solution file to use instead of simulating.
     """
 
     solution: Path | None = None
@@ -64,15 +59,10 @@ class Run(StagedRun[Case]):
     def fem(self) -> Solution:
         """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.
 
-        Without dolfinx, a shipped case's own solution is taken instead.
-
-        Raises
-        ------
-        MissingDependencyError
-            If dolfinx is not there and no solution of this case is shipped.
+        Without dolfinx, a shipped case's own solution is taken instead; MissingDependencyError if
+        none of this case is shipped.
         """
-        path = self.folder / "solution.h5"
-        vtu = path.with_suffix(".vtu")
+        path, vtu = self.folder / "solution.h5", self.folder / "solution.vtu"
 
         def write(solution: Solution) -> None:
             solution.write(path)
@@ -89,21 +79,15 @@ class Run(StagedRun[Case]):
     def solved(self) -> Solution:
         """The solution that was given, or else a simulated one.
 
-        Raises
-        ------
-        InputError
-            If the one given is of another experiment, or lacks one of its strains.
+        Raises InputError if the one given is of another experiment, or lacks one of its strains.
         """
         return self.fem() if self.solution is None else self._solution()
 
     def image(self) -> ImageSet:
         """Make images and truth of the solution's snapshots in ``images/``.
 
-        Raises
-        ------
-        InputError
-            If the solution is of another experiment, or lacks one of its strains although its
-            simulation did not end early.
+        Raises InputError if the solution is of another experiment, or lacks one of its strains
+        although its simulation did not end early.
         """
         solution, folder = self._solution(), self.folder / "images"
         strains, spec = self._strains(solution), self.case.imaging
@@ -117,17 +101,16 @@ class Run(StagedRun[Case]):
     def correlate(self) -> dict[float, Result]:
         """Correlate every deformed image with the reference; leaves ``correlation/``.
 
-        Raises
-        ------
-        InputError
-            If the images were made of another experiment or with other options than this case's.
+        Raises InputError if the images were made of another experiment or with other options than
+        this case's.
         """
         images = self._images()
 
         def work() -> list[Path]:
-            for strain in images.strains:
-                self._correlate_one(images, strain).write(self._result_path(strain))
-            return [self._result_path(strain) for strain in images.strains]
+            paths = [self._result_path(strain) for strain in images.strains]
+            for strain, path in zip(images.strains, paths, strict=True):
+                self._correlate_one(images, strain).write(path)
+            return paths
 
         key = self._correlate_key(images)
         return self.do("correlate", key, work, lambda: self._results(images))
@@ -135,10 +118,7 @@ class Run(StagedRun[Case]):
     def validate(self) -> dict[str, Any]:
         """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            If the results are not of these images and this case.
+        Raises InputError if the results are not of these images and this case.
         """
         images = self._images()
         correlated = self._correlate_key(images)
@@ -159,11 +139,8 @@ class Run(StagedRun[Case]):
     def all(self) -> dict[str, Any]:
         """Run every stage that is not finished; returns the content of ``summary.json``.
 
-        Raises
-        ------
-        InputError
-            At once, if another process works in the folder. At the end, if the simulation did
-            not reach all strains asked for: what it did reach is reported.
+        Raises InputError at once, if another process works in the folder; at the end, if the
+        simulation did not reach all strains asked for: what it did reach is reported.
         """
         with exclusive(self.folder):
             ahead = [stage for stage in ("image", "correlate") if stage not in self.stages.timings]
@@ -190,20 +167,18 @@ class Run(StagedRun[Case]):
         case, solution, results = self.case, self._solution(), self._results(images)
         measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
         strains = sorted(results)
+        every = range(len(strains))
         # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
         with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
             comparisons = _Awaited([threads.submit(compare_snapshot, measured, e) for e in strains])
-            every = range(len(strains))
             spectra = _Awaited(
                 [threads.submit(displacement_spectrum, comparisons, k, measured) for k in every]
             )
             snapshots = _Awaited(
                 [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
             )
-            data = ExperimentData(
-                solution, images, strains, [results[strain] for strain in strains],
-                comparisons, spectra, measured.specimen.pitch,
-            )  # fmt: skip
+            found, pitch = [results[strain] for strain in strains], measured.specimen.pitch
+            data = ExperimentData(solution, images, strains, found, comparisons, spectra, pitch)
             pictures = draw_figures(experiment_figures(data), self.progress)
             summary = experiment_summary(measured, case.plain(), list(snapshots)).plain()
         write_page(experiment_report(summary, data), page, pictures=pictures)
@@ -213,12 +188,12 @@ class Run(StagedRun[Case]):
         advice = "make it again with 'modeharvest image'"
         self.stages.require_whole(self.folder / "images" / SIDECAR, advice)
         images = ImageSet.read(self.folder / "images")
-        hint = f"in {images.folder}; make them again with 'modeharvest image'"
+        where = f"in {images.folder}; make them again with 'modeharvest image'"
         if images.spec != self.case.imaging:
-            raise InputError(f"expected images made with this case's options, got others {hint}")
-        info = images.info["solution"]
-        require_same_experiment(info, self.case.experiment, f"images {hint}")
-        self._reached(info, images.strains, f"images {hint}")
+            raise InputError(f"expected images made with this case's options, got others {where}")
+        info, where = images.info["solution"], f"images {where}"
+        require_same_experiment(info, self.case.experiment, where)
+        self._reached(info, images.strains, where)
         return images
 
     def _correlate_key(self, images: ImageSet) -> str:

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Solution
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
-from modeharvest.idic.photograph.measure import MeasuredPhotograph
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
@@ -44,7 +43,7 @@ from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthCheck
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic, copy_whole, read_json, write_json
+from modeharvest.util.files import atomic, copy_whole, write_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
@@ -54,13 +53,7 @@ _SIDECAR = "twin.json"
 
 @dataclass(frozen=True)
 class Twin:
-    """A finished twin on disk.
-
-    Parameters
-    ----------
-    folder
-        Where it is.
-    """
+    """A finished twin on disk."""
 
     folder: Path
 
@@ -70,30 +63,19 @@ class Twin:
         return self.folder / "experiment" / "experiment.toml"
 
     @property
-    def solution(self) -> Solution:
-        """The true displacements, on the mesh."""
-        return Solution.read(self.folder / "truth" / "solution.h5")
+    def truth(self) -> Path:
+        """The folder of what a user would not have."""
+        return self.folder / "truth"
 
     @property
     def images(self) -> ImageSet:
         """Noise-free images through the lens, and the truth on the ideal grid."""
-        return ImageSet.read(self.folder / "truth" / "images")
+        return ImageSet.read(self.truth / "images")
 
     @property
     def distortion(self) -> AnyDistortion:
         """The lens."""
-        return read_distortion(self.folder / "truth" / "distortion.json")
-
-    @property
-    def shifts(self) -> FloatArray:
-        """(m, 2) where the stage was at the calibration, along (rows, columns) [px]."""
-        return np.array(self.info["stage_shifts_row_col_px"], dtype=np.float64)
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """The content of ``twin.json``."""
-        found: dict[str, Any] = read_json(self.folder / "truth" / _SIDECAR)
-        return found
+        return read_distortion(self.truth / "distortion.json")
 
 
 def make_twin(
@@ -101,25 +83,12 @@ def make_twin(
 ) -> Twin:
     """Make (or find finished) the photographs of a twin, and its truth.
 
-    Parameters
-    ----------
-    case
-        Of a twin, such as the shipped "paper-real-twin".
-    solution
-        Of the case's experiment.
-    folder
-        Where; made if it doesn't exist.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If the case has no distortion, an image doesn't fit, or the disk refuses.
+    ``case`` of a twin, such as the shipped "paper-real-twin"; ``solution`` of its experiment.
+    Raises InputError if the case has no distortion, an image doesn't fit, or the disk refuses.
     """
     twin, spec, strains = Twin(Path(folder)), case.imaging, case.experiment.strains
     target = _target(case)
-    truth, photographs = twin.folder / "truth", twin.experiment.parent
+    truth, photographs = twin.truth, twin.experiment.parent
     key = stage_key([image_key(solution, spec, strains), to_plain(target), case.title])
 
     def work() -> list[Path]:
@@ -137,8 +106,7 @@ def make_twin(
             write_image(taken[-1], levels)
         with atomic(twin.experiment) as temporary:
             temporary.write_text(_experiment_text(case, images), "utf-8")
-        shifts = {"stage_shifts_row_col_px": target.true_shifts.tolist()}
-        write_json(truth / _SIDECAR, shifts)
+        write_json(truth / _SIDECAR, {"stage_shifts_row_col_px": target.true_shifts.tolist()})
         own = (truth / name for name in ("solution.h5", "distortion.json", _SIDECAR))
         return [*images.files, *taken, *own, twin.experiment]
 
@@ -163,13 +131,12 @@ def _copy_photographs(images: ImageSet, folder: Path) -> list[Path]:
     for name, source in _exposures(images):
         paths.append(folder / f"{name}.tif")
         copy_whole(images.folder / source, paths[-1])
-    spec, again = images.spec, "reference_2"
-    sensor = spec.sensor
+    sensor, bits, again = images.spec.sensor, images.spec.bits, "reference_2"
     light = sensor.illumination(again) / sensor.illumination("reference")
     irradiance = light * (images.reference() - sensor.offset) / sensor.gain
-    levels = sensor.expose(irradiance.astype(np.float32), spec.bits, again)
-    write_image(folder / f"{again}.tif", levels)
-    return [*paths, folder / f"{again}.tif"]
+    paths.append(folder / f"{again}.tif")
+    write_image(paths[-1], sensor.expose(irradiance.astype(np.float32), bits, again))
+    return paths
 
 
 def _exposures(images: ImageSet) -> Iterator[tuple[str, str]]:
@@ -215,49 +182,30 @@ _WAVES, _AMPLITUDE, _LENS_PX = 0.01, 0.03, 0.05
 class TwinRun(StagedRun[Case]):
     """The stages of a twin: those of its simulation, its photographs, those of their harvest.
 
-    Parameters
-    ----------
-    case, folder, progress
-        As of every run.
-    solution
-        A solution file to use instead of simulating.
+    ``solution``: a solution file to use instead of simulating.
     """
 
     solution: Path | None = None
 
-    def twin(self) -> Twin:
-        """Make the photographs and their truth, unless they are there."""
-        solution = Run(self.case, self.folder, self.progress, self.solution).solved()
-        return make_twin(self.case, solution, self.folder / "twin", self.progress)
-
-    def harvesting(self, twin: Twin) -> HarvestRun:
-        """The harvest of the photographs; knows nothing of the truth."""
-        case, folder = PhotographCase.read(twin.experiment), self.folder / "harvest"
-        return HarvestRun(case, folder, self.progress, str(twin.experiment))
-
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``."""
         with exclusive(self.folder):
-            twin = self.twin()
-            harvesting = self.harvesting(twin)
-            results = harvesting.results()
-            truth = compare_with_truth(twin, harvesting, results, self.progress)
-            return harvesting.all(truth)
+            solution = Run(self.case, self.folder, self.progress, self.solution).solved()
+            twin = make_twin(self.case, solution, self.folder / "twin", self.progress)
+            case, folder = PhotographCase.read(twin.experiment), self.folder / "harvest"
+            harvesting = HarvestRun(case, folder, self.progress, str(twin.experiment))
+            return harvesting.all(compare_with_truth(twin, harvesting, self.progress))
 
 
 def compare_with_truth(
-    twin: Twin,
-    harvesting: HarvestRun,
-    results: Mapping[str, MeasuredPhotograph],
-    progress: Progress = silent,
+    twin: Twin, harvesting: HarvestRun, progress: Progress = silent
 ) -> HarvestTruth:
-    """Set a harvest against the truth of its twin."""
-    images, geometry = twin.images, harvesting.geometry
+    """Set a harvest, which knows nothing of the truth, against that of its twin."""
+    images, geometry, results = twin.images, harvesting.geometry, harvesting.results()
     frames, rows = {}, []
     for k, (name, measured) in enumerate(results.items()):
         progress(k, len(results), "compare with the truth")
-        strain = _strain_of(name, images.strains)
-        true = images.truth(strain).displacement
+        true = images.truth(_strain_of(name, images.strains)).displacement
         # Not the images' own masks: those are as the lens shows them.
         inside = np.asarray(np.isfinite(true).all(axis=-1))
         result = measured.result
@@ -284,8 +232,7 @@ def _frame_rows(
     cellular: Box,
 ) -> list[TruthCheck]:
     """What of one photograph was found, against the truth and the best fit of the ansatz."""
-    px = result.grid.pixel_size
-    found = result.displacement()
+    px, found = result.grid.pixel_size, result.displacement()
     left, lost = (_rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
         TruthCheck(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
