@@ -35,41 +35,18 @@ if TYPE_CHECKING:  # what type checkers and editors see of the table below
     from modeharvest.runs.photographs.pipeline import harvest
 
 __all__ = [
-    "Ansatz",
-    "Experiment",
-    "ImagePair",
-    "ImagingSpec",
-    "Ogden",
-    "Result",
-    "Solution",
-    "Specimen",
-    "__version__",
-    "best_fit",
-    "correlate",
-    "harvest",
-    "make_images",
-    "run",
-    "score",
-    "simulate",
-]
+    "Ansatz", "Experiment", "ImagePair", "ImagingSpec", "Ogden", "Result", "Solution", "Specimen",
+    "__version__", "best_fit", "correlate", "harvest", "make_images", "run", "score", "simulate",
+]  # fmt: skip
 
 _HOMES = {
-    "Ansatz": "idic.ansatz",
-    "Experiment": "fem.experiment",
-    "ImagePair": "imaging.pair",
-    "ImagingSpec": "imaging.spec",
-    "Ogden": "fem.materials",
-    "Result": "idic.result",
-    "Solution": "fem.field",
-    "Specimen": "fem.specimen",
-    "best_fit": "idic.correlate",
-    "correlate": "idic.correlate",
-    "harvest": "runs.photographs.pipeline",
-    "make_images": "imaging.imageset",
-    "run": "runs",
-    "score": "runs.benchmark",
+    "Ansatz": "idic.ansatz", "Experiment": "fem.experiment", "ImagePair": "imaging.pair",
+    "ImagingSpec": "imaging.spec", "Ogden": "fem.materials", "Result": "idic.result",
+    "Solution": "fem.field", "Specimen": "fem.specimen", "best_fit": "idic.correlate",
+    "correlate": "idic.correlate", "harvest": "runs.photographs.pipeline",
+    "make_images": "imaging.imageset", "run": "runs", "score": "runs.benchmark",
     "simulate": "fem.simulate",
-}
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -20,20 +20,9 @@ def run(
 ) -> dict[str, Any]:
     """Run a case of any kind, from its options to its report; what is finished is not done again.
 
-    Parameters
-    ----------
-    case
-        A shipped case's name, the path of a TOML file, or the case itself: a virtual experiment,
-        the twin of a real one, an infinite lattice, a study, or photographs of a test.
-    folder
-        Where to leave the files.
-    progress
-        Listener.
-
-    Returns
-    -------
-    dict
-        The content of ``summary.json``.
+    ``case``: a shipped case's name, the path of a TOML file, or the case itself: a virtual
+    experiment, the twin of a real one, an infinite lattice, a study, or photographs of a test.
+    ``folder``: where to leave the files. Returns the content of ``summary.json``.
     """
     from modeharvest.runs.case import Case, CaseModel, read_tables, table_of_kind
 

@@ -48,10 +48,8 @@ def _correlation() -> None:
     grid, strain = PixelGrid.centred(444, 320, 0.05), case.experiment.strains[-1]
     ansatz = case.correlation.ansatz(case.experiment.specimen)
     f, mask = rng.random(grid.shape, np.float32), np.ones(grid.shape, np.bool_)
-    options = replace(
-        case.correlation.options(),
-        gauss_newton=replace(case.correlation.options().gauss_newton, max_iterations=1),
-    )
+    options = case.correlation.options()
+    options = replace(options, gauss_newton=replace(options.gauss_newton, max_iterations=1))
     pair = ImagePair(f, f[::-1].copy(), grid, mask, mask, strain=strain)
     found = correlate(pair, ansatz, options=options)
     best_fit(Truth.of(displacement=found.displacement()), found)
@@ -76,13 +74,7 @@ _PARTS = {"image": _Part(_images, rasterise), "correlate": _Part(_correlation, a
 
 @dataclass(frozen=True)
 class Precompilation:
-    """Children at work.
-
-    Parameters
-    ----------
-    children
-        By the stage that needs what they compile.
-    """
+    """Children at work, by the stage that needs what they compile."""
 
     children: dict[str, subprocess.Popen[bytes]]
 
@@ -102,11 +94,10 @@ def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
         for stage in stages:
             stamp = _PARTS[stage].stamp
             if stamp is not None and not stamp.exists():
+                command = [sys.executable, "-m", "modeharvest.runs.precompile", stage]
+                nowhere = subprocess.DEVNULL
                 children[stage] = subprocess.Popen(
-                    [sys.executable, "-m", "modeharvest.runs.precompile", stage],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
+                    command, stdin=nowhere, stdout=nowhere, stderr=nowhere
                 )
     try:
         yield Precompilation(children)

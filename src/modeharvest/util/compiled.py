@@ -30,15 +30,9 @@ def compiled(
 ) -> Callable[[F], F]:
     """Compile a kernel at its first call; the machine code is cached on disk, if that is allowed.
 
-    Parameters
-    ----------
-    parallel
-        Run the kernel's ``prange`` loops on numba's threads.
-    inline
-        Put the function's code into those that call it.
-    relaxed
-        Let the compiler reorder sums and divide as numpy does; by default floating-point
-        arithmetic is strict, and division by zero an error.
+    ``parallel``: run the kernel's ``prange`` loops on numba's threads. ``inline``: put the code
+    into those that call it. ``relaxed``: let the compiler reorder sums and divide as numpy does; by
+    default floating-point arithmetic is strict, and division by zero an error.
     """
     options: dict[str, Any] = {"parallel": parallel, "forceinline": inline, "nogil": True}
     if relaxed:

@@ -25,6 +25,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from modeharvest.util import child
@@ -39,20 +40,9 @@ _CHILD_SECONDS, _CHILD_SECONDS_PER_BYTE = 60.0, 1e-5
 def reading(path: Path | str, what: str, remedy: str = "make it again") -> Iterator[Path]:
     """Turn whatever ends the block into InputError; nothing but reading the file belongs in it.
 
-    Parameters
-    ----------
-    path
-        The file.
-    what
-        Is expected there: "a solution (HDF5)".
-    remedy
-        What to do.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it is a folder, or the block raises. What the block itself says
-        is kept, behind the file's name.
+    ``what`` is expected at ``path``: "a solution (HDF5)"; ``remedy``: what to do. InputError also
+    if there is no such file or it is a folder. What the block itself says is kept, behind the
+    file's name.
     """
     path = Path(path)
     require_file(path, what, remedy)
@@ -92,19 +82,10 @@ def open_hdf5(
 ) -> Iterator[h5py.File]:
     """An HDF5 file to read from; see :func:`reading` for what happens to errors.
 
-    Parameters
-    ----------
-    path, what, remedy
-        As there.
-    form
-        What its attribute ``format`` has to say; None for any.
-
-    Raises
-    ------
-    InputError
-        Also if the file is of another format, reaches into other files (external storage, external
-        links, virtual data), or holds more than there is memory for: a file of a few hundred bytes
-        can hand out any other one, and declare any size.
+    ``form``: what its attribute ``format`` has to say; None for any. InputError also if the file is
+    of another format, reaches into other files (external storage, external links, virtual data), or
+    holds more than there is memory for: a file of a few hundred bytes can hand out any other one,
+    and declare any size.
     """
     with reading(path, what, remedy) as path, h5py.File(path, "r") as file:
         if form is not None and (got := file.attrs.get("format")) != form:
@@ -114,19 +95,9 @@ def open_hdf5(
 
 
 def require_plausible(path: Path, declared: float) -> None:
-    """Refuse a file that declares more than it can hold, or more than there is memory for.
+    """Refuse a file that declares more bytes than it can hold, or than there is memory for.
 
-    Parameters
-    ----------
-    path
-        The file.
-    declared
-        What it says that it holds [bytes].
-
-    Raises
-    ------
-    InputError
-        A header of a few bytes can declare any size.
+    A header of a few bytes can declare any size; an InputError says so.
     """
     size = path.stat().st_size
     if not declared <= child.BASE_BYTES / 10.0 + child.BYTES_PER_BYTE * size:
@@ -139,17 +110,8 @@ def require_plausible(path: Path, declared: float) -> None:
 def read_in_child(kind: str, path: Path | str, what: str, remedy: str) -> dict[str, NDArray[Any]]:
     """Numbers and texts of a file, by their names, read by :mod:`modeharvest.util.child`.
 
-    Parameters
-    ----------
-    kind
-        "mat" or "mesh".
-    path, what, remedy
-        As for :func:`reading`.
-
-    Raises
-    ------
-    InputError
-        If the parser gives up, crashes, or doesn't end.
+    ``kind``: "mat" or "mesh"; the others as for :func:`reading`, and so are the errors where the
+    parser gives up, crashes, or doesn't end.
     """
     with reading(path, what, remedy) as path, tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "read.npz"
@@ -202,12 +164,8 @@ def atomic(path: Path | str) -> Iterator[Path]:
     file, so a reader never sees half a file; what a killed process left is removed by the next
     that writes in the same folder. File and folder reach the disk before the block ends, so that a
     power cut leaves no empty file under a finished name. The suffix is kept, because libraries
-    choose formats by it.
-
-    Raises
-    ------
-    InputError
-        If the operating system refuses the write (disk full, no permission).
+    choose formats by it. Raises InputError if the operating system refuses the write (disk full, no
+    permission).
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -239,32 +197,15 @@ def remove_orphans(folder: Path | str) -> None:
     """Remove temporary files in a folder whose process is no more."""
     for name in os.listdir(folder):
         orphan = _TEMPORARY.fullmatch(name)
-        if orphan and not may_be_alive(int(orphan[1])):
+        if orphan and not psutil.pid_exists(int(orphan[1])):
             Path(folder, name).unlink(missing_ok=True)
-
-
-def may_be_alive(process: int) -> bool:
-    """Whether this machine may have a process of that id; where it can't tell, it says yes."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(process, 0)  # sends nothing
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # another user's; no id at all
-        return True
-    return True
 
 
 def make_folder(folder: Path | str) -> None:
     """Make a folder, and those above it, where they are not there yet.
 
-    Raises
-    ------
-    InputError
-        If there is a file in its place, or in that of one above it.
-    OSError
-        If the operating system refuses it for another reason.
+    Raises InputError if there is a file in its place or above it, OSError if the operating system
+    refuses it for another reason.
     """
     folder = Path(folder)
     require_no_file(folder)
@@ -272,13 +213,7 @@ def make_folder(folder: Path | str) -> None:
 
 
 def require_no_file(folder: Path) -> None:
-    """Check that a folder is there or can be: that no file is in its place, or above it.
-
-    Raises
-    ------
-    InputError
-        If one is.
-    """
+    """Raise InputError if a folder can't be: if a file is in its place, or above it."""
     for place in (folder, *folder.parents):
         if os.path.isdir(place):
             return
@@ -289,13 +224,7 @@ def require_no_file(folder: Path) -> None:
 
 
 def require_writable(folder: Path | str) -> None:
-    """Make ``folder`` and check that files can be written there, before long work begins.
-
-    Raises
-    ------
-    InputError
-        If not.
-    """
+    """Make ``folder`` and check that files can be written there, before long work begins."""
     with atomic(Path(folder) / "writable") as temporary:
         temporary.touch()
     (Path(folder) / "writable").unlink()
@@ -337,19 +266,8 @@ def read_json(path: Path | str) -> Any:
 def read_record(path: Path | str, form: str, what: str, remedy: str) -> dict[str, Any]:
     """Read a JSON object whose ``format`` is ``form``.
 
-    Parameters
-    ----------
-    path
-        The file.
-    form
-        What its key ``format`` has to say.
-    what, remedy
-        For the message: what is expected there, and what to do.
-
-    Raises
-    ------
-    InputError
-        If it is missing, damaged, or of another format.
+    ``what`` is expected there, and ``remedy`` what to do, for the InputError if it is missing,
+    damaged, or of another format.
     """
     with reading(path, what, remedy):
         content = read_json(path)

@@ -27,21 +27,10 @@ def available_bytes() -> float:
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Refuse work before it begins to allocate.
+    """Refuse work, by an InputError, before it allocates more than there is.
 
-    Parameters
-    ----------
-    needed
-        A rough estimate [bytes]; infinite or NaN is too much.
-    what
-        Needs it: "an image of 9000 x 9000 px".
-    remedy
-        What to change.
-
-    Raises
-    ------
-    InputError
-        If there is less.
+    ``needed``: a rough estimate [bytes], infinite or NaN is too much; ``what`` needs it: "an image
+    of 9000 x 9000 px"; ``remedy``: what to change.
     """
     there = available_bytes()
     if not needed <= there:
@@ -68,10 +57,8 @@ def _own_cgroups() -> list[Path]:
 
 def _left_in(folder: Path) -> float:
     """What a control group may still take [bytes]; files it has cached don't count as taken."""
-    for limit, usage in (
-        ("memory.max", "memory.current"),
-        ("memory.limit_in_bytes", "memory.usage_in_bytes"),
-    ):
+    v2, v1 = ("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    for limit, usage in (v2, v1):
         with suppress(OSError, ValueError):
             left = float((folder / limit).read_text()) - float((folder / usage).read_text())
             return left + _cached_in(folder)

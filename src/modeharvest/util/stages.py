@@ -33,16 +33,11 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import psutil
+
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import (
-    make_folder,
-    may_be_alive,
-    read_json,
-    remove_orphans,
-    sha256_of,
-    write_json,
-)
+from modeharvest.util.files import make_folder, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import Progress, silent
 
@@ -61,12 +56,9 @@ def versions(*libraries: str) -> dict[str, str]:
 def source_digest(*folders: str) -> str:
     """SHA-256 of the package's own code, hexadecimal: a version's number lags behind it.
 
-    Parameters
-    ----------
-    folders
-        Folders of the package that count, such as "fem" and "imaging", besides the modules at
-        its root, which always do; all of them if none is named. Since imports go one way, those
-        up to the one that does the work are all that it can depend on.
+    ``folders`` of the package that count, such as "fem" and "imaging", besides the modules at its
+    root and util, which always do; all of them if none is named. Since imports go one way, those up
+    to the one that does the work are all that it can depend on.
     """
     found = hashlib.sha256()
     root = resources.files("modeharvest")
@@ -98,13 +90,7 @@ RECORD, TIMINGS, LOCK = "stages.json", "timings.json", ".lock"
 
 @dataclass(frozen=True)
 class Stages:
-    """The stages of one folder.
-
-    Parameters
-    ----------
-    folder
-        Where; made if it does not exist.
-    """
+    """The stages of one folder, which is made if it does not exist."""
 
     folder: Path
 
@@ -130,8 +116,6 @@ class Stages:
 
         Parameters
         ----------
-        name
-            Of the stage.
         key
             See :func:`stage_key`.
         work
@@ -201,14 +185,7 @@ class Stages:
 class StagedRun(Generic[C]):
     """What every kind of run has: a case, a folder, stages that are not done twice.
 
-    Parameters
-    ----------
-    case
-        What to do.
-    folder
-        Where to leave the files; made if it does not exist.
-    progress
-        Listener.
+    The folder is made if it does not exist; ``progress`` listens.
     """
 
     case: C
@@ -243,13 +220,8 @@ class StagedRun(Generic[C]):
 def stage_key(content: object, *folders: str) -> str:
     """The digest of all that a stage's outcome depends on.
 
-    Parameters
-    ----------
-    content
-        Plain values: options, digests of files, keys of other stages.
-    folders
-        Folders of the package whose code counts, see
-        :func:`modeharvest.util.stages.source_digest`; all if none is named.
+    ``content``, plain values: options, digests of files, keys of other stages; ``folders`` of the
+    package whose code counts, see :func:`source_digest`.
     """
     return digest([source_digest(*folders), content])
 
@@ -293,12 +265,8 @@ def exclusive(folder: Path | str) -> Iterator[None]:
     The operating system gives the folder back when its holder ends, however it ends. Where the
     file system has no locks (that of some networks, or Windows) the file ``.lock`` alone decides,
     and is believed unless it is of a process that this machine had and has no more. Where nothing
-    can be written nothing is locked. Under mpirun rank 0 holds the folder for all.
-
-    Raises
-    ------
-    InputError
-        If another process has it: which, where and since when. If the disk refuses.
+    can be written nothing is locked. Under mpirun rank 0 holds the folder for all. Raises
+    InputError if another process has it (which, where and since when), or the disk refuses.
     """
     folder = Path(folder).resolve()
     mine: set[Path] = _of_this_thread.__dict__.setdefault("folders", set())
@@ -401,4 +369,4 @@ def _this_process() -> dict[str, Any]:
 def _is_gone(holder: dict[str, Any]) -> bool:
     """Whether a holder was a process of this machine that is no more."""
     process, is_here = holder.get("process"), holder.get("host") == socket.gethostname()
-    return is_here and isinstance(process, int) and not may_be_alive(process)
+    return is_here and isinstance(process, int) and not psutil.pid_exists(process)

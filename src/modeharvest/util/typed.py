@@ -34,11 +34,8 @@ T = TypeVar("T")
 def made(kind: type[T], values: object) -> T:
     """The dataclass that plain values describe.
 
-    Raises
-    ------
-    InputError
-        If a key is unknown (the nearest known one is suggested) or missing, or a value is of
-        another type or out of its range; the place is named as ``table.key``.
+    Raises InputError if a key is unknown (the nearest known one is suggested) or missing, or a
+    value is of another type or out of its range; the place is named as ``table.key``.
     """
     from pydantic import TypeAdapter, ValidationError  # here: a fifth of a second
 
@@ -54,10 +51,8 @@ def made(kind: type[T], values: object) -> T:
 def require_types(given: object, found: object, where: str = "") -> None:
     """Compare values with what was made of them, leaf by leaf.
 
-    Raises
-    ------
-    InputError
-        If a boolean or a text became a number, a number a boolean, or a number is beyond all use.
+    Raises InputError if a boolean or a text became a number, a number a boolean, or a number is
+    beyond all use.
     """
     if isinstance(given, Mapping):
         for key, value in given.items():
