@@ -142,18 +142,12 @@ class ChebyshevField:
 
 @dataclass(frozen=True)
 class Brightness:
-    """Which of gain and offset are unknowns, and how finely they vary.
-
-    Parameters
-    ----------
-    gain_degree
-        Total degree of b; 0 is one number for the whole image, None (the default) no gain.
-    offset_degree
-        Total degree of c, likewise.
-    """
+    """Which of gain and offset are unknowns, and how finely they vary."""
 
     gain_degree: int | None = None
+    """Total degree of b; 0 is one number for the whole image, None (the default) no gain."""
     offset_degree: int | None = None
+    """Total degree of c, likewise."""
 
     def __post_init__(self) -> None:
         for name, degree in self._each:

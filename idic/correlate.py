@@ -421,8 +421,7 @@ def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> W
 
 
 _FINEST_PX = 4.0
-"""Finer speckle than this is aliased by the pixels; a blur keeps that out of what weighs the
-residual."""
+"""Finer speckle is aliased by the pixels; a blur keeps that out of what weighs the residual."""
 _ALIASED_BLUR_PX = 0.75
 """Where aliasing stands out of the noise: as little as keeps the bias at 0.2 of a standard error in
 benchmarks/small_motion.py, whose last rows have less."""

@@ -205,8 +205,7 @@ class Result:
     def residual_test(self, noise: ImageNoise | float | None = None) -> ResidualTest:
         """Whether the residual is noise: what the standard errors rest on.
 
-        With the noise of the images, or the standard deviation of both [grey levels], chi squared,
-        too.
+        With the images' noise, or the standard deviation of both [grey levels], chi squared, too.
         """
         return ResidualTest.of(
             self.residual_rms,

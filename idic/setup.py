@@ -18,43 +18,29 @@ _WIDEST_PX = 100
 
 @dataclass(frozen=True)
 class CorrelationOptions:
-    """How to correlate.
-
-    Parameters
-    ----------
-    levels
-        From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l)
-        or leave fewer than 32 px across are skipped; the last one never is.
-    edge_px
-        Pixels of the reference closer than this to the edge of a hole are left out on the
-        finest level [px].
-    order
-        Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where
-        speckles are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px.
-    gauss_newton
-        Tolerances and limits.
-    gradient
-        What weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`: the
-        gradient of the "deformed" image at x + u (the least-squares minimum), or that of the
-        "reference" at x. By default the reference's where the residual is noise, else the deformed
-        image's.
-    gradient_blur_px
-        Blur of the image that this gradient is taken of, on the finest level [px]. By default
-        none, unless the residual is noise: then the blur that makes the unknowns' variance
-        smallest.
-    final_smoothing_px
-        Blur of both images, locally normalised [px]; None for as the model error on the last
-        coarse level asks for, which is how photographs are correlated, and then on the finest
-        level alone. See :mod:`modeharvest.idic.solver.final_smoothing`.
-    """
+    """How to correlate."""
 
     levels: tuple[Level, ...] = COARSE_TO_FINE
+    """From coarse to fine. Levels that would blur a mode away (a blur above a quarter of l) or
+    leave fewer than 32 px across are skipped; the last one never is."""
     edge_px: int = 2
+    """Pixels of f closer than this to a hole's edge are left out on the finest level [px]."""
     order: int | None = None
+    """Of the spline that samples the deformed image: 3, 5 or 11. By default 5, or 11 where speckles
+    are narrower than 6.5 px: those a quintic displaces by up to 2e-3 px."""
     gauss_newton: GaussNewtonOptions = field(default_factory=GaussNewtonOptions)
+    """Tolerances and limits."""
     gradient: str | None = None
+    """What weighs the residual in the end, see :mod:`modeharvest.idic.solver.weighting`: the
+    gradient of the "deformed" image at x + u (the least-squares minimum), or that of the
+    "reference" at x. By default the latter where the residual is noise, else the former."""
     gradient_blur_px: float | None = None
+    """Blur of the image that this gradient is taken of, on the finest level [px]. By default none,
+    unless the residual is noise: then the blur that makes the unknowns' variance smallest."""
     final_smoothing_px: float | None = 0.0
+    """Blur of both images, locally normalised [px]; None for as the model error on the last coarse
+    level asks for, which is how photographs are correlated, and then on the finest level alone. See
+    :mod:`modeharvest.idic.solver.final_smoothing`."""
 
     def __post_init__(self) -> None:
         known = [gradient.value for gradient in Gradient]
@@ -127,8 +113,7 @@ class SquareLatticeOptions(AnsatzOptions):
     """
 
     start_amplitude: float = 1.0
-    """The small constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a pattern of
-    40 um."""
+    """The constant that v1 starts with [mm]; with max ||phi|| = 0.04, 1 mm is a 40 um pattern."""
     edge_px: int = 2
     order: int | None = None
     camera: bool = False

@@ -1,8 +1,7 @@
 """Run pyvale's subset DIC in the Python that has it: ``python pyvale_side.py FOLDER``.
 
 Imports nothing of modeharvest, which that Python need not have. FOLDER holds ``request.npz``: the
-images f and g, the mask, and the arguments of ``calculate_2d`` as JSON. Its result is a CSV
-beside them.
+images f and g, the mask, and the arguments of ``calculate_2d`` as JSON. A CSV is the result.
 """
 
 from __future__ import annotations

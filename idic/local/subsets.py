@@ -114,9 +114,8 @@ class SubsetOptions:
     """Least share of a subset that is material [-]. pyvale takes the pixels of a hole for speckle,
     so at less than 1 there are more subsets at holes, and they are worse."""
     largest_px: int | None = None
-    """Largest motion along either axis [px]; None: looked up in a rough field of the images
-    (``coarse_field``). pyvale's first windows are twice as large, and fail if they are much larger
-    than need be."""
+    """Largest motion along either axis [px]; None: looked up in the images' ``coarse_field``.
+    pyvale's first windows are twice as large, and fail if they are much larger than need be."""
     threads: int | None = None
     """For pyvale; None: all cores."""
 

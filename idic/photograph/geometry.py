@@ -75,8 +75,7 @@ class SpecimenTable:
     cell_size: float = math.nan
     """l [mm], the distance of neighbouring holes."""
     polygon: Corners = ()
-    """Corners (column, row) of the cellular part in the reference image [px]; found from the holes
-    otherwise."""
+    """Corners (column, row) of the cellular part in the reference [px]; else found from holes."""
     cells: str = ""
     """Or a mask image of the cellular part, white inside."""
     material: str = ""

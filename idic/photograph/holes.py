@@ -84,8 +84,7 @@ def _typical(areas: FloatArray) -> float:
 
 _ALIKE = 0.25
 """Vectors this near to each other, as a share of the pitch, stand for one of the lattice's, and
-holes for a place in it: locally, strain differs from the mean by 10 %, and holes are moulded a
-little off."""
+holes for a place in it: locally, strain differs by 10 %, and holes are moulded a little off."""
 
 
 def spanning_vectors(spots: FloatArray) -> FloatArray | None:

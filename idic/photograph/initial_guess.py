@@ -310,11 +310,14 @@ def shows_more(
     now: Ansatz, unknowns: FloatArray, before: Ansatz, unknowns_before: FloatArray
 ) -> bool:
     """Whether a part of the specimen shows a wave that it did not show before."""
-    known = _waves(before, unknowns_before)
-    return any(
-        not any(part == other and _same(xi, k) for other, k in known)
-        for part, xi in _waves(now, unknowns)
-    )
+
+    def known(taper: Taper, xi: FloatArray) -> bool:
+        return any(
+            taper == other and 0.5 * min(map(np.linalg.norm, (xi - k, xi + k))) <= SAME_WAVE
+            for other, k in _waves(before, unknowns_before)
+        )
+
+    return not all(known(*wave) for wave in _waves(now, unknowns))
 
 
 def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray]]:
@@ -324,12 +327,6 @@ def _waves(ansatz: Ansatz, unknowns: FloatArray) -> list[tuple[Taper, FloatArray
         for i, mode in enumerate(ansatz.modes)
         for wave in mode.family.waves(unknowns[ansatz.phi_slice(i)])
     ]
-
-
-def _same(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two wave vectors are one, or each other's opposite."""
-    apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
-    return bool(0.5 * apart <= SAME_WAVE)
 
 
 def _in_every_part(

@@ -80,7 +80,12 @@ def possible_motions(reference: HoleLattice, deformed: HoleLattice) -> tuple[Hol
         for step, count in steps.items()
         if count >= _RIVAL * most
     ]
-    return tuple(sorted(motions, key=lambda motion: (-len(motion), _length(motion))))
+
+    def rank(motion: HoleMotion) -> tuple[int, float]:
+        shift = (motion.after - motion.before).mean(axis=0)
+        return -len(motion), float(np.linalg.norm(shift))
+
+    return tuple(sorted(motions, key=rank))
 
 
 def _in_basis_of(reference: HoleLattice, deformed: HoleLattice) -> IntArray:
@@ -133,10 +138,6 @@ def _motion(
     return HoleMotion(before, after, rivals, tuple(text))
 
 
-def _length(motion: HoleMotion) -> float:
-    return float(np.linalg.norm((motion.after - motion.before).mean(axis=0)))
-
-
 Expected = Callable[[FloatArray], FloatArray]
 """From (n, 2) (row, col) in the reference to (n, 2) (row, col) in the deformed image [px]."""
 
@@ -158,8 +159,7 @@ class BlockMatch:
 
     before: FloatArray
     after: FloatArray
-    """(n, 2) block centres in the reference and where they correlate best, (row, col) whole pixels.
-    """
+    """(n, 2) centres in the reference and where they correlate best, (row, col) whole pixels."""
     correlation: FloatArray
     """(n,) normalised cross-correlation there [-]."""
     chance: float

@@ -121,8 +121,7 @@ class MaterialMask:
 def find_material(image: ArrayLike, options: MaterialOptions | None = None) -> MaterialMask:
     """Find the material in an image (rows, cols) of a speckled specimen, grey levels in any unit.
 
-    Raises InputError if the image is not a finite plane one larger than the window, or shows no
-    speckle.
+    Raises InputError unless it is plane, finite, larger than the window, and shows a speckle.
     """
     options = options or MaterialOptions()
     grey = _checked(image, options)

@@ -203,9 +203,8 @@ def warped_back(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Show a deformed image g (rows, cols) in the frame of the reference.
 
-    (rows, cols) (1 + b) g(x + u) + c [grey levels] with a result's displacement, and gain and
-    offset if they were unknowns; and where x + u lies inside the image. The order is the spline's,
-    3 or 5.
+    (1 + b) g(x + u) + c [grey levels] with a result's displacement, and gain and offset if they
+    were unknowns; and where x + u lies inside the image. The spline's order is 3 or 5.
     """
     grid, ansatz, a = result.grid, result.ansatz, result.unknowns
     spline = SplineImage.of(np.asarray(deformed, dtype=np.float32), order)

@@ -262,8 +262,7 @@ def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
 def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
 
-    Raises InputError if the lattice given isn't one, or its shortest distance isn't the cell size
-    within 7 %.
+    Raises InputError if it isn't one, or its shortest distance isn't the cell size within 7 %.
     """
     if lattice is None:
         return cell_size * np.eye(2)

@@ -170,8 +170,7 @@ class LevelSearch:
 def step_length(ansatz: Ansatz, grid: PixelGrid, mask: BoolArray, factor: int) -> StepLength:
     """Rms difference of two displacements over some 10^4 of the pixels [px of the full image].
 
-    The mask (rows, cols) says which pixels count; ``factor`` is the binning: a binned px is so many
-    px.
+    The mask (rows, cols) says which pixels count; a binned px is ``factor`` px.
     """
     rows, cols, some = subsampled(mask)
     x, y = grid.x[cols], grid.y[rows]

@@ -54,7 +54,8 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> C
     """
     halves = []
     for number, (a, b) in enumerate(pairwise(images), start=1):
-        left, there = _residual_variance(a[mask], b[mask]), float(b[mask].var(dtype=np.float64))
+        cov = np.cov(a[mask], b[mask], dtype=np.float64)
+        left, there = cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0], float(b[mask].var(dtype=np.float64))
         if left > _OTHER_STATE * there:
             raise InputError(
                 "images.repeats: expected exposures of the reference's state, got number "
@@ -70,12 +71,6 @@ def measured_noise(images: Sequence[NDArray[Any]], mask: NDArray[np.bool_]) -> C
             "moved between the exposures, leave the repeats out"
         )
     return CameraNoise(sd, source)
-
-
-def _residual_variance(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Variance of b - gain a - offset at the best gain and offset."""
-    covariance = np.cov(a, b, dtype=np.float64)
-    return float(covariance[1, 1] - covariance[0, 1] ** 2 / covariance[0, 0])
 
 
 def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise:

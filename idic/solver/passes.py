@@ -137,8 +137,7 @@ class Tables(NamedTuple):
     eta: NDArray[Any]
     """(rows,): normalised coordinate."""
     along_x: NDArray[Any]
-    """(1 + 2 w + n, cols): xi, then for each wave sin and cos of pi/l kx x, then for each mode s
-    tau_x."""
+    """(1 + 2 w + n, cols): xi, for each wave sin and cos of pi/l kx x, for each mode s tau_x."""
     v0: NDArray[Any]
     v: NDArray[Any]
     """(2, D0 + 1, D0 + 1) and (n, D + 1, D + 1): Chebyshev coefficients [i, j] [mm]."""

@@ -151,8 +151,7 @@ def level_pair(
 ) -> LevelPair:
     """Make one level of a pair of images.
 
-    Holes are kept out of the blur only if both masks are known: they have to look alike in the two
-    images.
+    Holes are kept out of the blur only if both masks are known: they have to look alike in both.
 
     Parameters
     ----------

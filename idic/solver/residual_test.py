@@ -2,8 +2,7 @@
 
 Noise has no correlation from one pixel to another a few pixels off; a model error shows the
 speckle's own gradient, which is correlated over a speckle. So the residual's autocorrelation
-separates the two without knowing how large the noise is; where that is known, chi squared does,
-too.
+separates the two without knowing the noise; where that is known, chi squared does, too.
 
 NaN is where no pixel counts. Each row, or row of blocks, is summed on its own, so the result does
 not depend on the number of threads.
@@ -62,8 +61,7 @@ def _products(one: Any, other: Any, n: int, products: Any, counts: Any, k: int) 
 def block_moments(f: Any, residual: Any, size: int, sums: Any) -> None:
     """Sum 1, f, g, f g, f f and g g with g = f - residual over blocks of ``size`` pixels.
 
-    Fills ``sums`` (block rows, block columns, 6); blocks at the right and at the bottom may be
-    incomplete.
+    Fills ``sums`` (block rows, block columns, 6); the last blocks may be incomplete.
     """
     rows, cols = f.shape
     for block_row in prange(sums.shape[0]):
@@ -133,8 +131,7 @@ class ResidualTest:
             Number of fitted unknowns.
         noise_sd
             Standard deviation of the residual that the images' noise predicts [grey levels], if
-            known; see :meth:`modeharvest.idic.result.Result.residual_noise`. InputError unless
-            positive.
+            known (:meth:`modeharvest.idic.result.Result.residual_noise`); InputError if not > 0.
         lags_px
             Where the autocorrelation was taken.
         """

@@ -75,8 +75,7 @@ class Weighting:
 
     gradient: Gradient = Gradient.DEFORMED
     blur_px: float = 0.0
-    """Standard deviation of the blur of the image that the gradient is taken of [px]; 0 for none.
-    """
+    """Standard deviation of a blur of the image whose gradient it is [px]; 0 for none."""
     speckle_size_px: float = np.inf
     """Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known."""
 
@@ -96,10 +95,10 @@ class Weighting:
         """Relative excess of the unknowns' variance over the Cramer-Rao bound [-].
 
         With the same noise in both images, the reference's gradient, and a speckle whose
-        autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost, (1 +
-        t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the noise
-        of an image has nothing in common with its own gradient. ``noise`` is its variance over the
-        mean square of the speckle's slope [px^2], ``order`` the spline's.
+        autocorrelation is exp(-r^2/(2 L^2)); t = (s/L)^2 for a blur s. The blur's cost,
+        (1 + t)^4/(1 + 2 t)^2, is that of weights that are not the gradient itself. The half: the
+        noise of an image has nothing in common with its own gradient. ``noise`` is its variance
+        over the mean square of the speckle's slope [px^2], ``order`` the spline's.
         """
         noise *= slope_noise(order, self.blur_px)
         if self.blur_px == 0.0:

@@ -232,7 +232,9 @@ def lattice_spectrum(
     translation = np.asarray(rule.weights @ at_points / rule.area, dtype=np.float64)
     xi = reciprocal_vectors(vectors, pitch, reach)
     half = np.flatnonzero(upward(xi) | (np.abs(xi).max(axis=1) == 0))
-    coefficients = _transformed(rule, field, xi[half], pitch)
+    weighted, positions = rule.weights[:, None] * field, -2j * np.pi / pitch * rule.positions
+    # One wave vector after the other: little memory.
+    coefficients = np.array([np.exp(positions @ vector) @ weighted for vector in xi[half]])
     # u is real: û(−ξ) is the conjugate of û(ξ).
     both = np.concatenate([xi[half], -xi[half[1:]]]) + 0.0
     u_hat = np.concatenate([coefficients, coefficients[1:].conj()])
@@ -308,15 +310,6 @@ def _check_energy(energy: float, whole: float, rule: MeshQuadrature, lattice: Fl
         )
     if not energy > 1e-24 * whole:  # that is rounding
         raise InputError("periodic field: expected more than a translation, got energy 0")
-
-
-def _transformed(
-    rule: MeshQuadrature, field: FloatArray, xi: FloatArray, pitch: float
-) -> ComplexArray:
-    """(n, 2) ∫ u exp(−2πi ξ·x/l) dA, one wave vector after the other: little memory."""
-    weighted = rule.weights[:, None] * field
-    positions = -2j * np.pi / pitch * rule.positions
-    return np.array([np.exp(positions @ vector) @ weighted for vector in xi])
 
 
 def _pair(vector: FloatArray) -> tuple[float, float]:

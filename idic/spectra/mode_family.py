@@ -28,8 +28,6 @@ from modeharvest.fem.field import Mesh
 from modeharvest.idic.modes import ModeFamily, free_family
 from modeharvest.idic.spectra.constraints import (
     SAME_AMPLITUDE,
-    RealWave,
-    Tie,
     as_rows,
     describe,
     find_ties,
@@ -110,8 +108,7 @@ class FoundFamily:
     amplitude: float
     """[unit of the field], with sign."""
     captured: float
-    """Share of ∫ |u|² over the material, translation apart, that ``amplitude`` and the start
-    describe [-]."""
+    """Share of ∫ |u|² over the material, translation apart, that amplitude and start describe."""
     growth: tuple[tuple[int, float], ...]
     """(number of waves, share captured by as many, nothing tied); goes on beyond those taken."""
     text: tuple[str, ...]
@@ -146,8 +143,7 @@ def mode_family(
     Parameters
     ----------
     mesh, lattice, values, pitch
-        As for :func:`~modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum`; the field in any
-        unit.
+        As for :func:`~modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum` [any unit].
     shared
         Look for constraints; otherwise every wave has five parameters of its own (but one).
     growth
@@ -161,22 +157,19 @@ def mode_family(
     selection = select_waves(spectrum, rule, u, growth)
     waves = real_waves(selection)
     ties = find_ties(waves)
-    family = _family(waves, ties, pitch, shared)
+    count = f"{len(waves)} wave" + "s" * (len(waves) > 1)
+    rows = as_rows(waves, pitch)
+    rows[:, :2] /= np.abs(rows[:, :2]).max()
+    if shared:
+        family = as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
+    else:
+        family = free_family(rows, f"{count}, free")
     phi = wave_values(rule, family.waves(family.start), pitch)
     amplitude, captured = best_amplitude(rule, u, phi)
     sentences = describe(selection, waves, ties if shared else [], family, captured)
     return FoundFamily(
         family, pitch, amplitude, captured, selection.growth, sentences, dict(info or {})
     )
-
-
-def _family(waves: list[RealWave], ties: list[Tie], pitch: float, shared: bool) -> ModeFamily:
-    count = f"{len(waves)} wave" + "s" * (len(waves) > 1)
-    rows = as_rows(waves, pitch)
-    rows[:, :2] /= np.abs(rows[:, :2]).max()
-    if not shared:
-        return free_family(rows, f"{count}, free")
-    return as_square(rows, pitch) or tied_family(count, waves, ties, pitch)
 
 
 def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
@@ -235,7 +228,16 @@ def write_family(
         "info": {**found.info, **(info or {})},
     }
     if spectrum is not None:
-        content["spectrum"] = _spectrum_to_dict(spectrum)
+        u = spectrum.coefficients  # as [[re, im] of u_x, [re, im] of u_y] for each wave vector
+        content["spectrum"] = {
+            "pitch": spectrum.pitch,
+            "lattice": spectrum.lattice.tolist(),
+            "energy": spectrum.energy,
+            "material": spectrum.material,
+            "translation": list(spectrum.translation),
+            "xi": spectrum.xi.tolist(),
+            "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
+        }
     try:
         json.dumps(content, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -277,17 +279,3 @@ def read_spectrum(path: Path | str) -> LatticeSpectrum | None:
             float(content["material"]),
             (float(x), float(y)),
         )
-
-
-def _spectrum_to_dict(spectrum: LatticeSpectrum) -> dict[str, Any]:
-    """Coefficients as [[re, im] of u_x, [re, im] of u_y] for each wave vector."""
-    u = spectrum.coefficients
-    return {
-        "pitch": spectrum.pitch,
-        "lattice": spectrum.lattice.tolist(),
-        "energy": spectrum.energy,
-        "material": spectrum.material,
-        "translation": list(spectrum.translation),
-        "xi": spectrum.xi.tolist(),
-        "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
-    }

@@ -105,8 +105,7 @@ def spectral_density(
     Parameters
     ----------
     mask
-        (rows, cols) True where there is material; what the displacement is elsewhere doesn't
-        matter.
+        (rows, cols) True where there is material; elsewhere the displacement doesn't matter.
     pitch
         Unit cell size l [mm].
     bins_per_cell

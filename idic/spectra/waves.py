@@ -51,8 +51,7 @@ class Peak:
     """A maximum of S_xx + S_yy outside the edges' lines."""
 
     xi: tuple[float, float]
-    """Wave vector (ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since S(−ξ) =
-    S(ξ)."""
+    """(ξ1, ξ2) [1/l], in the half plane ξ2 > 0, or ξ1 > 0 on its border, since S(−ξ) = S(ξ)."""
     density: float
     """S_xx + S_yy there [mm⁶]."""
     contrast: float
@@ -218,8 +217,7 @@ PEAK_SHARE = 0.02
 """Least density of a candidate, of the largest peak's. A wave this weak is 14 % as strong, and
 what a fit over the holes' gaps can't distinguish only makes it ill-conditioned."""
 SAME_DENSITY = 0.02
-"""Relative difference of densities that are called equal, 1 % of the amplitude. Symmetric meshes
-reach 1e-7."""
+"""Relative difference of equal densities, 1 % of the amplitude. Symmetric meshes reach 1e-7."""
 SAME_LENGTH = 1e-3
 """Relative difference of wave numbers that are called equal: for lattices given with few digits."""
 GROWTH = 0.04
