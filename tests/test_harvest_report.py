@@ -43,9 +43,8 @@ from modeharvest.report.photographs import (
     photograph_panels,
     photographs_report,
 )
-from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
+from modeharvest.runs.photographs.results import Harvest
 from modeharvest.runs.photographs.summary import harvest_summary
-from modeharvest.util.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -327,29 +326,6 @@ def test_buckling_is_told_as_far_as_it_is_known(
     keys = key_numbers(summary | {"buckling": buckling, "truth": []})
     assert next(key for key in keys if key.name == "buckling").value == value
     assert keys[0].value == "2 of 3"
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"frames": ()}, "expected at least one deformed photograph"),
-        ({"mask": np.ones((3, 3), dtype=np.bool_)}, r"got \(3, 3\) for mask"),
-        ({"experiment": {}}, "cell_size"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(
-    harvest: Harvest, change: dict[str, Any], said: str
-) -> None:
-    with pytest.raises(InputError, match=said):
-        replace(harvest, **change)
-
-
-def test_two_photographs_of_one_name_are_refused(harvest: Harvest) -> None:
-    frame: HarvestedFrame = harvest.frames[0]
-    with pytest.raises(InputError, match="names that differ"):
-        replace(harvest, frames=(frame, frame))
-    with pytest.raises(InputError, match="error bars of shape"):
-        replace(frame, error_x=frame.error_x[:-1])
 
 
 def _area(corners: np.ndarray[Any, Any]) -> float:

@@ -27,7 +27,6 @@ from modeharvest.report.lattice import (
 )
 from modeharvest.report.model import write_page
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField, summary_of
-from modeharvest.util.errors import InputError
 
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
 
@@ -142,11 +141,6 @@ def test_a_mode_is_no_equilibrium_and_a_small_pattern_is_magnified(tmp_path: Pat
     assert "a mode, no equilibrium; largest displacement 0.16 l" in text
     # drawn with 0.12 l instead of 0.016 l
     assert "stable; fluctuation × 7.5" in text
-
-
-def test_patterns_without_modes_are_refused() -> None:
-    with pytest.raises(InputError, match="expected the modes of the patterns"):
-        made_up.run(modes=None)
 
 
 def test_progress_is_told_up_to_the_end(tmp_path: Path) -> None:

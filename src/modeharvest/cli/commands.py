@@ -17,7 +17,6 @@ from modeharvest.util.errors import InputError
 
 if TYPE_CHECKING:
     from modeharvest.runs.experiment import Run
-    from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
 
 def cases(
@@ -132,12 +131,7 @@ def bloch(case: CaseName, out: OutFolder) -> None:
     Leaves the first critical load and waves with their proof, the lowest eigenvalues against the
     wave vector at several loads (dispersion.csv, dispersion.h5), report.html and summary.json.
     """
-    from modeharvest.report.lattice import lattice_report
-    from modeharvest.report.model import print_report
-
-    with _analysis(case, out) as analysis:
-        summary = analysis.bloch()
-    print_report(lattice_report(summary), out)
+    _analyse(case, out, whole=False)
 
 
 def modes(case: CaseName, out: OutFolder) -> None:
@@ -146,24 +140,22 @@ def modes(case: CaseName, out: OutFolder) -> None:
     Does what 'bloch' does, unless that is there already, and goes on: real modes on the smallest
     cell, branches with their energies, spectra, and the Fourier mode families found in them.
     """
+    _analyse(case, out, whole=True)
+
+
+def _analyse(case: str, out: Path, whole: bool) -> None:
+    """Analyse a lattice under progress bars, and print its report."""
     from modeharvest.report.lattice import lattice_report
     from modeharvest.report.model import print_report
-
-    with _analysis(case, out) as analysis:
-        summary = analysis.all()
-    print_report(lattice_report(summary), out)
-
-
-@contextmanager
-def _analysis(case: str, out: Path) -> Iterator[LatticeAnalysis]:
-    """The analysis of a lattice's case, under progress bars."""
     from modeharvest.runs.lattice.case import LatticeCase
 
     checked = LatticeCase.read(case)
     from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 
     with bars() as progress:
-        yield LatticeAnalysis(checked, out, progress, case)
+        analysis = LatticeAnalysis(checked, out, progress, case)
+        summary = analysis.all() if whole else analysis.bloch()
+    print_report(lattice_report(summary), out)
 
 
 def _example(wanted: bool) -> None:

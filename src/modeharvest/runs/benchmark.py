@@ -52,25 +52,11 @@ def grade_star(
 ) -> StarGrading:
     """Grade fields measured on a star set; leaves a report, JSON and CSV in ``out``.
 
-    Parameters
-    ----------
-    fields
-        Files of the deformed image, with what they don't say themselves.
-    stills
-        Files of the image without motion, one for each field in the same order; or none.
-    folder
-        The star set.
-
-    Returns
-    -------
-    StarGrading
-        Of the fields that can be graded; those that can't be read, are of another set, in
-        millimetres or don't contain the wave are in its ``refused``, each with the reason.
-
-    Raises
-    ------
-    InputError
-        If no field can be graded, or two have one name.
+    ``fields``: files of the deformed image, with what they don't say themselves; ``stills``: files
+    of the image without motion, one for each field in the same order, or none; ``folder``: the star
+    set. Fields that can't be read, are of another set, in millimetres or don't contain the wave are
+    in the result's ``refused``, each with the reason. Raises InputError if no field can be graded,
+    or two have one name.
     """
     if stills and len(stills) != len(fields):
         raise InputError(
@@ -111,26 +97,11 @@ def make_benchmark(
 ) -> dict[str, Any]:
     """Simulate a case, image it, and part the images from their truth; resumed as every run.
 
-    Parameters
-    ----------
-    case
-        A shipped case's name, the path of a TOML file, or a Case.
-    public, truth
-        Folder for what anybody may have, and for the truth; that is by default beside the public
-        one, with "-truth" after its name.
-    solution
-        Use this solution (HDF5) instead of simulating.
-
-    Returns
-    -------
-    dict
-        The content of the public ``benchmark.json``.
-
-    Raises
-    ------
-    InputError
-        If the case's images are distorted, the truth would be in the public folder, the solution
-        is of another case, or another process works in one of the folders.
+    ``case``: a shipped case's name, the path of a TOML file, or a Case; ``public``: folder for what
+    anybody may have; ``truth``: for the truth, by default beside it, with "-truth" after its name;
+    ``solution``: use this (HDF5) instead of simulating. Returns the content of the public
+    ``benchmark.json``. Raises InputError if the case's images are distorted, the truth would be in
+    the public folder, the solution is of another case, or another process works in a folder.
     """
     case, public = Case.of(case), Path(public)
     require_no_lens(case.imaging)

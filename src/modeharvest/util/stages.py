@@ -114,19 +114,10 @@ class Stages:
     ) -> None:
         """Do the work unless it was finished with the same key and its files are whole.
 
-        Parameters
-        ----------
-        key
-            See :func:`stage_key`.
-        work
-            Leaves files in the folder and returns their paths.
-        collective
-            Under mpirun, all ranks work; otherwise rank 0 does, and the others wait.
-
-        Raises
-        ------
-        InputError
-            If the disk refuses or another process works in the folder, and what the work raises.
+        ``key``: see :func:`stage_key`; ``work`` leaves files in the folder and returns their paths;
+        ``collective``: under mpirun all ranks work, otherwise rank 0 does, and the others wait.
+        Raises InputError if the disk refuses or another process works in the folder, and what the
+        work raises.
         """
         if on_first(lambda: self.is_finished(name, key)):
             return

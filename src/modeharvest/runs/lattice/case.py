@@ -377,18 +377,10 @@ class StudyPlan:
     Every ratio under every loading, and where the pattern stops being what buckles first; other
     unit cell sizes and materials at the case's own d/l and loading.
 
-    Parameters
-    ----------
-    ratios, overlays
-        d/l [-], and those of the pictures of numerical over analytic mode.
-    loadings
-        "uniaxial", "uniaxial-strain", "equibiaxial".
-    pitches, materials
-        Other l [mm]; names of other materials, among ``STUDIED_MATERIALS``.
-    divisions
-        Elements along l.
-    largest
-        Load up to which to look for critical points [-].
+    ``ratios``, and ``overlays`` of the pictures of numerical over analytic mode: d/l [-];
+    ``loadings``: "uniaxial", "uniaxial-strain", "equibiaxial"; ``pitches``: other l [mm];
+    ``materials``: names among ``STUDIED_MATERIALS``; ``divisions``: elements along l; ``largest``:
+    load up to which to look for critical points [-].
     """
 
     ratios: tuple[float, ...] = RATIOS

@@ -8,7 +8,7 @@ the least stable wave (see ``fem.bloch.zone.LeastStable``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.modes import Branch, ModeSet
-from modeharvest.idic.spectra.mode_family import read_family, read_spectrum, write_family
+from modeharvest.idic.spectra.mode_family import read_family, read_spectrum
 from modeharvest.runs.lattice import results
 from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, PeriodicField
@@ -38,7 +38,7 @@ BEYOND = (1.02, 1.1, 1.25, 1.5)
 
 def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
     """Write ``critical.json``."""
-    point = _in_order(CriticalPoint.of(loading, found))
+    point = CriticalPoint.of(loading, found)
     write_json(path, {"point": to_plain(point), "history": to_plain(found.history)})
 
 
@@ -46,14 +46,6 @@ def read_critical(path: Path) -> CriticalPoint:
     """Read the point in ``critical.json``; InputError if it is damaged."""
     with reading(path, "a critical point", "remove it"):
         return made(CriticalPoint, read_json(path)["point"])
-
-
-def _in_order(point: CriticalPoint) -> CriticalPoint:
-    """The same with its waves by phases, the largest first: rounding must not number the modes."""
-    every = zip(point.waves, point.below, point.above, strict=True)
-    ordered = sorted(every, key=lambda one: [-round(phase, 3) for phase in one[0]])
-    waves, below, above = zip(*ordered, strict=True) if ordered else ((), (), ())
-    return replace(point, waves=waves, below=below, above=above)
 
 
 @dataclass(frozen=True)
@@ -208,14 +200,8 @@ def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
     return np.asarray(np.mod(fractional, 1.0))  # -1e-17 has become 1
 
 
-def find_family(pattern: PeriodicField, pitch: float, folder: Path) -> None:
-    """Find the family of a pattern and write it, with its Fourier coefficients, as JSON."""
-    found = pattern.analysed(pitch)
-    write_family(folder / pattern.file, found.family, spectrum=found.spectrum)
-
-
 def found_pattern(pattern: PeriodicField, folder: Path) -> FoundPattern:
-    """A pattern with the family and spectrum that :func:`find_family` left; InputError if not."""
+    """A pattern with the family and spectrum that its file has; InputError if it lacks them."""
     path = folder / pattern.file
     family, spectrum = read_family(path), read_spectrum(path)
     if spectrum is None:

@@ -12,32 +12,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from modeharvest.fem.bloch import modes as mode_files
 from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap, dispersion, zone_map
-from modeharvest.fem.bloch.modes import (
-    Branch,
-    ModeSet,
-    read_modes,
-    write_modes,
-    write_vtu,
-    write_xdmf,
-)
+from modeharvest.fem.bloch.modes import Branch, ModeSet
+from modeharvest.idic.spectra.mode_family import write_family
+from modeharvest.runs.lattice import results
 from modeharvest.runs.lattice.case import LatticeCase, stage_keys
 from modeharvest.runs.lattice.modes import (
     LatticeModel,
-    find_family,
     found_pattern,
     read_critical,
     to_be_shown,
     write_critical,
 )
-from modeharvest.runs.lattice.results import (
-    CriticalPoint,
-    LatticeRun,
-    PeriodicField,
-    exports_in,
-    summary_of,
-    write_dispersion_table,
-)
+from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
@@ -77,7 +65,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             if plan.map_divisions:
                 zone.append(zone_map(cell_path, critical.load, plan.map_divisions, self.progress))
             replace(found, zone=tuple(zone)).write(path)
-            write_dispersion_table(found, table)
+            results.write_dispersion_table(found, table)
             return path, table
 
         return self.do("dispersion", self._keys["dispersion"], work, lambda: Dispersion.read(path))
@@ -92,16 +80,16 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         if self._model.why_no_modes(critical):
             return None, ()
         path = self.folder / "modes.h5"
-        others = {write_vtu: path.with_suffix(".vtu"), write_xdmf: path.with_suffix(".xdmf")}
+        vtu, xdmf = path.with_suffix(".vtu"), path.with_suffix(".xdmf")
 
         def work() -> tuple[Path, ...]:
             found = self._model.modes(critical, self._info(critical))
-            write_modes(path, *found)
-            for write, other in others.items():
-                write(other, *found)
-            return path, *others.values()
+            mode_files.write_modes(path, *found)
+            mode_files.write_vtu(vtu, *found)
+            mode_files.write_xdmf(xdmf, *found)
+            return path, vtu, xdmf
 
-        return self.do("modes", self._keys["modes"], work, lambda: read_modes(path))
+        return self.do("modes", self._keys["modes"], work, lambda: mode_files.read_modes(path))
 
     def families(self) -> None:
         """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
@@ -111,7 +99,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         def work() -> list[Path]:
             for k, pattern in enumerate(self._patterns):
                 self.progress(k, len(self._patterns), "mode families")
-                find_family(pattern, self.case.lattice.pitch, self.folder)
+                found = pattern.analysed(self.case.lattice.pitch)
+                write_family(self.folder / pattern.file, found.family, spectrum=found.spectrum)
             self.progress(1, 1, "mode families")
             write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
             return [index, *(self.folder / pattern.file for pattern in self._patterns)]
@@ -140,7 +129,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         Whatever was computed in this folder for this very case is in it.
         """
         path, page = self.folder / "summary.json", self.folder / "report.html"
-        done = self._finished()
+        done = {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
 
         def work() -> tuple[Path, ...]:
             from modeharvest.report.lattice import lattice_report
@@ -148,7 +137,9 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
             run = self._run(done)
             families = self._patterns if "families" in done else []
-            summary = summary_of(run, [found_pattern(field, self.folder) for field in families])
+            summary = results.summary_of(
+                run, [found_pattern(field, self.folder) for field in families]
+            )
             write_page(lattice_report(summary, run), page, self.progress)
             write_json(path, summary)
             return path, page
@@ -222,14 +213,10 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             study=self.case.run_study(self.folder / "study.csv", self.progress)
             if "study" in done else None,  # of which the rows are all there
             notes=[note for note in (self._model.why_no_modes(critical),) if note],
-            exports=exports_in(self.folder),
+            exports=results.exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )  # fmt: skip
 
     @cached_property
     def _keys(self) -> dict[str, str]:
         return stage_keys(self.case)
-
-    def _finished(self) -> dict[str, str]:
-        """The keys of the stages that are finished for this very case."""
-        return {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}

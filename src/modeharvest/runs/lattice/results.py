@@ -20,7 +20,6 @@ from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.studies.lattice import LatticeModeStudy
@@ -69,10 +68,13 @@ class CriticalPoint:
 
     @classmethod
     def of(cls, loading: str, found: LatticeCritical) -> CriticalPoint:
-        """Take the plain values of a search's result."""
+        """A search's result, waves by phases, the largest first: rounding must not number them."""
+        every = zip(found.waves, found.below, found.above, strict=True)
+        ordered = sorted(every, key=lambda one: [-round(phase, 3) for phase in one[0]])
+        waves, below, above = zip(*ordered, strict=True) if ordered else ((), (), ())
         least = found.least_stable
-        return cls(loading, found.load, found.found, found.outcome, found.waves, found.below,
-                   found.above, found.unstable_before, least.value, least.angle)  # fmt: skip
+        return cls(loading, found.load, found.found, found.outcome, waves, below, above,
+                   found.unstable_before, least.value, least.angle)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -170,26 +172,11 @@ class FoundPattern(PeriodicField):
 class LatticeRun:
     """All that the report of a lattice shows; what is None or empty is left out.
 
-    Parameters
-    ----------
-    case, command
-        What was run, as plain values, and what makes this page again.
-    mesh, lattice
-        Primitive cell [mm], and its (2, 2) lattice vectors as rows [mm].
-    pitch
-        Unit cell size l [mm].
-    dispersion
-        Lowest eigenvalues along a path and over the zone.
-    modes, branches
-        At the critical point, and what leaves there.
-    patterns
-        On the cell of ``modes``; the first is shown at the top.
-    study
-        How the pattern depends on d/l and more.
-    exports
-        Files beside the page, and what each holds.
-    notes
-        What a reader should know before trusting the numbers.
+    ``case``: what was run, as plain values, and ``command``: what makes this page again. ``mesh``,
+    ``lattice``: the primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]; ``pitch``:
+    unit cell size l [mm]. ``patterns`` are on the cell of ``modes``, the first is shown at the top.
+    ``exports``: files beside the page, and what each holds; ``notes``: what a reader should know
+    before trusting the numbers.
     """
 
     title: str
@@ -207,10 +194,6 @@ class LatticeRun:
     exports: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.patterns and self.modes is None:
-            raise InputError("lattice report: expected the modes of the patterns, got none")
 
 
 _EXPORTS = {

@@ -1,12 +1,5 @@
 """Photographs made ready for correlation: files found, lens, ideal images, masks, local fields.
 
-::
-
-    distortion.json  calibration.json            S, if it is calibrated, and how
-    prepared/reference.tif  reference_mask.tif
-    prepared/NAME.tif       NAME_mask.tif        of each deformed image
-    prepared/prepared.json                       what was done and what was skipped; written last
-
 The images are grey levels as the camera counts them, float32, on the ideal pixel grid; the masks
 are white on material. A local DIC's field is another code's file, or pyvale's subsets.
 """
@@ -59,20 +52,10 @@ PREPARED_FILE = "prepared.json"
 class PreparedPhotographs:
     """Photographs on the ideal grid, in a folder; read when asked for.
 
-    Parameters
-    ----------
-    folder
-        Where they are; its ``prepared.json`` has the rest.
-    names
-        Of the deformed images that can be used, in the order of the test.
-    skipped
-        Name of each file that can't be used, and why.
-    grid
-        The ideal pixels; the physical origin is the middle of the image.
-    full_scale
-        Largest grey level of the camera.
-    notes
-        What was done to the photographs.
+    ``folder`` has the files, and the rest in its ``prepared.json``: ``names`` of the deformed
+    images that can be used, in the order of the test; ``skipped``: the name of each file that can't
+    be used, and why; ``grid``: the ideal pixels, the physical origin is the middle of the image;
+    ``full_scale``: the camera's largest grey level; ``notes``: what was done to the photographs.
     """
 
     folder: Path

@@ -29,7 +29,6 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
-from modeharvest.util.errors import InputError
 from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
 
 
@@ -91,15 +90,6 @@ class HarvestedFrame:
     local: LocalField | None = None
     start_text: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        expected = (len(self.error_y), len(self.error_x), 2)
-        for errors in (self.by_noise, self.by_model_error):
-            if errors is not None and errors.v0.shape != expected:
-                raise InputError(
-                    f"harvest {self.name}: expected error bars of shape {expected} like their "
-                    f"axes, got {errors.v0.shape}"
-                )
 
     @property
     def modes(self) -> range:
@@ -203,22 +193,6 @@ class Harvest:
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        images = {"reference": self.reference, "mask": self.mask}
-        for name, image in (images | {frame.name: frame.image for frame in self.frames}).items():
-            if image.shape != self.grid.shape:
-                raise InputError(
-                    f"harvest: expected images of {self.grid.shape} px like the grid, got "
-                    f"{image.shape} for {name}"
-                )
-        if not self.frames:
-            raise InputError("harvest: expected at least one deformed photograph, got none")
-        names = [frame.name for frame in self.frames]
-        if len(set(names)) < len(names):
-            raise InputError(f"harvest: expected names that differ, got {', '.join(names)}")
-        if not self.pitch > 0:
-            raise InputError("harvest: expected specimen.cell_size above 0 mm in the experiment")
 
     @property
     def pitch(self) -> float:
