@@ -97,12 +97,9 @@ class Stages:
     def is_finished(self, name: str, key: str) -> bool:
         """Whether a stage was finished with this key, and its files are what it wrote."""
         stage = self._record().get(name)
-        if not isinstance(stage, dict) or stage.get("key") != key:
-            return False
-        files = stage.get("files")
-        return isinstance(files, dict) and all(
-            _is_whole(self.folder / path, entry) for path, entry in files.items()
-        )
+        return stage is not None and stage.get("key") == key and all(
+            _is_whole(self.folder / path, entry) for path, entry in stage["files"].items()
+        )  # fmt: skip
 
     def do(
         self,
@@ -135,8 +132,7 @@ class Stages:
         """
         name = path.relative_to(self.folder).as_posix()
         for stage in self._record().values():
-            files = stage.get("files") if isinstance(stage, dict) else None
-            if isinstance(files, dict) and name in files and not _is_whole(path, files[name]):
+            if name in stage["files"] and not _is_whole(path, stage["files"][name]):
                 raise InputError(
                     f"expected {path} as {RECORD} has its SHA-256, got another file or none; "
                     f"{advice}"
@@ -151,24 +147,24 @@ class Stages:
         """Take down what a stage took [s]."""
         write_json(self.folder / TIMINGS, {**self.timings, name: seconds})
 
-    def _record(self) -> dict[str, Any]:
-        return _table(self.folder / RECORD)
+    def _record(self) -> dict[str, dict[str, Any]]:
+        """The finished stages; what makes no sense, as in a damaged file, is left out."""
+        every = _table(self.folder / RECORD).items()
+        return {n: s for n, s in every if isinstance(s, dict) and isinstance(s.get("files"), dict)}
 
     def _forget(self, name: str) -> None:
         """Remove a stage's files, which are of other inputs; its record first."""
         record = self._record()
-        stage = record.pop(name, {})
+        stage = record.pop(name, {"files": {}})
         write_json(self.folder / RECORD, record)
-        files = stage.get("files") if isinstance(stage, dict) else {}
-        for path in map(Path, files or {}):
+        for path in map(Path, stage["files"]):
             if not path.is_absolute() and ".." not in path.parts:  # whatever the record says
                 (self.folder / path).unlink(missing_ok=True)
 
     def _remember(self, name: str, key: str, files: Iterable[Path]) -> None:
         """Take down that a stage is finished."""
         entries = {path.relative_to(self.folder).as_posix(): _entry(path) for path in files}
-        stage = {"key": key, "files": entries}
-        record = {**self._record(), name: stage}
+        record = {**self._record(), name: {"key": key, "files": entries}}
         write_json(self.folder / RECORD, dict(sorted(record.items())))
 
 

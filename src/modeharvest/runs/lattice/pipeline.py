@@ -136,10 +136,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             from modeharvest.report.model import write_page
 
             run = self._run(done)
-            families = self._patterns if "families" in done else []
-            summary = results.summary_of(
-                run, [found_pattern(field, self.folder) for field in families]
-            )
+            fields = self._patterns if "families" in done else []
+            summary = results.summary_of(run, [found_pattern(it, self.folder) for it in fields])
             write_page(lattice_report(summary, run), page, self.progress)
             write_json(path, summary)
             return path, page
