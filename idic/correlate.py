@@ -272,7 +272,8 @@ class _Course:
         edge_px, before = self.options.edge_px, a
         history: tuple[Iteration, ...] = ()
         for level in levels:
-            finest, own_order = level is levels[-1], order if level == FULL else min(order, 5)
+            finest = level is levels[-1]
+            own_order = order if level == FULL else min(order, 5)
             normalised = ansatz.brightness.size > 0 and not finest
             search = LevelSearch(
                 level_pair(pair, level, edge_px, own_order, normalised=normalised),

@@ -88,7 +88,7 @@ class PlaneWave:
 
 
 def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
-    """All maxima of S_xx + S_yy outside the edges' lines, largest first."""
+    """All maxima of S_xx + S_yy outside the edges' lines, or clear ones on a line, by size."""
     xi1, xi2, S_xx, S_yy = spectrum.window(xi_max)
     S = S_xx + S_yy
     lobes = [spectrum.pitch / size for size in spectrum.extent]
