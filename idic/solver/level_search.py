@@ -125,6 +125,11 @@ class LevelSearch:
     def _all_pixels(self) -> Assembly:
         return Assembly(self.ansatz, self.pair.grid, self.pair.mask)
 
+    @cached_property
+    def _material(self) -> NDArray[np.int64]:
+        """(rows,) pixels of the level's mask."""
+        return np.asarray(np.count_nonzero(self.pair.mask, axis=1))
+
     def _thinned(self, assembly: Assembly) -> Assembly:
         """One row of a few, if that leaves plenty of pixels."""
         if assembly.pixels < _STRIDE * _PLENTY * self.ansatz.size:
@@ -148,8 +153,7 @@ class LevelSearch:
         """
         limits, factor = self.options, self.level.factor
         rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
-        material = max(1, np.count_nonzero(self.pair.mask[rows]))
-        kept = (assembly.pixels + assembly.outside) / material
+        kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
         most = min(1.0, limits.max_outside / kept) if kept > 0 else limits.max_outside
         tolerance = limits.coarse_tolerance_px * factor if leads else limits.tolerance_px
         return minimise(
