@@ -59,14 +59,12 @@ class Experiment:
     edges : loaded edges "clamped" or "sliding".
     branches : what to keep above the critical strain, out of "primary" (unstable there), "buckled+"
         and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
-    imperfection : scatter of the holes; with any, there is no bifurcation to find and the one
-        natural path is followed.
+    imperfection : scatter of the holes; with any, there is no bifurcation but one natural path.
     tilt : by how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
         about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not
         quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
     guided : fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail
-        would; ``holes_y`` has to be even, rows not staggered. Keeps a long specimen from bowing
-        sideways.
+        would; ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing.
     """
 
     specimen: Specimen = field(default_factory=Specimen)

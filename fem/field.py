@@ -1,7 +1,6 @@
 """A mesh, nodal displacements on it, and how they came about: plain numpy, no dolfinx.
 
-This is what the finite-element side hands to everything else. The file is HDF5 and can be
-read with h5py alone::
+What finite elements hand to everything else. The file is HDF5, readable with h5py alone::
 
     nodes (n, 2) [mm]    cells (m, k)    @element @geometry @material @versions @seed
     snapshots/0000/displacement (n, 2) [mm]    @nominal_strain @branch ...
@@ -84,14 +83,11 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 class Snapshot:
     """One equilibrium state, with the displacement (n, 2) at the mesh's nodes [mm].
 
-    nominal_strain : applied shortening over L, the length of the cellular part [-]; compression
-        positive.
-    reaction, energy : compressive force on the loaded edge [N/mm] and stored energy [N], per unit
-        thickness.
-    negative_pivots : number of negative eigenvalues of the tangent stiffness; 0 means stable, None
-        unknown.
-    eigenvalues : lowest eigenvalues of K x = lambda M x, ascending [N/mm^4]; M is the mass matrix
-        of unit density. Empty where none were computed.
+    nominal_strain : applied shortening over L, the length of the cellular part [-].
+    reaction, energy : compressive force on the loaded edge [N/mm], stored energy [N], by thickness.
+    negative_pivots : negative eigenvalues of the tangent stiffness; 0: stable, None: unknown.
+    eigenvalues : lowest ones of K x = lambda M x, ascending [N/mm^4], where they were computed; M
+        is the mass matrix of unit density.
     branch : "primary", "buckled+" or "buckled-".
     """
 
@@ -185,11 +181,10 @@ class Solution:
 
 def in_space(mesh: Mesh, fields: Mapping[str, FloatArray]) -> meshio.Mesh:
     """A mesh with nodal vectors (n, 2) by name, all in three dimensions: VTK knows no plane."""
-    nodes, *vectors = (
-        np.pad(values, ((0, 0), (0, 1))) for values in (mesh.nodes, *fields.values())
-    )
+    flat = ((0, 0), (0, 1))
+    data = {name: np.pad(values, flat) for name, values in fields.items()}
     cells = [(_MESHIO_NAME[mesh.element], mesh.cells)]
-    return meshio.Mesh(nodes, cells, point_data=dict(zip(fields, vectors, strict=True)))
+    return meshio.Mesh(np.pad(mesh.nodes, flat), cells, point_data=data)
 
 
 def write_mesh(file: h5py.File, mesh: Mesh) -> None:

@@ -2,10 +2,6 @@
 
 Total Lagrangian, plane strain, six-node triangles with the three-point Gauss rule, as in the
 paper's section "Virtual Experiments". A material states its energy; the rest is derived.
-
-:class:`FreeBody` is such a body without any constraint, of which periodic cells are made: dolfinx
-assembles, plain numpy and scipy take over, in the order of the mesh's nodes, the two components
-of a node side by side, on one rank.
 """
 
 from __future__ import annotations
@@ -65,7 +61,10 @@ class Hyperelastic:
 
 
 class FreeBody:
-    """Total-Lagrangian finite elements of a T6 mesh in plane strain, in the order of its nodes."""
+    """A body without any constraint, on one rank, of which periodic cells are made.
+
+    All is in the order of the mesh's nodes, the two components of a node side by side.
+    """
 
     def __init__(self, mesh: Mesh, material: Material) -> None:
         self.mesh = mesh

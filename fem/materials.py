@@ -160,7 +160,7 @@ def _series(s: Any, m: float) -> Any:
     for k in range(_SERIES_TERMS):
         ratio = (0.25 * m**2 - k**2) / ((k + 1.0) * (k + 0.5))
         coefficients.append(coefficients[-1] * ratio)
-    value = coefficients[-1]
-    for a in reversed(coefficients[:-1]):
+    *others, value = coefficients
+    for a in reversed(others):
         value = value * s + a
     return value

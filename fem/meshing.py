@@ -1,8 +1,7 @@
 """T6 meshes with the specimen's own symmetries: one quarter cell, mirrored and tiled.
 
-A mesh without the mirror symmetries turns the bifurcation into an imperfect one, and Newton
-slips onto a branch unnoticed. So gmsh meshes only a few small blocks (a quarter of a unit
-cell for each diameter, a piece of each bulk strip, a corner), whose shared sides are divided
+A mesh without the mirror symmetries turns the bifurcation into an imperfect one, and Newton slips
+onto a branch unnoticed. So gmsh meshes only a few small blocks, whose shared sides are divided
 alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on the ellipse.
 """
 
@@ -102,8 +101,6 @@ def quarter_polygon(
 
     InputError if ``size`` leaves fewer than two elements on a quarter of the hole's edge.
 
-    Parameters
-    ----------
     heights : of the cell's upper side at x = width and at x = 0 [mm]; the same for a rectangle.
     width : half the cell's width [mm].
     radii : the hole's, along x and y [mm].
@@ -237,8 +234,6 @@ def mesh_block(
 ) -> MeshBlock:
     """Let gmsh mesh a polygon with T6 elements.
 
-    Parameters
-    ----------
     corners, divisions : the polygon's corners, counter-clockwise [mm]; number of elements on each
         side, the first from the first corner to the second.
     arcs : numbers of those sides that are arcs about the origin: of a circle, or, where they end on

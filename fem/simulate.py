@@ -166,11 +166,8 @@ class _Run:
         self, path: Sequence[State], limit: float, branches: dict[str, list[State]]
     ) -> list[Snapshot]:
         beyond = np.inf if "primary" in self.experiment.branches else limit
-        kept = [
-            (state, "primary")
-            for state in path
-            if _is_among(state.strain, self.experiment.strains) and state.strain <= beyond
-        ]
+        met = (s for s in path if _is_among(s.strain, self.experiment.strains))
+        kept = [(state, "primary") for state in met if state.strain <= beyond]
         kept += [(state, name) for name, states in branches.items() for state in states]
         kept.sort(key=lambda item: (item[0].strain, item[0].negative_pivots))
         structure, length = self.follower.structure, self.experiment.specimen.length
@@ -195,10 +192,8 @@ class _Run:
     def _critical_info(self, critical: Critical) -> dict[str, Any]:
         mode, overlaps = critical.modes[0], {}
         if not self.experiment.specimen.is_staggered:
-            overlaps = {
-                "pattern_overlap": self._pattern_overlap(mode),
-                "pattern_overlap_by_cell": self._pattern_share(mode),
-            }
+            overlaps["pattern_overlap"] = self._pattern_overlap(mode)
+            overlaps["pattern_overlap_by_cell"] = self._pattern_share(mode)
         return {
             "strain": critical.strain,
             "tolerance": self.experiment.path.critical_tolerance,
@@ -284,8 +279,6 @@ def simulate_pattern(
     ``strain`` and ``pattern_overlap_by_cell``, the buckling mode's share. ``info["outcome"]`` is
     "complete" or the reason why not.
 
-    Parameters
-    ----------
     experiment, mesh : its strains and branches are not used; the mesh of its specimen.
     pattern, target : what is measured, and the amplitude to be reached [mm].
     largest_strain : up to which to look for the first critical point [-].

@@ -45,22 +45,18 @@ class Specimen:
 
     In triangular stacking every second row, counted from below, has one hole less: no hole is cut,
     the specimen is symmetric about the y axis, and with an odd number of rows about the x axis too.
-    The cellular part is the bounding box of the holes' cells; what is left of it at the ends of the
-    shorter rows, and between the cells at top and bottom, is solid.
+    The cellular part is the bounding box of the holes' cells; what these leave of it is solid.
 
     holes_x, holes_y : number of holes in a row, along the loading direction; number of rows.
-    diameter : hole diameter d, of an ellipse that along x [mm]; of a graded specimen, the one at
-        its centre.
+    diameter : hole diameter d, of ellipses along x, of a graded specimen at its centre [mm].
     pitch : centre-to-centre distance l along a row, the unit cell size [mm].
-    bulk_x, bulk_y : width of the solid strips beside the cellular part, at the loaded edges and at
-        the free edges [mm]; 0 leaves them out.
+    bulk_x, bulk_y : width of the solid strips at loaded and at free edges [mm]; 0: none.
     grading_x, grading_y : change of the diameter from hole to hole, per distance of their centres
         in the loading and in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x +
         grading_y y. A specimen graded in one direction keeps its mirror symmetry in the other.
         Ellipses keep their aspect.
     stacking : "square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``.
-    pitch_y : distance of the rows [mm], of rectangular stacking; that of the others follows from
-        ``pitch``.
+    pitch_y : distance of the rows [mm] of rectangular stacking; others have it from ``pitch``.
     diameter_y : diameter of elliptical holes along y [mm]; None for round ones.
     """
 
@@ -82,10 +78,8 @@ class Specimen:
                 f"specimen: expected 1 x 1 to {MOST_HOLES} x {MOST_HOLES} holes, got "
                 f"{self.holes_x} x {self.holes_y}; set holes_x and holes_y"
             )
-        if self.stacking not in STACKINGS:
-            raise InputError(
-                f"specimen: expected a stacking among {list(STACKINGS)}, got {self.stacking!r}"
-            )
+        if self.stacking not in (known := list(STACKINGS)):
+            raise InputError(f"specimen: expected a stacking among {known}, got {self.stacking!r}")
         if (self.pitch_y is None) == (STACKINGS[self.stacking].rise is None):
             raise InputError(
                 f"specimen: expected {'a' if self.pitch_y is None else 'no'} pitch_y for "
@@ -282,7 +276,6 @@ class Imperfection:
 
     position_sd : standard deviation of each coordinate of a hole's centre [mm].
     diameter_sd : standard deviation of a hole's diameter [mm].
-    seed : seed of the random generator.
     """
 
     position_sd: float = 0.0

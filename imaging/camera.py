@@ -100,8 +100,7 @@ class ImageRecord:
     """What the sidecar of a set says of an image.
 
     image, camera_image, mask : files without noise, as exposed, and of where there is material.
-    noise_sd : root mean square over the material of the camera image's predicted noise [fraction of
-        full scale].
+    noise_sd : rms of the camera image's predicted noise on the material [fraction of full scale].
     saturated_px, doubly_covered_px : material pixels at the highest level, and pixels inside more
         than one element, where the specimen overlaps.
     light : the factor on the irradiance; None if the light doesn't flicker.

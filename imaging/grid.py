@@ -20,8 +20,7 @@ from modeharvest.util.errors import InputError
 class PixelGrid:
     """A regular grid of square pixels laid over the physical plane.
 
-    rows, cols : image size [px].
-    pixel_size : edge of a pixel [mm/px].
+    rows, cols, pixel_size : image size [px]; edge of a pixel [mm/px].
     x0, y0 : position of the centre of pixel (row 0, column 0), the upper left one [mm].
     """
 
@@ -41,9 +40,8 @@ class PixelGrid:
     @classmethod
     def centred(cls, rows: int, cols: int, pixel_size: float) -> PixelGrid:
         """Make the grid whose image centre is the physical origin."""
-        return cls(
-            rows, cols, pixel_size, -0.5 * (cols - 1) * pixel_size, 0.5 * (rows - 1) * pixel_size
-        )
+        x0, y0 = -0.5 * (cols - 1) * pixel_size, 0.5 * (rows - 1) * pixel_size
+        return cls(rows, cols, pixel_size, x0, y0)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -80,11 +78,6 @@ class PixelGrid:
 
     def binned(self, factor: int) -> PixelGrid:
         """Join blocks of ``factor`` x ``factor`` pixels; incomplete blocks are dropped."""
+        rows, cols, h = self.rows // factor, self.cols // factor, self.pixel_size * factor
         shift = 0.5 * (factor - 1) * self.pixel_size
-        return PixelGrid(
-            self.rows // factor,
-            self.cols // factor,
-            self.pixel_size * factor,
-            self.x0 + shift,
-            self.y0 - shift,
-        )
+        return PixelGrid(rows, cols, h, self.x0 + shift, self.y0 - shift)

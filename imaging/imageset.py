@@ -13,8 +13,7 @@ set was made and is written last: without it, the set isn't finished. Files are 
 SHA-256 in it when they are read. It also holds what makes the set anew, and:
 
 ``noise``
-    The camera images' predicted ``variance = constant + slope * (grey - offset)`` [fraction of
-    full scale, squared].
+    Predicted ``variance = constant + slope * (grey - offset)`` [fraction of full scale, squared].
 ``reference``, ``snapshots``
     An ``ImageRecord``, and a ``SnapshotRecord`` of each deformed image.
 ``warnings``
@@ -85,8 +84,7 @@ _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*
 class SnapshotRecord(ImageRecord):
     """What the sidecar says of a deformed image.
 
-    nominal_strain, branch : of the snapshot [-].
-    truth : name of the truth's file.
+    nominal_strain, branch, truth : of the snapshot [-]; name of the truth's file.
     inverse_map_max_residual_px : largest residual of the inverse mapping [px].
     """
 
@@ -98,10 +96,9 @@ class SnapshotRecord(ImageRecord):
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """A finished set on disk; images and truth are read, and checked, when asked for.
+    """A finished set on disk; ``info`` is the content of ``images.json``.
 
-    A file that is missing, or not what was written, raises InputError. ``info`` is the content of
-    ``images.json``.
+    Images and truth are read when asked for: InputError if a file is not what was written.
     """
 
     folder: Path
@@ -250,8 +247,6 @@ def make_images(
     InputError if a snapshot is missing, an element is turned inside out, two strains would share a
     file name, or the disk refuses.
 
-    Parameters
-    ----------
     solution, spec : what is imaged, and how.
     folder : where to write; made if it doesn't exist. A whole set of the same solution, spec,
         strains and code is left as it is; any other set there is replaced.

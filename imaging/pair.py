@@ -105,9 +105,8 @@ class Truth:
                 data = self.part(name)
                 data = np.moveaxis(data, -1, 0) if data.ndim == 3 else data
                 chunk = (1,) * (data.ndim - 2) + (min(_CHUNK_ROWS, grid.rows), grid.cols)
-                dataset = file.create_dataset(
-                    name, data=data, chunks=chunk, compression="lzf", shuffle=True
-                )
+                options = {"chunks": chunk, "compression": "lzf", "shuffle": True}
+                dataset = file.create_dataset(name, data=data, **options)
                 dataset.attrs.update(unit=unit, meaning=meaning)
 
 
@@ -126,8 +125,7 @@ def _read_part(path: Path | str, name: str) -> NDArray[Any]:
 class ImagePair:
     """A reference and a deformed image of one size; checked, and read-only.
 
-    InputError if sizes differ, a mask is empty, or an image holds NaN or is constant on its
-    material.
+    InputError if sizes differ, a mask is empty, or an image has NaN or one level on its material.
 
     reference, deformed : (rows, cols) grey levels f and g; kept as float32.
     grid : their pixels.
@@ -206,10 +204,8 @@ def checked_mask(mask: ArrayLike | None, what: str, grid: PixelGrid) -> BoolArra
         return None
     inside = np.ascontiguousarray(mask, dtype=np.bool_)
     if inside.shape != grid.shape:
-        raise InputError(
-            f"expected a {what} of {grid.rows} x {grid.cols} px like the images, got shape "
-            f"{inside.shape}"
-        )
+        size = f"{grid.rows} x {grid.cols} px"
+        raise InputError(f"expected a {what} of {size} like the images, got shape {inside.shape}")
     if not inside.any():
         raise InputError(f"expected material in the {what}, got one that is False everywhere")
     return readable(inside)

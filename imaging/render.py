@@ -1,10 +1,9 @@
 """Images of a deforming specimen, and the truth behind them.
 
-The reference image shows the speckle itself. A pixel x of a deformed image shows the speckle at
-its reference point X, with X + u(X) = x solved by the inverse isoparametric mapping, so neither
-image is interpolated from the other. Through a lens a pixel p shows the ideal point phi_S^-1(p):
-that is found exactly, then the element and the local coordinates of the material there, then the
-speckle at its reference point. No image is resampled.
+The reference image shows the speckle itself. A pixel x of a deformed image shows the speckle at its
+reference point X, with X + u(X) = x solved by the inverse isoparametric mapping, so neither image
+is interpolated from the other. Through a lens a pixel p shows the ideal point phi_S^-1(p): that is
+found exactly, then the material there and its reference point. No image is resampled.
 """
 
 from __future__ import annotations
@@ -16,13 +15,7 @@ import numpy as np
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.distortion.undistort import Positions
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.elements import (
-    bezier_matrix,
-    monomial_gradients,
-    polynomials,
-    reference_element,
-    require_positive_jacobian,
-)
+from modeharvest.imaging.mapping import elements
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
 from modeharvest.imaging.mapping.render_rows import render_rows_average
@@ -60,10 +53,10 @@ class ImagedState:
         if self.displacement is None:
             return 1.0
         mesh = self.mesh
-        middle = np.full(2, 1.0 / 3.0 if reference_element(mesh.element).triangular else 0.0)
-        slopes = monomial_gradients(middle)
-        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
-        after = polynomials(mesh.element, mesh.cells, self.nodes) @ slopes
+        middle = elements.reference_element(mesh.element).middle
+        slopes = elements.monomial_gradients((middle, middle))
+        before = elements.polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
+        after = elements.polynomials(mesh.element, mesh.cells, self.nodes) @ slopes
         stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
         return float(1.0 / stretches.min())
 
@@ -73,7 +66,7 @@ class ImagedState:
         ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
         """
         mesh, nodes = self.mesh, self.nodes
-        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
+        elements.require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
         reach = float(np.abs(offsets).max(initial=0.0))
         near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
         total = render_rows_average(
@@ -83,8 +76,8 @@ class ImagedState:
 
     def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
         """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
-        element, shape = reference_element(self.mesh.element), self.grid.shape
-        control = bezier_matrix(element.triangular) @ element.coefficients
+        element, shape = elements.reference_element(self.mesh.element), self.grid.shape
+        control = elements.bezier_matrix(element.triangular) @ element.coefficients
         position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
         hull = np.einsum("pk,mki->mpi", control, position)
         low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)

@@ -4,9 +4,9 @@ A pixel that receives the irradiance I (its aperture's average; 1 is white) puts
 
     y = gain * Poisson(full_well * I) / full_well + offset + read_noise * N(0, 1),
 
-cut off at 0 and at ``saturation`` and rounded to one of 2^bits levels: the linear model of
-EMVA 1288 [1]_. All grey levels are fractions of full scale. Before the cut-off the variance of
-a grey level whose mean is y is
+cut off at 0 and at ``saturation`` and rounded to one of 2^bits levels: the linear model of EMVA
+Standard 1288 (Release 4.0 Linear, European Machine Vision Association 2021). All grey levels are
+fractions of full scale. Before the cut-off the variance of a grey level whose mean is y is
 
     sigma^2(y) = read_noise^2 + gain (y - offset) / full_well + q^2 / 12,   q = 1 / (2^bits - 1).
 
@@ -17,10 +17,6 @@ with h the indicator of a centred square convolved with a Gaussian. In Fourier s
 ``sinc(a f_row) sinc(a f_col) exp(-2 pi^2 s^2 |f|^2)``, which is exact on the reference image's
 pattern. A deformed pattern is no sum of plane waves: there the average is a Gauss rule whose
 weight is h itself, and equally weighted points where the edge of the material makes I jump.
-
-References
-----------
-.. [1] EMVA Standard 1288, Release 4.0 Linear, European Machine Vision Association 2021.
 """
 
 from __future__ import annotations
@@ -62,8 +58,7 @@ _TAIL = 5.0  # standard deviations of the blur; 6e-7 of it lie beyond
 class Aperture:
     """The weight h with which a pixel averages light; InputError if a value is out of its range.
 
-    fill_factor : sensitive part of the pixel's area [-], a centred square: 1 is the whole pixel, 0
-        a point.
+    fill_factor : sensitive part of the pixel's area [-], a centred square; 0 is a point.
     psf_px : standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens.
     """
 
@@ -100,15 +95,18 @@ class Aperture:
 
         With a perfect lens it is the Gauss-Legendre rule, with a fill factor of 0 Gauss-Hermite.
         """
-        nodes, weights = self._fine_rule()
+        x, v = np.polynomial.legendre.leggauss(_FINE)
+        y, w = np.polynomial.hermite_e.hermegauss(_FINE)
+        nodes = (0.5 * self.side_px * x[:, None] + self.psf_px * y).ravel()
+        weights = np.outer(v / v.sum(), w / w.sum()).ravel()
         before, polynomial = np.zeros_like(nodes), np.ones_like(nodes)
         beta = np.zeros(points)
         for k in range(1, points):  # Stieltjes' recurrence; the weight is even
             polynomial, before = nodes * polynomial - beta[k - 1] * before, polynomial
             beta[k] = math.sqrt(weights @ polynomial**2)
             polynomial /= beta[k]
-        x, v = eigh_tridiagonal(np.zeros(points), beta[1:])
-        return x, v[0] ** 2
+        found, vectors = eigh_tridiagonal(np.zeros(points), beta[1:])
+        return found, vectors[0] ** 2
 
     def scattered(self, points: int = EDGE_POINTS) -> FloatArray:
         """(points, 2) offsets (row, col) [px], all of the same weight, that sample h evenly.
@@ -126,13 +124,6 @@ class Aperture:
         k = np.arange(points)
         unit = np.stack([k, k * round(points / _GOLDEN) % points], axis=1) + 0.5
         return np.asarray(np.interp(unit / points, upto, t))
-
-    def _fine_rule(self) -> tuple[FloatArray, FloatArray]:
-        """Nodes [px] and weights of a fine rule along one axis: square times Gaussian."""
-        x, v = np.polynomial.legendre.leggauss(_FINE)
-        y, w = np.polynomial.hermite_e.hermegauss(_FINE)
-        nodes = 0.5 * self.side_px * x[:, None] + self.psf_px * y
-        return nodes.ravel(), np.outer(v / v.sum(), w / w.sum()).ravel()
 
 
 @dataclass(frozen=True)
@@ -166,10 +157,8 @@ class Sensor:
         require_within("sensor: expected a gain", self.gain, 0.0, above=True)
         require_within("sensor: expected an offset", self.offset, -1.0, 1.0, above=True)
         if not (self.full_well == 0.0 or 1.0 <= self.full_well <= 1e12):
-            raise InputError(
-                "sensor: expected a full well of 1 to 1e12 electrons, or 0 for no shot noise, got "
-                f"{self.full_well}"
-            )
+            what = "a full well of 1 to 1e12 electrons, or 0 for no shot noise"
+            raise InputError(f"sensor: expected {what}, got {self.full_well}")
         require_within("sensor: expected a read noise", self.read_noise, 0.0, 1.0)
         require_within("sensor: expected a saturation", self.saturation, 0.0, 1.0, above=True)
         require_within("sensor: expected a flicker", self.flicker, 0.0, 0.2)

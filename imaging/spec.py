@@ -69,12 +69,9 @@ class ImagingSpec:
 
     def lens(self, shape: tuple[int, int]) -> AnyDistortion | None:
         """The distortion of images of (rows, cols) px; InputError if its file can't be read."""
-        lens: AnyDistortion | str | None = self.distortion
-        if isinstance(lens, str):
-            lens = read_distortion(lens)
-        if lens is None or self.affine_distortion:
-            return lens
-        return without_affine(lens, shape)
+        given = self.distortion
+        lens: AnyDistortion | None = read_distortion(given) if isinstance(given, str) else given
+        return lens if lens is None or self.affine_distortion else without_affine(lens, shape)
 
 
 def choose_grid(solution: Solution, strains: Sequence[float], spec: ImagingSpec) -> PixelGrid:

@@ -2,8 +2,7 @@
 
 The image is prefiltered once, so that the spline passes through every pixel: each line goes through
 a recursive filter, forwards and backwards, once for every pole; the mirrored border makes it exact.
-Afterwards a sample costs 16, 36 or 144 coefficients. Speckles finer than 6 px want order 11:
-docs/metrology.md.
+A sample costs 16, 36 or 144 coefficients. Speckles below 6 px want order 11: docs/metrology.md.
 
 Compilers turn loops over many points into vectors, but here neighbouring points read from places
 that differ; what can go side by side are the taps of a row: the six of a quintic spline as a vector
@@ -324,9 +323,8 @@ class SplineImage:
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         value, d_row, d_col = (np.empty(row.size) for _ in range(3))
-        sample_points(
-            self.coefficients, self.order, row.ravel(), col.ravel(), row.size, value, d_row, d_col
-        )
+        at = row.ravel(), col.ravel(), row.size
+        sample_points(self.coefficients, self.order, *at, value, d_row, d_col)
         return value.reshape(row.shape), d_row.reshape(row.shape), d_col.reshape(row.shape)
 
 

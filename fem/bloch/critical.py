@@ -109,8 +109,7 @@ class _LoadSearch:
             if least.value <= 0:
                 return self._root(load, target)
             if path_ends:
-                text = f"Newton's method did not converge beyond {target:.6g}"
-                return self._stable(target, text)
+                return self._stable(target, f"Newton's method did not converge beyond {target:.6g}")
             rate = (previous.value - least.value) / (target - load)
             ahead = 1.05 * least.value / rate if rate > 0 else math.inf
             step = min(max(ahead, 0.2 * step), 3.0 * step, self.search.largest_step)
@@ -184,12 +183,9 @@ class _LoadSearch:
     def _unstable(self, state: CellState, critical: tuple[Wave, ...]) -> tuple[int, ...]:
         """Negative eigenvalues at the critical waves; at Γ the translations don't count."""
         waves = BlochWaves(self.path.cell, state)
-        return tuple(
-            int(np.sum(waves.lowest(wave, 4).eigenvalues < 0))
-            if wave == CENTRE
-            else waves.unstable(wave)
-            for wave in critical
-        )
+        if CENTRE in critical:  # then it is the only one
+            return (int(np.sum(waves.lowest(CENTRE, 4).eigenvalues < 0)),)
+        return tuple(waves.unstable(wave) for wave in critical)
 
     def _by_load(self) -> tuple[LeastStable, ...]:
         return tuple(self.history[load] for load in sorted(self.history))

@@ -84,8 +84,7 @@ class Dispersion:
     """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors.
 
     labels, stops : names of the path's corners, and their places among its points.
-    waves, distances : (p, 2) phases (k . a1, k . a2) [rad]; (p,) length of the path [rad/mm].
-    loads : (s,) [-].
+    waves, distances, loads : (p, 2) phases [rad]; (p,) length of the path [rad/mm]; (s,) [-].
     eigenvalues : (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
     zone : maps of the zone, one for each requested load.
     """
@@ -149,8 +148,6 @@ def dispersion(
 
     An InputError refuses other wave vectors than two finite phases, and loads out of reach.
 
-    Parameters
-    ----------
     corners : names and phases [rad] of the path's corners, such as ``ZONES["square"]``.
     count, bands : number of wave vectors, corners included, and of eigenvalues at each.
     """

@@ -1,9 +1,8 @@
 """Bloch waves on a deformed lattice: their lowest eigenvalues, for any wave vector.
 
-K x = lambda M x with both matrices reduced by T(k)^H . T(k) to the primitive cell; a negative
-lambda means that a wave of this length and direction grows. Wave vectors are given as phases
-from cell to cell, (k . a1, k . a2) in rad: M of the square lattice is (pi, pi). Eigenpairs are
-found by Lanczos' method in blocks, for many wave vectors at once.
+K x = lambda M x with both matrices reduced by T(k)^H . T(k) to the primitive cell; a wave of
+negative lambda grows. Wave vectors are given as phases from cell to cell, (k . a1, k . a2) in rad.
+Eigenpairs are found by Lanczos' method in blocks, for many wave vectors at once.
 """
 
 from __future__ import annotations
@@ -66,11 +65,9 @@ class BlochWaves:
     ) -> BlochModes:
         """The ``count`` lowest eigenpairs, at Γ without the two translations.
 
-        Lanczos with the inverse of K + s M; s is so large that this is positive definite, which
-        its factors prove, so the eigenvalues nearest to -s are the lowest.
-
-        ``near`` are those of a wave vector nearby, as a start; ``tolerance`` is about the relative
-        error of lambda + s that is allowed.
+        Lanczos with the inverse of K + s M; s is so large that this is positive definite, which its
+        factors prove, so the eigenvalues nearest to -s are the lowest. ``near`` are those of a wave
+        vector nearby, as a start; ``tolerance`` is about the relative error of lambda + s.
         """
         values, vectors = self.iterated(phases_of([wave]), count, near, tolerance)
         return BlochModes(wave, values[0], vectors[:, 0])

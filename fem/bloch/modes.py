@@ -43,17 +43,15 @@ NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i =
 class ModeSet:
     """Real modes of a lattice on its smallest cell that has their period.
 
-    mesh, lattice, primitive : T6 mesh of the commensurate cell, undeformed, and lattice vectors of
-        that cell and of the primitive one as rows (2, 2) [mm].
+    mesh, lattice, primitive : T6 mesh of the commensurate cell, undeformed; lattice vectors of it
+        and of the primitive cell as rows (2, 2) [mm].
     waves : (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
-    eigenvalues : (m,) of K x = lambda M x, M of unit density [N/mm^4]; near zero at a critical
-        point.
+    eigenvalues : (m,) of K x = lambda M x, M of unit density [N/mm^4]; near 0 at a critical point.
     shapes : (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
         delta_ij. The sign is such that the first large component is positive. Waves with phases
         other than 0 and pi have their modes in pairs, which are the real and imaginary part.
     load, gradient : load parameter and F̄ (2, 2) of the state whose tangent they belong to [-].
-    info : plain JSON values: lattice, material, loading, whether and where it is critical,
-        versions.
+    info : plain JSON values: lattice, material, loading, where it is critical, versions.
     """
 
     mesh: Mesh
@@ -85,11 +83,9 @@ class BranchState:
     energy, primary_energy : stored energy per area of the cell, here and on the primary path at the
         same load [MPa]; NaN where that path ends before. Under a stress other than 0 the lower
         energy minus P̄ : F̄ is what is preferred.
-    negative_eigenvalues : of the cell's tangent with F̄'s free components; 0: stable against its
-        own period.
+    negative_eigenvalues : of the cell's tangent with F̄'s free components; 0: stable in its period.
     displacement : (n, 2) of the mesh's nodes [mm].
-    amplitudes : (m,) mean over the material of (u - affine part - primary fluctuation) . phi_i
-        [mm].
+    amplitudes : (m,) [mm] means over the material of (u - affine part - primary w) . phi_i.
     """
 
     load: float
@@ -111,11 +107,9 @@ class Branch:
     """A buckled branch: which combination of modes it started with, and its states.
 
     combination : (m,) coefficients of the modes at the start, of unit length [-].
-    states : by load; empty if it could not be followed. A load that the branch meets twice is there
-        twice.
+    states : by load; empty if it could not be followed. A load met twice is there twice.
     outcome : how far it was followed, and why no farther.
-    curve : (p, 2) amplitude of the combination [mm] and load [-] of the points passed on the way,
-        the critical one first.
+    curve : (p, 2) amplitude of the combination [mm] and load [-] of all points from the first.
     """
 
     combination: tuple[float, ...]

@@ -3,8 +3,7 @@
 A branch starts along a combination of the critical modes. Its amplitude is prescribed and the
 load is an unknown, which is regular where the branch leaves the primary path and where its load
 has a maximum or minimum; so branches along which the load falls are followed as well. The states
-at given loads are then met exactly. Contact isn't modelled: a branch ends where the material would
-run into itself.
+at given loads are then met exactly. A branch ends at contact, which isn't modelled.
 """
 
 from __future__ import annotations
@@ -45,12 +44,9 @@ def follow(
     that of the modes, and a combination that doesn't fit them. A branch that can't be followed is
     an outcome, not an exception.
 
-    Parameters
-    ----------
     path, modes : primary path of the commensurate cell, that of ``modes.mesh``, such as
         ``CellPath(PeriodicCell(cell.enlarged(2, 2), material), loading)``; its critical modes.
-    combination : (m,) coefficients; only their ratios and signs count. The opposite is the other
-        half of the branch.
+    combination : (m,) coefficients; only ratios and signs count. The opposite is the other half.
     loads : at which to report states [-]. One that the branch meets twice is reported twice.
     """
     _check(path.cell, modes, combination, loads)
@@ -240,9 +236,7 @@ def _check(
             f"with cell.enlarged{tuple(modes.info.get('copies', ('m', 'n')))}"
         )
     if len(combination) != len(modes.waves) or not 0 < np.linalg.norm(combination) < math.inf:
-        raise InputError(
-            f"branch: expected {len(modes.waves)} coefficients of modes, not all 0, got "
-            f"{tuple(combination)}"
-        )
+        what = f"{len(modes.waves)} coefficients of modes, not all 0"
+        raise InputError(f"branch: expected {what}, got {tuple(combination)}")
     if not len(loads) or not np.isfinite(loads).all():
         raise InputError(f"branch: expected one finite load or more, got {tuple(loads)}")

@@ -50,8 +50,6 @@ def real_modes(
     or as k and -k, counts once. An InputError refuses no wave at all (long ones are modes of no
     finite cell), and one that doesn't repeat within ``largest`` cells.
 
-    Parameters
-    ----------
     cell, state, waves : primitive; its equilibrium and phases [rad], such as of a critical point.
     info, largest : plain JSON values to be kept with the modes; the most copies along a1 or a2.
     """
@@ -149,9 +147,8 @@ def _real_fields(
     moves = enlarged.mesh.nodes[places[:, 0]] - cell.cell.mesh.nodes[0]
     copies = np.rint(moves @ np.linalg.inv(cell.cell.lattice))
     phases = np.exp(1j * (copies @ np.asarray(modes.wave)))
-    at_nodes = np.stack(
-        [cell.reduction.displacement(vector, modes.wave).ravel() for vector in modes.vectors.T], 1
-    )
+    displaced = (cell.reduction.displacement(x, modes.wave) for x in modes.vectors.T)
+    at_nodes = np.stack([u.ravel() for u in displaced], axis=1)
     fields: list[FloatArray] = []
     for field in math.sqrt(material) * canonical(at_nodes).T:
         whole = np.empty((len(enlarged.mesh.nodes), 2), dtype=np.complex128)

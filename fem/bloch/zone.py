@@ -125,10 +125,8 @@ def zone_path(
     InputError refuses fewer than two corners, or fewer points than corners.
     """
     if len(corners) < 2 or count < len(corners):
-        raise InputError(
-            "zone path: expected two corners or more and at least as many points, got "
-            f"{len(corners)} and {count}"
-        )
+        what = "two corners or more and at least as many points"
+        raise InputError(f"zone path: expected {what}, got {len(corners)} and {count}")
     ends = phases_of([wave for _, wave in corners])
     vectors = ends @ np.linalg.inv(lattice).T
     lengths = np.linalg.norm(np.diff(vectors, axis=0), axis=1)

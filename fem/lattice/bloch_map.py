@@ -2,8 +2,8 @@
 
 At a node that lies R1 a1 + R2 a2 from its master, u = exp(i (R1 k1 + R2 k2)) times the master's,
 with the phases k1 = k . a1 and k2 = k . a2. An entry of K between nodes of shifts R and R' is thus
-multiplied by exp(i k . (R' - R)). Sorted by R' - R once, the reduced matrix for any k is a sum
-of a few arrays over one sparsity pattern.
+multiplied by exp(i k . (R' - R)). Sorted by R' - R once, the reduced matrix for any k is a sum of a
+few arrays over one sparsity pattern.
 
 Only nodes with copies in other cells feel the phase. So the others are eliminated once
 (:class:`Condensation`), and only the small dense (Schur) complement on the cell's boundary is
@@ -123,8 +123,7 @@ class BoundaryDofs:
     """The components of displacement with copies in other cells, and how their matrices reduce.
 
     ``interior`` and ``boundary`` are the components without and with copies, ``interior_places``
-    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is made from that of
-    all components, and has the boundary alone.
+    and ``boundary_places`` the reduced unknowns that they are; ``bloch_map`` is the boundary's.
     """
 
     def __init__(self, bloch_map: BlochMap) -> None:

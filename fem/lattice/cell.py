@@ -35,8 +35,7 @@ class CellState:
 
     load : e: for compressions the nominal strain [-].
     gradient, gradient_rate : (2, 2) F̄ and dF̄/de [-].
-    fluctuation, fluctuation_rate : (2 count,) w of the masters in the order of ``Reduction``, and
-        dw/de [mm].
+    fluctuation, fluctuation_rate : (2 count,) w of the masters as in ``Reduction``, dw/de [mm].
     stress : (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
     stiffness : (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
     moduli : (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
@@ -116,9 +115,9 @@ class LinearisedCell:
         size, amplitude = np.linalg.norm, self.amplitude
         inner = _LOAD_TOLERANCE * size(self.on_affine @ self.rate)
         outer = _LOAD_TOLERANCE * size(self.condensed) * size(self.rate)
-        is_met = amplitude is None or (
-            abs(self._excess(amplitude)) <= _AMPLITUDE_TOLERANCE * abs(amplitude.value)
-        )
+        is_met = True
+        if amplitude is not None:
+            is_met = abs(self._excess(amplitude)) <= _AMPLITUDE_TOLERANCE * abs(amplitude.value)
         return bool(size(self.forces) <= inner and size(self._unbalanced) <= outer and is_met)
 
     def _excess(self, prescribed: Amplitude) -> float:

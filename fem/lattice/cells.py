@@ -138,11 +138,8 @@ def chiral(
 
     a1 points along x; a2 stands 90 degrees (tetrachiral) or 60 degrees (hexachiral) from it.
     ``enlarged(2, 2)`` has room for modes that change sign from ring to ring. An InputError refuses
-    rings that touch, and ligaments too thick to leave their ring apart from each other or to have a
-    free length.
+    rings that touch, and ligaments too thick to be apart at their ring or to have a free length.
 
-    Parameters
-    ----------
     pitch, size : distance of neighbouring rings' centres, and edge length of the elements, at most
         as long as a wall is thick [mm]. Half of that thickness is a good choice.
     ligaments : of each ring: 4 (tetrachiral, square lattice) or 6 (hexachiral, hexagonal lattice).
@@ -151,12 +148,9 @@ def chiral(
     handedness : the sense, "clockwise" or "counterclockwise", in which a ligament followed outwards
         leaves its ring. One lattice is the mirror image of the other.
     """
-    usual = (RING_RADIUS, RING_THICKNESS, LIGAMENT_THICKNESS)
-    given = (ring_radius, ring_thickness, ligament_thickness)
-    radius, wall, ligament = (
-        share * pitch if length is None else length
-        for share, length in zip(usual, given, strict=True)
-    )
+    radius = RING_RADIUS * pitch if ring_radius is None else ring_radius
+    wall = RING_THICKNESS * pitch if ring_thickness is None else ring_thickness
+    ligament = LIGAMENT_THICKNESS * pitch if ligament_thickness is None else ligament_thickness
     shape = _RingAndLigaments(pitch, radius, wall, ligament, ligaments)
     require_size(size, pitch**2)
     if handedness not in HANDEDNESS:
@@ -199,10 +193,9 @@ class _RingAndLigaments:
             fault = f"0 < ligament_thickness < {most:.4g} mm (the ligaments of a ring must not "
             fault += f"touch), got {ligament} mm; make ligaments thinner or rings larger"
         elif not self.middle > self.foot:
-            fault = (
-                f"ligaments with a free length, got rings {self.pitch - 2 * radius:.4g} mm apart "
-            )
-            fault += f"with ligaments {ligament} mm thick; make rings smaller or ligaments thinner"
+            apart = self.pitch - 2 * radius
+            fault = f"ligaments with a free length, got rings {apart:.4g} mm apart with ligaments "
+            fault += f"{ligament} mm thick; make rings smaller or ligaments thinner"
         else:
             return
         raise InputError(f"chiral cell: expected {fault}")

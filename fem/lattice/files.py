@@ -44,11 +44,8 @@ def read_cell(
 ) -> UnitCell:
     """Read the unit cell of a lattice from a file.
 
-    An InputError refuses one that can't be read, is no plane mesh of sound triangles, or is not
-    periodic.
+    An InputError refuses one that is damaged, no plane mesh of sound triangles, or not periodic.
 
-    Parameters
-    ----------
     path : a plane mesh [mm] of six-node triangles, in any format of meshio or gmsh; three-node
         triangles get straight sides with nodes in their middle. Or a geometry for gmsh to mesh
         (suffixes ``GEOMETRY``). A gmsh file's physical surfaces, if any, are the material.
@@ -309,10 +306,8 @@ def _in_plane(points: FloatArray) -> FloatArray:
     if not np.isfinite(points).all():
         raise InputError("expected finite node positions, got NaN or infinity")
     if points.shape[1] == 3 and np.ptp(points[:, 2]) > 1e-9 * np.ptp(points[:, :2]):
-        raise InputError(
-            f"expected a plane mesh, z = const, got z from {points[:, 2].min():.5g} to "
-            f"{points[:, 2].max():.5g} mm"
-        )
+        low, high = points[:, 2].min(), points[:, 2].max()
+        raise InputError(f"expected a plane mesh, z = const, got z from {low:.5g} to {high:.5g} mm")
     return points[:, :2]
 
 
@@ -339,6 +334,5 @@ def _gradients(xi: float, eta: float) -> FloatArray:
 
 
 # At the element's own nodes, which determine a Jacobian that is quadratic.
-_GRADIENTS = np.array(
-    [_gradients(*p) for p in [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)]]
-)
+_NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
+_GRADIENTS = np.array([_gradients(xi, eta) for xi, eta in _NODES])

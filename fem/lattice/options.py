@@ -21,8 +21,7 @@ class CriticalSearch:
     """How the first critical point is looked for.
 
     divisions : of each axis of the zone; an even number has the points M and X on the grid.
-    largest, first_step, largest_step, tolerance : load up to which to look, its steps, and to which
-        it is located [-].
+    largest, first_step, largest_step, tolerance : load up to which to look; how it is located [-].
     """
 
     largest: float = 0.3
@@ -90,8 +89,7 @@ class MacroLoading:
     """For each component either of F̄ or of P̄ a value proportional to the load e.
 
     F̄_ij = δ_ij + e · gradient_ij [-] where that is given; where it is None, P̄_ij = e · stress_ij
-    [MPa] (first Piola-Kirchhoff, over the whole cell, holes included; 0, a free side, unless
-    given) and F̄_ij is found.
+    [MPa] (first Piola-Kirchhoff, over the whole cell; 0, a free side, unless given).
     """
 
     gradient: Rates

@@ -147,7 +147,11 @@ def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
             "periodic cell: expected one body, got parts that nothing holds: "
             f"{_named(np.flatnonzero(piece != largest), mesh.nodes)}; connect or remove them"
         )
-    shifts = _cycle_shifts(mesh, found)
+    # Differing shifts of nodes that are the same master and in the same piece.
+    piece = _pieces(mesh.cells, len(mesh.nodes))
+    order = np.lexsort((piece, found.master))
+    is_same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
+    shifts = np.unique(np.diff(found.shift[order], axis=0)[is_same], axis=0)
     rank = np.linalg.matrix_rank(shifts) if len(shifts) else 0
     if rank < 2:
         outline = np.unique(sides)
@@ -164,14 +168,6 @@ def _pieces(cells: IntArray, count: int) -> IntArray:
     start, end = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
     links = coo_array((np.ones(len(start)), (start, end)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
-
-
-def _cycle_shifts(mesh: Mesh, found: Periodicity) -> IntArray:
-    """(p, 2) differing shifts of nodes that are the same master and in the same piece."""
-    piece = _pieces(mesh.cells, len(mesh.nodes))
-    order = np.lexsort((piece, found.master))
-    same = (np.diff(found.master[order]) == 0) & (np.diff(piece[order]) == 0)
-    return np.asarray(np.unique(np.diff(found.shift[order], axis=0)[same], axis=0))
 
 
 def _named(numbers: IntArray, nodes: FloatArray, most: int = 4) -> str:

@@ -78,8 +78,7 @@ def follow_to_pattern(
     Returns the last state, None if there is none, and the pattern's amplitude there [mm].
     """
     weights, start = _start(follower, critical)
-    points = [start]
-    step, shortest = _FIRST * target, _SHORTEST * target
+    points, step, shortest = [start], _FIRST * target, _SHORTEST * target
     state, reached = None, 0.0
     while abs(step) > shortest:
         amplitude = points[-1].amplitude + step

@@ -30,8 +30,7 @@ _RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
 class State:
     """An equilibrium state: nominal strain [-], displacement and du/d(strain) [mm], stability.
 
-    ``eigenvalues`` are the lowest ones of the tangent stiffness [N/mm^4], ascending; empty where
-    none were computed.
+    ``eigenvalues`` are the lowest ones of the tangent stiffness [N/mm^4], if any were computed.
     """
 
     strain: float
@@ -101,17 +100,12 @@ class PathFollower:
     ) -> bool:
         """Extend ``states`` through all ``targets`` (ascending strains), each met exactly.
 
-        Parameters
-        ----------
+        False where no step down to 1e-5 of strain converges.
+
         states, targets : equilibria so far, at least one; targets already passed are left out.
         until_unstable : stop after the first state with negative pivots.
         refuse_unstable : take a step that arrives at an unstable state, or far from where it was
             expected, for a slip off a stable path (that of an imperfect specimen) and shorten it.
-
-        Returns
-        -------
-        bool
-            False where no step down to 1e-5 of strain converges.
         """
         step = self.options.first_step
         for target in (t for t in targets if t > states[-1].strain + 1e-12):

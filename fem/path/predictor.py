@@ -16,12 +16,8 @@ def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float,
     """Weights of value and slope at ``a``, value and slope at ``b``."""
     h = b - a
     t = (at - a) / h
-    return (
-        (1 + 2 * t) * (1 - t) ** 2,
-        h * t * (1 - t) ** 2,
-        t**2 * (3 - 2 * t),
-        h * t**2 * (t - 1),
-    )
+    before, after = (1 - t) ** 2, t**2
+    return (1 + 2 * t) * before, h * t * before, after * (3 - 2 * t), h * after * (t - 1)
 
 
 def extrapolate(points: Sequence[tuple[float, Any, Any]], at: float) -> Any:

@@ -55,15 +55,10 @@ def lowest_modes(
     """The lowest modes, by ascending eigenvalue: all negative ones, and at least one positive.
 
     Lanczos' method in blocks with the inverse of the stiffness, whose factor is there already. The
-    inertia is the number of negative eigenvalues to be found; of more than 24 only those nearest to
-    zero are. Deterministic.
+    inertia is the number of negative eigenvalues to be found; of more than 24 the nearest to zero.
 
-    Parameters
-    ----------
-    factor, mass : of the tangent stiffness; the mass matrix with zero rows at the constrained
-        components.
-    count, near : requested number of modes, more are returned if more are negative; those of a
-        state nearby.
+    factor, mass : of the tangent stiffness; mass matrix, its rows 0 at constrained components.
+    count, near : number of modes, more are returned if more are negative; those of a state nearby.
     tolerance : by which a mode may be mixed with others, for that with the largest eigenvalue; less
         for those nearer to zero. Relative errors of eigenvalues go with its square.
     """

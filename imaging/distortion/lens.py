@@ -286,10 +286,8 @@ class SampledDistortion(Distortion):
                 f"got {self.rows.size} and {self.cols.size}"
             )
         if self.field.shape != shape:
-            raise InputError(
-                f"distortion: expected a field of shape {shape} like its rows and cols, got "
-                f"{self.field.shape}"
-            )
+            what = f"a field of shape {shape} like its rows and cols"
+            raise InputError(f"distortion: expected {what}, got {self.field.shape}")
 
     @cached_property
     def _splines(self) -> list[RectBivariateSpline]:

@@ -39,10 +39,8 @@ class CalibrationTarget:
 
     def __post_init__(self) -> None:
         if not self.shifts_px or not np.isfinite(self.shifts_px).all():
-            raise InputError(
-                "calibration: expected finite shifts (along columns, along rows) [px], got "
-                f"{self.shifts_px}"
-            )
+            what = "finite shifts (along columns, along rows) [px]"
+            raise InputError(f"calibration: expected {what}, got {self.shifts_px}")
         require_within("calibration: expected a stage_sd_px", self.stage_sd_px, 0.0, 1000.0)
         require_within("calibration: expected a seed", self.seed, 0)
 
@@ -59,8 +57,6 @@ def photograph_target(
 ) -> Iterator[tuple[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
     """Make the photographs one after the other: "calibration_00", ... and (rows, cols) levels.
 
-    Parameters
-    ----------
     target, sensor, bits : shifts and pattern; the camera.
     speckle : the pattern if the target has none of its own, but for its seeds.
     points : (row, col), each (rows, cols) [px]: the ideal positions that the pixels show.

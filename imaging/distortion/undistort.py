@@ -45,8 +45,7 @@ def undistorted(image: ArrayLike, distortion: Distortion, order: int = 5) -> NDA
 def undistorted_mask(mask: ArrayLike, distortion: Distortion) -> NDArray[np.bool_]:
     """Free a mask (rows, cols) from the distortion: that of the photograph's nearest pixel.
 
-    All True gives the pixels of the ideal grid that were photographed at all. InputError if the
-    mask is not plane.
+    All True gives the pixels of the ideal grid that were photographed. InputError if not plane.
     """
     inside = np.asarray(mask, dtype=np.bool_)
     if inside.ndim != 2:

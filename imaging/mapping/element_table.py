@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import (
+    ReferenceElement,
     bezier_matrix,
     lattice_points,
     monomial_gradients,
@@ -92,13 +93,13 @@ def tabulate_elements(
     reference = reference_element(element)
     triangular = reference.triangular
     count, sides = len(cells), 3 if triangular else 4
-    slopes = np.stack([_enlarged_slopes(triangular, beyond) for beyond in BEYOND])
+    slopes = np.stack([_enlarged_slopes(reference, beyond) for beyond in BEYOND])
     elements = ElementTable(
         np.empty((count, 2, 9)), np.empty((count, 2, 9)), np.empty((count, sides, 2, 3)),
         np.empty((count, 2)), np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.int64),
         np.empty(count, dtype=np.int64), np.ascontiguousarray(reference.nodes[:sides]),
         bezier_matrix(triangular), slopes, sub_elements(triangular),
-        _middle(triangular), triangular,
+        reference.middle, triangular,
     )  # fmt: skip
     position_px = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)
     nodes_yx = np.ascontiguousarray(nodes, dtype=np.float64)
@@ -107,14 +108,9 @@ def tabulate_elements(
     return elements
 
 
-def _middle(triangular: bool) -> float:
-    """Both local coordinates of a reference domain's middle."""
-    return 1.0 / 3.0 if triangular else 0.0
-
-
-def _enlarged_slopes(triangular: bool, beyond: float) -> FloatArray:
+def _enlarged_slopes(reference: ReferenceElement, beyond: float) -> FloatArray:
     """(9, 2 q) derivatives along xi, then along eta, as Bernstein coefficients."""
-    centre = _middle(triangular)
+    centre, triangular = reference.middle, reference.triangular
     factor = 1.0 + beyond * (3.0 if triangular else 1.0)
     points = centre + factor * (lattice_points(triangular, 2) - centre)
     control = np.einsum("qp,pmi->miq", to_bernstein(triangular, 2), monomial_gradients(points))

@@ -42,9 +42,6 @@ class ReferenceElement:
     triangular : whether the reference domain is the triangle (else the square).
     nodes : (k, 2) local coordinates (xi, eta) of the nodes [-].
     monomials : which k of the nine monomials the element spans.
-
-    Attributes
-    ----------
     coefficients : (9, k); column a holds the coefficients of node a's shape function.
     """
 
@@ -59,6 +56,11 @@ class ReferenceElement:
         full[list(self.monomials)] = np.linalg.inv(monomials(self.nodes)[:, self.monomials])
         # The exact values are multiples of 1/4; the inversion may leave rounding behind.
         object.__setattr__(self, "coefficients", np.round(full * 4.0) / 4.0)
+
+    @property
+    def middle(self) -> float:
+        """Both local coordinates of the reference domain's middle."""
+        return 1.0 / 3.0 if self.triangular else 0.0
 
 
 def monomials(xi: ArrayLike) -> FloatArray:

@@ -33,8 +33,7 @@ class Located:
         does. A pixel on a shared edge or node belongs to the element of the lowest number.
     values : (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi,
         eta) there [-]; NaN where no element is.
-    residual_px : (rows, cols) float32 distance of the mapped (xi, eta) from the pixel centre [px];
-        NaN where no element is.
+    residual_px : (rows, cols) float32 distance of the mapped (xi, eta) from the pixel [px], or NaN.
     doubly_covered : how many pixels lie inside more than one element: the mesh overlaps there.
     """
 
@@ -72,8 +71,6 @@ def locate(
 
     InputError if a Jacobian isn't positive everywhere in some element.
 
-    Parameters
-    ----------
     nodes : (n, 2) node positions in the state to look at: undeformed X or deformed X + u [mm].
     cells, element : (m, k) node numbers of each element; T3, T6, Q4, Q8 or Q9.
     grid : the pixels.

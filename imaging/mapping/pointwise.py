@@ -67,33 +67,23 @@ def locate_points(
 ) -> Located:
     """Find element and local coordinates of points given by their image positions.
 
-    InputError if a Jacobian isn't positive everywhere in some element.
+    Points beside the mesh, and NaN, belong to no element; how many lie inside more than one is not
+    counted. InputError if a Jacobian isn't positive everywhere in some element.
 
-    Parameters
-    ----------
     nodes, cells, element, where : as for :func:`modeharvest.imaging.mapping.isoparametric.locate`.
     grid : what positions in px mean; they need not lie on it.
     row, col : positions of the points [px], of shapes that broadcast to two dimensions.
-
-    Returns
-    -------
-    Located
-        With arrays of the points' shape; points beside the mesh, and NaN, belong to no element.
-        How many points lie inside more than one element is not counted.
     """
     require_positive_jacobian(nodes, cells, element, where)
     row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
     elements = tabulate_elements(nodes, cells, element, grid)
-    owner = np.empty(row.size, dtype=np.int32)
+    owner, residual = np.empty(row.size, dtype=np.int32), np.empty(row.size, dtype=np.float32)
     xi = np.empty((row.size, 2))
-    residual = np.empty(row.size, dtype=np.float32)
     frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
     points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
     _locate(elements, _buckets(elements), *points, frame, owner, xi, residual)
-    shape = row.shape
-    return Located(
-        owner.reshape(shape), np.moveaxis(xi.reshape(*shape, 2), -1, 0), residual.reshape(shape)
-    )
+    shape, values = row.shape, np.moveaxis(xi.reshape(*row.shape, 2), -1, 0)
+    return Located(owner.reshape(shape), values, residual.reshape(shape))
 
 
 def _buckets(elements: ElementTable) -> _Buckets:

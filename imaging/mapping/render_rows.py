@@ -40,12 +40,9 @@ def render_rows_average(
 ) -> FloatArray:
     """(rows, cols) weighted sum of grey levels at selected pixels moved by offsets; else wrong.
 
-    Parameters
-    ----------
     mesh, nodes : the undeformed mesh, whose Jacobians are proved positive in the state with the
         node positions ``nodes`` (n, 2) [mm].
-    grid, pattern, background : the pixels, the pattern's among them; intensity of the material and
-        around it.
+    grid, pattern, background : the pixels, also the pattern's; intensity of material and around.
     selected, offsets, weights : (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
     """
     total = np.zeros(grid.shape)

@@ -1,11 +1,10 @@
 """Image files: the numbers that are stored, right side up; masks and grey images; TIFF written.
 
-TIFF is read by tifffile, which keeps 16-bit colour; its compressions that tifffile leaves to
-another package (LZW, JPEG, ...) are read by Pillow where that loses nothing. PNG and JPEG are
-read by Pillow. Files are checked on the way in, and whole or absent on the way out.
+TIFF is read by tifffile, which keeps 16-bit colour; its compressions that tifffile leaves to others
+(LZW, JPEG, ...) are read by Pillow where that loses nothing, as are PNG and JPEG. Files are checked
+on the way in, and whole or absent on the way out.
 
-Colour becomes grey by luma, 0.2125 R + 0.7154 G + 0.0721 B (ITU-R BT.709, the weights of
-scikit-image).
+Colour becomes grey by luma, 0.2125 R + 0.7154 G + 0.0721 B (ITU-R BT.709, as in scikit-image).
 """
 
 from __future__ import annotations
@@ -30,9 +29,8 @@ from modeharvest.util.files import atomic, reading, require_plausible
 def require_contrast(grey: NDArray[Any], what: str) -> None:
     """Raise InputError for a blank image."""
     if grey.min() == grey.max():
-        raise InputError(
-            f"expected a speckle in the {what} image, got the constant grey level {grey.flat[0]}"
-        )
+        got = f"the constant grey level {grey.flat[0]}"
+        raise InputError(f"expected a speckle in the {what} image, got {got}")
 
 
 LUMA = (0.2125, 0.7154, 0.0721)
@@ -68,8 +66,7 @@ def read_stored(path: Path, *, single: bool = False) -> StoredImage:
     """Read a TIFF, PNG or JPEG; an alpha channel is dropped.
 
     Of a file with several pages the first is taken, unless it has to be the ``single`` one.
-    InputError, in one line: the file is missing, empty, damaged, or its numbers can't be read
-    unchanged.
+    InputError if the file is missing, empty, damaged, or its numbers can't be read unchanged.
     """
     remedy = "if it is a damaged file, or cut short, copy it or make it again"
     with reading(path, "a TIFF, PNG or JPEG image", remedy), warnings.catch_warnings():
@@ -95,10 +92,8 @@ def _not_plane(shape: tuple[int, ...], path: Path) -> InputError:
 def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
     """Raise InputError for numbers of a type that has no full scale, or is no camera's."""
     if levels.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise InputError(
-            f"expected 8-bit, 16-bit or float grey levels at {path}, got {levels.dtype}; convert "
-            "it to one of them"
-        )
+        what = f"8-bit, 16-bit or float grey levels at {path}"
+        raise InputError(f"expected {what}, got {levels.dtype}; convert it to one of them")
 
 
 def require_visible(image: NDArray[Any], path: Path | str) -> None:
@@ -110,9 +105,8 @@ def require_visible(image: NDArray[Any], path: Path | str) -> None:
             "replace them and exclude them by a mask"
         )
     if image.min() == image.max():
-        raise InputError(
-            f"expected an image with contrast at {path}, got {image.flat[0]:g} in every pixel"
-        )
+        got = f"{image.flat[0]:g} in every pixel"
+        raise InputError(f"expected an image with contrast at {path}, got {got}")
 
 
 def _read_tiff(path: Path, single: bool) -> StoredImage:

@@ -1,21 +1,16 @@
 """One layer of a speckle pattern, known exactly everywhere, not only at whole pixels.
 
-A stationary Gaussian random field [1]_ with a radially symmetric normal spectral density is
-thresholded and blurred by a Gaussian. The thresholded samples blurred by the *continuous*
-Gaussian are a trigonometric polynomial
+A stationary Gaussian random field (M. Grigoriu, Stochastic Calculus, Birkhäuser 2002, section
+5.3.1.2) with a radially symmetric normal spectral density is thresholded and blurred by a Gaussian.
+The thresholded samples blurred by the *continuous* Gaussian are a trigonometric polynomial
 
     I(row, col) = sum_k  c_k exp(2 pi i (k_row row / rows + k_col col / cols)),
 
 because the Gaussian's transfer function at the samples' Nyquist frequency is 3e-9 or less: for
-blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole
-pixels, a non-uniform FFT [2]_ at any other point, both to rounding. Where millions of points are
-needed, a B-spline of its waves is twenty times faster, and its error is proved to be small.
-
-References
-----------
-.. [1] M. Grigoriu, Stochastic Calculus, Birkhäuser 2002, section 5.3.1.2.
-.. [2] A. H. Barnett, J. Magland, L. af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
-   doi:10.1137/18M120885X.
+blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole pixels,
+a non-uniform FFT (Barnett, Magland & af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
+doi:10.1137/18M120885X) at any other point, both to rounding. Where millions of points are needed, a
+B-spline of its waves is twenty times faster, and its error is proved to be small.
 """
 
 from __future__ import annotations
@@ -47,8 +42,7 @@ def gaussian_field(
     """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [samples].
 
     White noise is filtered by the square root of the spectral density, of that standard deviation
-    [cycles/sample]. The sample's mean is zero; in expectation the variance is one and the median
-    zero.
+    [cycles/sample]. The sample's mean is 0; in expectation the variance is 1 and the median 0.
     """
     noise = np.random.default_rng(seed).standard_normal(period)
     amplitude = np.exp(-_squared_frequency(period) / (4.0 * standard_deviation**2))
@@ -88,16 +82,10 @@ class BinaryField:
 class Layer:
     """One realisation of a blurred binary field: exact at whole pixels and anywhere between.
 
-    Parameters
-    ----------
     field : its phases and its blur.
     shape : (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
         that suit an FFT; the realisation depends on them, hence on ``shape``.
-
-    Attributes
-    ----------
-    period : (rows, cols) of the period [px].
-    samples : (rows, cols) of samples in a period.
+    period, samples : (rows, cols) of the period [px], of samples in it.
     """
 
     def __init__(self, field: BinaryField, shape: tuple[int, int]) -> None:
@@ -117,10 +105,10 @@ class Layer:
         return np.where(values > norm.isf(field.coverage), inside, outside)
 
     def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
-        """(rows, cols) exact values at whole pixels.
+        """(rows, cols) exact values at whole pixels, after a filter such as an aperture's.
 
         ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
-        multiplied by those of its row and its column frequency (see Aperture.transfer).
+        multiplied by those of its row and its column frequency.
         """
         spectrum = self._spectrum * math.prod(self.samples)
         finer = self.field.finer

@@ -56,17 +56,15 @@ class Ink:
     @property
     def binary_field(self) -> BinaryField:
         """What the layer is made of."""
-        return BinaryField(
-            self.standard_deviation, self.blur_px, (0.0, 1.0), self.coverage, (self.seed, 1)
-        )
+        spread, seed = self.standard_deviation, (self.seed, 1)
+        return BinaryField(spread, self.blur_px, (0.0, 1.0), self.coverage, seed)
 
 
 @dataclass(frozen=True)
 class SpeckleSpec:
     """What the speckle looks like; InputError if a value is out of its range.
 
-    standard_deviation : standard deviation of the spectral density of the Gaussian field, in
-        ``unit``.
+    standard_deviation : of the spectral density of the Gaussian field, in ``unit``.
     unit : "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi times
         coarser); the paper leaves it open.
     blur_px : standard deviation of the Gaussian blur [px], at least 0.75.
@@ -88,10 +86,8 @@ class SpeckleSpec:
             raise InputError(f"speckle: expected a unit among {list(_CYCLES)}, got {self.unit!r}")
         _require_band_limited(self.cycles_per_px, self.blur_px, "speckle")
         if not 0.0 <= self.dark < self.bright <= 1.0:
-            raise InputError(
-                "speckle: expected grey levels 0 <= dark < bright <= 1, got "
-                f"dark {self.dark}, bright {self.bright}"
-            )
+            got = f"dark {self.dark}, bright {self.bright}"
+            raise InputError(f"speckle: expected grey levels 0 <= dark < bright <= 1, got {got}")
         require_within("speckle: expected a seed", self.seed, 0)
 
     @property

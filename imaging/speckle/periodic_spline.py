@@ -83,15 +83,14 @@ class PeriodicSpline:
     ) -> PeriodicSpline:
         """Make the spline of a real pattern by its waves c_k (rows, cols // 2 + 1), as of an FFT.
 
-        ``period`` is (rows, cols) [px]; the bound is below ``tolerance`` if 4 x 4 samples per pixel
-        suffice for that.
+        ``period`` is (rows, cols) [px]; the bound is below ``tolerance`` if 4 x 4 samples do.
         """
         size = np.abs(spectrum)
         for finer in _FINER:
             rows, cols = (math.ceil(finer * n) for n in period)
             fine = (scipy.fft.next_fast_len(rows, True), scipy.fft.next_fast_len(cols, True))
-            errors = [_wave_errors(n, m) for n, m in zip(period, fine, strict=True)]
-            bound = _bound(size, errors[0], errors[1][: spectrum.shape[1]])
+            row, col = (_wave_errors(n, m) for n, m in zip(period, fine, strict=True))
+            bound = _bound(size, row, col[: spectrum.shape[1]])
             if bound <= tolerance:
                 break
         waves = _prefiltered(spectrum, period, fine)
@@ -138,7 +137,7 @@ def _prefiltered(
     spectrum: ComplexArray, period: tuple[int, int], fine: tuple[int, int]
 ) -> ComplexArray:
     """Divide the waves by B^ and lay them into the spectrum of the finer samples."""
-    most_rows, most_cols = (period[0] - 1) // 2, (period[1] - 1) // 2
+    most_rows, most_cols = ((n - 1) // 2 for n in period)
     k_row, k_col = np.arange(-most_rows, most_rows + 1), np.arange(most_cols + 1)
     waves = spectrum[k_row, : most_cols + 1]
     waves /= (np.sinc(k_row / fine[0]) ** _TAPS)[:, None]

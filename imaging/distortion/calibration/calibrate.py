@@ -88,15 +88,18 @@ def calibrate(
     InputError if there are too few photographs, of different sizes, without speckle, of different
     things, or without enough shifts.
 
-    Parameters
-    ----------
-    images : m >= 3 photographs (rows, cols), the target shifted in its plane along at least two
-        directions.
+    images : m >= 3 photographs (rows, cols), the target shifted along two directions or more.
     shifts : (m, 2) where the stage was, along rows and columns [px], if known; what they are off by
         goes into S. Not needed: without them the affine part of S isn't observable and is zero.
     """
     options = options or CalibrationOptions()
-    photographs = _checked(images)
+    if len(images) < 3:
+        raise InputError(
+            "expected a calibration set of at least 3 photographs, shifted along two directions, "
+            f"got {len(images)}: a calibration set without enough shifts"
+        )
+    names = [f"{n + 1}. calibration" for n in range(len(images))]
+    photographs = checked_images(images, names)
     known = shifts is not None
     start = _given(shifts, len(images)) if known else _rough_shifts(photographs)
     free = (not known, not known, not known and options.rotations)
@@ -105,9 +108,8 @@ def calibrate(
     def report() -> None:
         progress(next(done), steps, "calibrate")
 
-    coarse, fit = _coarse_fit(
-        photographs, normalised_illumination(photographs, start), free, options, report
-    )
+    poses = normalised_illumination(photographs, start)
+    coarse, fit = _coarse_fit(photographs, poses, free, options, report)
     _require_shifts(fit.poses)
     _require_matches(fit)
     trials, stride = _trials(photographs, coarse, fit, free, options, report)
@@ -167,15 +169,6 @@ def _trials(
     settled = fit_views(model, fit.coefficients, with_poses(views, fit.poses), points)
     trials[best] = model, settled
     return trials, stride
-
-
-def _checked(images: Sequence[ArrayLike]) -> list[FloatImage]:
-    if len(images) < 3:
-        raise InputError(
-            "expected a calibration set of at least 3 photographs, shifted along two directions, "
-            f"got {len(images)}: a calibration set without enough shifts"
-        )
-    return checked_images(images, [f"{n + 1}. calibration" for n in range(len(images))])
 
 
 def _given(shifts: ArrayLike | None, count: int) -> FloatArray:

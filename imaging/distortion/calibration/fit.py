@@ -118,8 +118,7 @@ class Fit:
 
     coefficients : (k,) of the model.
     poses : one a view.
-    inverse : (K, K) inverse of the normal matrix: of the coefficients, then of each view's
-        unknowns.
+    inverse : (K, K) of the normal matrix: of the coefficients, then of each view's unknowns.
     free : (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
     sum_of_squares, freedom : scatter about the mean [grey levels squared], its degrees of freedom.
     matches : (views,) correlation of each photograph with the mean of the others [-].
@@ -160,8 +159,6 @@ def fit_views(
 ) -> Fit:
     """Find the model's coefficients and the views' poses by Gauss-Newton.
 
-    Parameters
-    ----------
     model, c, views : the distortions to choose from; (k,) coefficients and poses to begin with.
     points : (n,) rows and columns of ideal positions to look at [px].
     tolerance_px : largest change of S or of a shift [px] at which to stop.

@@ -98,11 +98,9 @@ class CameraModel:
     unknown: tuple[str, ...] = ("cx", "cy", "k1", "k2", "k3")
 
     def __post_init__(self) -> None:
-        allowed = tuple(f.name for f in fields(CameraDistortion))[2:]
-        if not self.unknown or not set(self.unknown) <= set(allowed):
-            raise InputError(
-                f"expected unknown camera parameters among {allowed}, got {self.unknown}"
-            )
+        known = tuple(f.name for f in fields(CameraDistortion))[2:]
+        if not self.unknown or not set(self.unknown) <= set(known):
+            raise InputError(f"expected unknown parameters among {known}, got {self.unknown}")
 
     @property
     def start(self) -> FloatArray:

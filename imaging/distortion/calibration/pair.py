@@ -48,14 +48,11 @@ def recover_camera(
 
     InputError if sizes differ, an image is blank, or the images don't show the same scene.
 
-    Parameters
-    ----------
     undistorted, distorted : (rows, cols) grey levels of one scene.
     model : what the lens may be: a :class:`CameraModel` or a :class:`PolynomialModel` with
         ``fixed=0``. By default an OpenCV camera with unknown cx, cy, k1, k2, k3; its focal length
         is taken as the larger size of the image, because another f with other k is the same S.
-    mask, points : (rows, cols) where the undistorted image counts; about how many pixels to look
-        at.
+    mask, points : (rows, cols) where the undistorted image counts; about how many pixels of it.
     order : of the spline that samples the images: 5 or 3.
     """
     images = checked_images((undistorted, distorted), ("undistorted", "distorted"))
@@ -119,9 +116,8 @@ def _points(
     if mask is not None:
         inside = np.asarray(mask, dtype=np.bool_)
         if inside.shape != (rows, cols) or not inside.any():
-            raise InputError(
-                f"expected a mask of {rows} x {cols} px with something in it, got {inside.shape}"
-            )
+            what = f"a mask of {rows} x {cols} px with something in it"
+            raise InputError(f"expected {what}, got {inside.shape}")
         kept = inside[row.astype(np.intp), col.astype(np.intp)]
         return (row[kept], col[kept]), float(stride)
     return (row, col), float(stride)

@@ -31,14 +31,11 @@ def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, 
     neighbouring samples have in common: the variance that a field sees that varies slowly from
     sample to sample. It is 1 for a stride of 1 px: no information is lost there.
 
-    Parameters
-    ----------
     blur_px, order : standard deviation of the blur before the spline [px]; its order, 3 or 5.
     stride_px : distance between samples along rows and columns [px].
     """
     lags, correlations = sampled_correlations(blur_px, order, stride_px)
-    one = float(correlations[lags == 0.0].sum())
-    return one**2, float(correlations.sum()) ** 2
+    return float(correlations[lags == 0.0].sum()) ** 2, float(correlations.sum()) ** 2
 
 
 def sampled_correlations(
@@ -173,15 +170,14 @@ def _trials(
     for model, fit in fitted:
         lens = LensEstimate.of(model, fit, noise)
         now = np.stack(lens.distortion.shift(*at))
-        trials.append(
-            DegreeTrial(
-                degree=model.degree,
-                unknowns=len(fit.inverse),
-                residual_rms=float(np.sqrt(fit.variance)),
-                bic=fit.bic - lowest,
-                change_px=float(np.sqrt(np.mean((now - before) ** 2))),
-                sd_px=float(np.sqrt(np.mean(np.square(lens.sd(*at))))),
-            )
+        trial = DegreeTrial(
+            degree=model.degree,
+            unknowns=len(fit.inverse),
+            residual_rms=float(np.sqrt(fit.variance)),
+            bic=fit.bic - lowest,
+            change_px=float(np.sqrt(np.mean((now - before) ** 2))),
+            sd_px=float(np.sqrt(np.mean(np.square(lens.sd(*at))))),
         )
+        trials.append(trial)
         before = now
     return tuple(trials)
