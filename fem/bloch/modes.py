@@ -85,7 +85,7 @@ class BranchState:
         energy minus P̄ : F̄ is what is preferred.
     negative_eigenvalues : of the cell's tangent with F̄'s free components; 0: stable in its period.
     displacement : (n, 2) of the mesh's nodes [mm].
-    amplitudes : (m,) [mm] means over the material of (u - affine part - primary w) . phi_i.
+    amplitudes : (m,) mean of (u - affine part - primary fluctuation) . phi_i over material [mm].
     """
 
     load: float

@@ -89,7 +89,7 @@ class MacroLoading:
     """For each component either of F̄ or of P̄ a value proportional to the load e.
 
     F̄_ij = δ_ij + e · gradient_ij [-] where that is given; where it is None, P̄_ij = e · stress_ij
-    [MPa] (first Piola-Kirchhoff, over the whole cell; 0, a free side, unless given).
+    [MPa] (first Piola-Kirchhoff, of the cell with its holes; 0, a free side, unless given).
     """
 
     gradient: Rates

@@ -100,7 +100,8 @@ class CameraModel:
     def __post_init__(self) -> None:
         known = tuple(f.name for f in fields(CameraDistortion))[2:]
         if not self.unknown or not set(self.unknown) <= set(known):
-            raise InputError(f"expected unknown parameters among {known}, got {self.unknown}")
+            what = f"unknown camera parameters among {known}"
+            raise InputError(f"expected {what}, got {self.unknown}")
 
     @property
     def start(self) -> FloatArray:
