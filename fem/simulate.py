@@ -295,10 +295,8 @@ def simulate_pattern(
         found, reached = follow_to_pattern(follower, critical, pattern.amplitude, target)
         state = found or state
         if abs(reached / target - 1.0) > PATTERN_TOLERANCE:
-            outcome = (
-                f"the branch could be followed to a pattern of {reached / spec.pitch:.3f} l only, "
-                f"not to {target / spec.pitch:.3f} l"
-            )
+            outcome = f"the branch could be followed to a pattern of {reached / spec.pitch:.3f} l "
+            outcome += f"only, not to {target / spec.pitch:.3f} l"
     branch = "primary" if critical is None else "buckled+"
     return Solution(
         mesh,
@@ -339,6 +337,5 @@ def _until_critical(
         follower.options = replace(follower.options, **steps)
         follower.linearisation = None
     before, after = 100 * path[-1].strain, 100 * last.strain
-    return path[-1], None, (
-        f"unstable between {before:.4g} and {after:.4g} %, where no bifurcation was found"
-    )  # fmt: skip
+    where = f"between {before:.4g} and {after:.4g} %"
+    return path[-1], None, f"unstable {where}, where no bifurcation was found"

@@ -64,7 +64,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("[experiment.specimen]\nholes_x = -3", "to 1000 x 1000 holes"),
         ("[experiment.imperfection]\nseed = -1", "a seed of 0 or more"),
         ("[experiment]\nmesh_size = 2020-01-01", "mesh_size"),
-        ("[experiment.path]\nlargest_step = 1e-300", "steps and an amplitude from 1e-05"),
+        ("[experiment.path]\nlargest_step = 1e-300", "a largest_step of 1e-05 to 1"),
         ("experiment = 3", "experiment"),
         ("[imaging]\npixel_size = '0.01'", "pixel_size: expected a number, got '0.01'"),
         ("[imaging]\npixel_size = 1e300", "pixel_size: expected a number below"),

@@ -97,10 +97,8 @@ class _Tracing:
             return f"not followed: {self.stopped}"
         start, last = self.points[0], self.points[-1]
         if len(self.points) == 1:
-            return (
-                f"not followed from the load {start.load:.6g} on: {self.stopped}; perhaps no "
-                "branch starts along this combination of the modes"
-            )
+            why = f"{self.stopped}; perhaps no branch starts along this combination of the modes"
+            return f"not followed from the load {start.load:.6g} on: {why}"
         way = "rises" if self.points[1].load > start.load else "falls"
         text = f"the load {way} from {start.load:.6g} on; followed to {last.load:.6g}, "
         text += f"amplitude {last.amplitude:.4g} mm"

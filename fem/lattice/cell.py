@@ -204,10 +204,7 @@ class PeriodicCell:
     def equilibrium(
         self, loading: MacroLoading, load: float, near: CellState | None = None
     ) -> CellState | None:
-        """The equilibrium at a load, by Newton's method along the tangent of a state nearby.
-
-        None where it does not converge, or does with a reversed element.
-        """
+        """The equilibrium at a load, from a state nearby; None if not found, or not sound."""
         F: FloatArray = np.eye(2)
         w: FloatArray = np.zeros(self.reduction.size)
         if near is not None:
