@@ -20,7 +20,7 @@ from modeharvest.fem.lattice.options import simple_shear
 from modeharvest.fem.materials import Ogden
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies import lattice as mode_study
-from modeharvest.validation.studies.lattice import ModeTable, first_mode_limit, study_modes
+from modeharvest.validation.studies.lattice import ModeTable, first_mode_limit
 from modeharvest.validation.studies.lattice_pattern import (
     LOADINGS,
     STUDIED_MATERIALS,
@@ -75,9 +75,7 @@ def test_without_a_file_there_are_no_rows(tmp_path: Path) -> None:
     assert read_rows(tmp_path / "none.csv") == ()
 
 
-def test_a_study_goes_on_where_it_was_broken_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_study_goes_on_where_it_was_broken_off(tmp_path: Path) -> None:
     asked: list[float] = []
 
     def work(lattice: StudiedLattice) -> ModeRow:
@@ -86,24 +84,21 @@ def test_a_study_goes_on_where_it_was_broken_off(
         asked.append(lattice.ratio)
         return made_up(lattice)
 
-    monkeypatch.setattr(mode_study, "pattern_row", work)
     lattices, path = ratio_lattices((0.3, 0.5, 0.7), ("uniaxial",)), tmp_path / "study.csv"
     with pytest.raises(KeyboardInterrupt):
-        study_modes(lattices, ModeTable(path))
+        ModeTable(path).rows(lattices, work)
     assert len(read_rows(path)) == 2
-    monkeypatch.setattr(mode_study, "pattern_row", made_up)
-    rows = study_modes(lattices, ModeTable(path))
+    rows = ModeTable(path).rows(lattices, made_up)
     assert [r.ratio for r in rows] == [0.3, 0.5, 0.7]
     asked.clear()
-    monkeypatch.setattr(mode_study, "pattern_row", work)
-    assert len(study_modes(lattices, ModeTable(path))) == 3
+    assert len(ModeTable(path).rows(lattices, work)) == 3
     assert asked == []
 
 
 def test_where_the_pattern_stops_being_first_is_bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mode_study, "pattern_row", made_up)
     base = StudiedLattice()
-    rows = study_modes(ratio_lattices((0.3, 0.5, 0.9), ("uniaxial",), base))
+    rows = ModeTable().rows(ratio_lattices((0.3, 0.5, 0.9), ("uniaxial",), base), made_up)
     limit = first_mode_limit(base, "uniaxial", rows, tolerance=0.003)
     assert limit is not None
     assert limit.without <= LIMIT < limit.with_ <= limit.without + 0.003

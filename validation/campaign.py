@@ -11,6 +11,7 @@ rest goes on.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -44,16 +45,9 @@ _ATTEMPTS = 3
 class Campaign:
     """A function and its cases.
 
-    Parameters
-    ----------
-    function
-        "package.module:name" of a function that takes a case and the campaign's folder and
-        returns a mapping of plain values, the row of the table.
-    cases
-        What to run it with; all have the same keys. What the function reads from the folder
-        belongs in them by a digest, so that a result is known to be of other inputs.
-    folder
-        Where the results go.
+    ``function``: "package.module:name" of a :data:`~modeharvest.validation.workers.CaseFunction`;
+    ``cases``: what to run it with, all with the same keys. What it reads from ``folder``, where the
+    results go, belongs in them by a digest, so that a result is known to be of other inputs.
     """
 
     function: str
@@ -65,12 +59,10 @@ class Campaign:
         if not self.cases:
             raise InputError("expected at least one case in a campaign, got none")
         keys = set(self.cases[0])
-        other = next((set(case) for case in self.cases if set(case) != keys), None)
-        if other is not None:
-            raise InputError(
-                "expected cases with the same keys, got "
-                f"{sorted(keys ^ other)} in some of them only"
-            )
+        for other in map(set, self.cases):
+            if other != keys:
+                some = sorted(keys ^ other)
+                raise InputError(f"expected cases with the same keys, got {some} in some only")
         named(self.function)
 
     def path(self, case: Case) -> Path:
@@ -82,15 +74,11 @@ class Campaign:
         return tuple(case for case in self.cases if read_result(self.path(case)).get("error") != "")
 
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
-        """Run what is missing and return the table; also left as ``table.csv``.
+        """Run what is missing and return the table; also left as ``table.csv``, without lists.
 
-        Lists are left in the cases' files. By default two processes of this machine do the work.
-
-        Raises
-        ------
-        InputError
-            If the folder can't be written to or another process works in it, the scheduler is
-            not there or goes away, or its workers can't do the work.
+        By default two processes of this machine do the work. InputError if the folder can't be
+        written to or another process works in it, the scheduler is not there or goes away, or its
+        workers can't do the work.
         """
         require_writable(self.folder)
         with exclusive(self.folder):
@@ -101,36 +89,31 @@ class Campaign:
                 done += 1
                 progress(done, len(self.cases), "campaign")
             table = self.table()
-            _write(table, self.folder)
+            lists = [name for name in table if table[name].map(lambda v: isinstance(v, list)).any()]
+            with atomic(self.folder / "table.csv") as temporary:
+                table.drop(columns=lists).to_csv(temporary, index=False)
         return table
 
     def table(self) -> pd.DataFrame:
         """A row for each case: its values, ``error`` (empty if none), its result."""
-        return pd.DataFrame([self._row(case) for case in self.cases])
+        rows = []
+        for case in self.cases:
+            record = read_result(self.path(case)) or {"error": "not run"}
+            error = (record["error"].strip().splitlines() or [""])[-1]
+            rows.append({**case, "error": error, **(record.get("result") or {})})
+        return pd.DataFrame(rows)
 
     def of_other_versions(self) -> dict[str, int]:
         """How many stored results are of another version or no longer asked for, by version."""
         wanted = {self.path(case) for case in self.cases}
-        counts: dict[str, int] = {}
-        for path in sorted((self.folder / "cases").glob("*.json")):
-            if path not in wanted:
-                version = str(stored(path).get("version", "unknown"))
-                counts[version] = counts.get(version, 0) + 1
-        return counts
-
-    def _row(self, case: Case) -> dict[str, Any]:
-        record = read_result(self.path(case))
-        error = record.get("error", "not run") if record else "not run"
-        last = error.strip().splitlines()[-1] if error else ""
-        found = record.get("result") or {}
-        return {**case, "error": last, **found}
+        others = set((self.folder / "cases").glob("*.json")) - wanted
+        return Counter(str(stored(path).get("version", "unknown")) for path in sorted(others))
 
     def _settled(self, cases: Sequence[Case], workers: Workers) -> Iterator[Case]:
         """The cases as they get done, or fail for certain.
 
-        A connection that breaks is made anew. Only where that fails is the scheduler gone:
-        whatever dask reports of a case, no other conclusion is drawn from it
-        (docs/decisions/0011-campaigns-on-busy-machines.md).
+        A connection that breaks is made anew. Only where that fails is the scheduler gone, whatever
+        dask reports of a case (docs/decisions/0011-campaigns-on-busy-machines.md).
         """
         left, in_vain = list(cases), 0
         while left:
@@ -164,8 +147,8 @@ class Campaign:
     def _tried(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
         """Each case with what became of it, in the end never KILLED.
 
-        A worker may have died of what it ran beside a case, or just before: those whose worker
-        died are tried again, each alone, and only then stored as failed.
+        A worker may have died of what it ran beside a case: those whose worker died are tried
+        again, each alone, and only then stored as failed.
         """
         killed = []
         for case, outcome in self._submitted(client, cases):
@@ -209,23 +192,16 @@ class Campaign:
 class _Outcome(Enum):
     """What becomes of a case that was handed to dask."""
 
-    SETTLED = auto()
-    """Its result, or its failure, is stored."""
-    KILLED = auto()
-    """Its worker died, more than once."""
-    CUT_OFF = auto()
-    """The connection to the scheduler broke."""
+    SETTLED = auto()  # its result, or its failure, is stored
+    KILLED = auto()  # its worker died, more than once
+    CUT_OFF = auto()  # the connection to the scheduler broke
 
 
 def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
     """All combinations of some values, each on top of a base case.
 
-    ``axes``: the values that keys of the base run through; the last runs fastest.
-
-    Raises
-    ------
-    InputError
-        If an axis is not a key of the base, or has no value or one twice.
+    ``axes``: the values that keys of the base run through, the last fastest; InputError if one is
+    not a key of the base, or has no value or one twice.
     """
     for name, values in axes.items():
         if name not in base:
@@ -235,11 +211,3 @@ def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
             raise InputError(f"expected different values of {name!r}, got {list(values)}")
     combinations = itertools.product(*axes.values())
     return tuple({**base, **dict(zip(axes, c, strict=True))} for c in combinations)
-
-
-def _write(table: pd.DataFrame, folder: Path) -> None:
-    """Leave the table for others to read."""
-    lists = [name for name in table if table[name].map(lambda v: isinstance(v, list)).any()]
-    plain = table.drop(columns=lists)
-    with atomic(folder / "table.csv") as temporary:
-        plain.to_csv(temporary, index=False)

@@ -38,19 +38,12 @@ class ImageAmplitude:
 
 @dataclass(frozen=True)
 class Buckling:
-    """When the pattern appears.
+    """When the pattern appears, in numbers and as ``text``.
 
-    Parameters
-    ----------
-    before, after
-        Strains of the last image without a pattern and of the first with one [-]; NaN if
-        there is none.
-    estimate
-        Strain at which the pattern begins if its amplitude grows with the square root of the
-        strain beyond, as after a pitchfork bifurcation [-]; NaN with fewer than three images
-        that have a pattern.
-    text
-        That as text.
+    ``before``, ``after``: strains of the last image without a pattern and of the first with one
+    [-], NaN if there is none; ``estimate``: strain at which the pattern begins if its amplitude
+    grows with the square root of the strain beyond, as after a pitchfork bifurcation [-], NaN with
+    fewer than three images that have a pattern.
     """
 
     before: float
@@ -65,15 +58,15 @@ def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:
     The shortening between its opposite edges by v0, averaged along them, over their distance.
     """
     along = np.linspace(0.02, 0.98, 33)
-    x = cellular.x_min + along * (cellular.x_max - cellular.x_min)
-    y = cellular.y_min + along * (cellular.y_max - cellular.y_min)
+    x_sides = np.array([cellular.x_min, cellular.x_max])
+    y_sides = np.array([cellular.y_min, cellular.y_max])
+    x, y = (sides[0] + along * np.ptp(sides) for sides in (x_sides, y_sides))
     ansatz, a = result.ansatz, result.unknowns
-    sides = np.array([cellular.x_min, cellular.x_max]), np.array([cellular.y_min, cellular.y_max])
-    across_x = ansatz.v0(a, sides[0], y)[..., 0].mean(axis=0)
-    across_y = ansatz.v0(a, x, sides[1])[..., 1].mean(axis=1)
+    across_x = ansatz.v0(a, x_sides, y)[..., 0].mean(axis=0)
+    across_y = ansatz.v0(a, x, y_sides)[..., 1].mean(axis=1)
     return (
-        float((across_x[0] - across_x[1]) / (sides[0][1] - sides[0][0])),
-        float((across_y[0] - across_y[1]) / (sides[1][1] - sides[1][0])),
+        float((across_x[0] - across_x[1]) / np.ptp(x_sides)),
+        float((across_y[0] - across_y[1]) / np.ptp(y_sides)),
     )
 
 

@@ -31,7 +31,6 @@ from modeharvest.validation.truth import Comparison, VectorStatistics, compare, 
 
 PAPER = "Maraghechi et al. 2024, doi 10.1016/j.ijsolstr.2024.112916"
 INDEPENDENT = "independent calculation"
-_BRIGHTNESS = ("gain_min", "gain_max", "offset_min", "offset_max")
 
 
 @dataclass(frozen=True)
@@ -76,13 +75,12 @@ class SnapshotSummary:
     """One strain of a virtual experiment; rms is per component.
 
     Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``, which staggered
-    rows have instead of a single mode. The mode's parameters are, of all equivalents, the
-    ones nearest to ``mode_ideal``, the exact pattern with its origin on a solid junction; their
-    standard errors are by noise, and by model error (empty where the mode is not observable).
-    Without free parameters the lists are empty; without gain and offset as unknowns they are
-    None, and so is what belongs to noise for noise-free images. ``noise_sd`` is rms over the
-    material and both images. ``details_px`` has statistics of w, best-fit error, and
-    IDIC - best fit.
+    rows have instead of a single mode. The mode's parameters are, of all equivalents, the ones
+    nearest to ``mode_ideal``, the exact pattern with its origin on a solid junction; their standard
+    errors are by noise, and by model error (empty where the mode is not observable). Without free
+    parameters the lists are empty; without gain and offset as unknowns they are None, and so is
+    what belongs to noise for noise-free images. ``noise_sd`` is rms over the material and both
+    images. ``details_px`` has statistics of w, best-fit error, and IDIC - best fit.
     """
 
     nominal_strain: float
@@ -134,12 +132,12 @@ class SnapshotSummary:
 
     def plain(self) -> dict[str, Any]:
         """As plain values, without what was not measured: parameters of modes, gain, offset."""
-        content = to_plain(self)
-        single = "mode", "mode_ideal", "mode_standard_error", "mode_model_error"
-        absent = [name for name in _BRIGHTNESS if content[name] is None]
-        absent += [] if self.mode else [*single, "mode_deviation_percent", "mode_best_fit"]
-        absent += [] if self.modes else ["modes"]
-        return {name: value for name, value in content.items() if name not in absent}
+        brightness = ("gain_min", "gain_max", "offset_min", "offset_max")
+        single = ("mode", "mode_ideal", "mode_standard_error", "mode_model_error",
+                  "mode_deviation_percent", "mode_best_fit")  # fmt: skip
+        absent = {name for name in brightness if getattr(self, name) is None}
+        absent |= (set() if self.mode else {*single}) | (set() if self.modes else {"modes"})
+        return {name: value for name, value in to_plain(self).items() if name not in absent}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,41 +172,37 @@ def expectations(summary: ExperimentSummary) -> tuple[Expectation, ...]:
     Snapshots that are not there, and a critical strain that was not found, are left out.
     """
     residual, critical = summary.inverse_map_max_residual_px, summary.critical_strain
-    rows = [
-        Expectation("largest residual of the inverse mapping", "px", "at most 1e-10", residual,
-                    residual <= 1e-10, "this project's promise")
-    ]  # fmt: skip
+    rows = []
     if critical is not None:
         ok = abs(100 * critical - 9.6) <= 0.3
-        rows.insert(0, Expectation("critical strain", "%", "9.6 ± 0.3", 100 * critical, ok,
-                                   INDEPENDENT))  # fmt: skip
+        rows = [Expectation("critical strain", "%", "9.6 ± 0.3", 100 * critical, ok, INDEPENDENT)]
+    rows.append(
+        Expectation("largest residual of the inverse mapping", "px", "at most 1e-10", residual,
+                    residual <= 1e-10, "this project's promise")
+    )  # fmt: skip
     for snapshot in summary.snapshots:
+        at, pivots = f" at {100 * snapshot.nominal_strain:.1f} %", snapshot.negative_pivots
         is_buckled = critical is not None and snapshot.nominal_strain > critical
-        rows += _after(snapshot) if is_buckled else _before(snapshot)
+        rows.append(Expectation("negative pivots" + at, "-", "0", pivots, pivots == 0, "stability"))
+        rows += _of_buckled(snapshot, at) if is_buckled else [_of_stable(snapshot, at)]
     return tuple(rows)
 
 
-def _before(snapshot: SnapshotSummary) -> list[Expectation]:
-    at = f" at {100 * snapshot.nominal_strain:.1f} %"
+def _of_stable(snapshot: SnapshotSummary, at: str) -> Expectation:
     inner, corners = snapshot.pattern_inner_px, snapshot.pattern_corners_px
-    return [
-        Expectation("negative pivots" + at, "-", "0", snapshot.negative_pivots,
-                    snapshot.negative_pivots == 0, "stability"),
-        Expectation("pattern inside over pattern in the corners" + at, "-",
-                    "below 1: v₁ near zero except at the corners", inner / corners,
-                    inner < corners, PAPER + ", Fig. (virt)"),
-    ]  # fmt: skip
+    return Expectation(
+        "pattern inside over pattern in the corners" + at, "-",
+        "below 1: v₁ near zero except at the corners", inner / corners, inner < corners,
+        PAPER + ", Fig. (virt)",
+    )  # fmt: skip
 
 
-def _after(snapshot: SnapshotSummary) -> list[Expectation]:
-    at = f" at {100 * snapshot.nominal_strain:.1f} %"
+def _of_buckled(snapshot: SnapshotSummary, at: str) -> list[Expectation]:
     worst = max((abs(v) for v in snapshot.mode_deviation_percent), default=0.0)
     pattern, best = snapshot.pattern_amplitude_px, snapshot.rms_best_fit_px
     loss = snapshot.rms_idic_to_best_fit_px
     length = snapshot.details_px["idic_to_best_fit"].rms_length
     return [
-        Expectation("negative pivots" + at, "-", "0", snapshot.negative_pivots,
-                    snapshot.negative_pivots == 0, "stability"),
         Expectation("pattern amplitude" + at, "px", "about 28 (25 to 31)", pattern,
                     25 <= pattern <= 31, INDEPENDENT),
         Expectation("mode's largest deviation from [1, 1, 1, −1, 1, 0, 0]" + at, "%", "at most 2",
@@ -224,11 +218,7 @@ def _after(snapshot: SnapshotSummary) -> list[Expectation]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredExperiment:
-    """What is to be assessed.
-
-    ``options`` of the correlation; the truth comes from ``solution`` and ``images``; ``results``:
-    what IDIC found, by nominal strain.
-    """
+    """What is to be assessed: ``results`` by nominal strain, ``options`` of the correlation."""
 
     experiment: Experiment
     options: SquareLatticeOptions
@@ -270,10 +260,8 @@ def displacement_spectrum(
     comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
 ) -> tuple[Spectrum, WavePattern]:
     """Spectral densities of the k-th true displacement, and the pattern read from them."""
-    comparison = comparisons[k]
-    spectrum = spectral_density(
-        comparison.displacement, comparison.grid, comparison.mask, measured.specimen.pitch
-    )
+    at, pitch = comparisons[k], measured.specimen.pitch
+    spectrum = spectral_density(at.displacement, at.grid, at.mask, pitch)
     return spectrum, read_pattern(spectrum)
 
 
@@ -347,21 +335,15 @@ def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise |
 
 def _brightness(comparison: Comparison) -> dict[str, Any]:
     """Gain [-] and offset [fraction of full scale] over the material; nothing if not unknown."""
-    result, grid = comparison.result, comparison.grid
-    fields = zip(
-        ("gain", "offset"),
-        (result.ansatz.brightness.gain_degree, result.ansatz.brightness.offset_degree),
-        result.ansatz.gain_and_offset(result.unknowns, grid.x, grid.y),
-        strict=True,
-    )
+    grid, ansatz = comparison.grid, comparison.result.ansatz
+    degrees = ansatz.brightness.gain_degree, ansatz.brightness.offset_degree
+    fields = ansatz.gain_and_offset(comparison.result.unknowns, grid.x, grid.y)
     found: dict[str, Any] = {}
-    for name, degree, values in fields:
+    for name, degree, values in zip(("gain", "offset"), degrees, fields, strict=True):
         if degree is not None:
             on_material = np.broadcast_to(values, grid.shape)[comparison.mask]
-            found |= {
-                f"{name}_min": float(on_material.min()),
-                f"{name}_max": float(on_material.max()),
-            }
+            found[f"{name}_min"] = float(on_material.min())
+            found[f"{name}_max"] = float(on_material.max())
     return found
 
 
@@ -379,21 +361,18 @@ def _mode_numbers(
     is_any = len(found.unobservable) < len(parts)
     model = _model_errors(comparison, measured) if is_any else (None,) * ansatz.size
     if measured.specimen.is_staggered:
-        modes = (
-            ModeSummary(
-                mode.family.name,
-                tuple(mode.family.names),
-                tuple(mode.family.units),
-                tuple(two_waves_near(result.mode_parameters(i), start[part], pitch)),
-                tuple(start[part]),
-                tuple(noise[part]),
-                model[part] if i not in found.unobservable else (),
-                tuple(two_waves_near(best.mode_parameters(i), start[part], pitch)),
-                found.amplitude_px[i],
-                i not in found.unobservable,
+        modes = []
+        for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True)):
+            family, is_observable = mode.family, i not in found.unobservable
+            at, at_best = (
+                tuple(two_waves_near(fit.mode_parameters(i), start[part], pitch))
+                for fit in (result, best)
             )
-            for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True))
-        )
+            modes.append(ModeSummary(
+                family.name, tuple(family.names), tuple(family.units), at, tuple(start[part]),
+                tuple(noise[part]), model[part] if is_observable else (), at_best,
+                found.amplitude_px[i], is_observable,
+            ))  # fmt: skip
         return {"modes": tuple(modes)}
     parameters, ideal = result.mode_parameters(), start[parts[0]]
     return {
@@ -407,11 +386,7 @@ def _mode_numbers(
 
 
 def _model_errors(comparison: Comparison, measured: MeasuredExperiment) -> tuple[float | None, ...]:
-    """Standard deviations of the unknowns by model error; None if not known.
-
-    Each unit cell's share of the residual counts as one draw: where noise says how well the
-    images determine the unknowns, this says how far w moves them.
-    """
+    """Standard deviations of the unknowns by model error, a unit cell a draw; None if unknown."""
     options, result = measured.options, comparison.result
     pair = measured.images.pair(comparison.strain, camera=options.camera)
     try:

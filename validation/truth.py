@@ -52,11 +52,7 @@ class VectorStatistics:
 
     @classmethod
     def of(cls, field: FloatArray, mask: BoolArray, unit: float = 1.0) -> VectorStatistics:
-        """Of a field (rows, cols, 2) where a mask (rows, cols) is True.
-
-        ``unit``: the size of the unit to give the numbers in, e.g. the pixel size [mm/px] to turn
-        a field in mm into px.
-        """
+        """Of a field (rows, cols, 2) where a mask (rows, cols) is True, in a unit of that size."""
         x, y = (field[..., c][mask] / unit for c in (0, 1))
         mean_squares = float(x @ x) / x.size, float(y @ y) / y.size
         length = np.sqrt(x * x + y * y)
@@ -64,12 +60,9 @@ class VectorStatistics:
         return cls(
             (float(x.mean()), float(y.mean())),
             (math.sqrt(mean_squares[0]), math.sqrt(mean_squares[1])),
-            math.sqrt(0.5 * sum(mean_squares)),
-            math.sqrt(sum(mean_squares)),
-            float(median),
-            float(p95),
-            float(largest),
-        )
+            math.sqrt(0.5 * sum(mean_squares)), math.sqrt(sum(mean_squares)),
+            float(median), float(p95), float(largest),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -116,11 +109,7 @@ class Comparison:
 
     def statistics(self) -> dict[str, VectorStatistics]:
         """Of the error ``w`` and of its parts ``best_fit`` and ``idic_to_best_fit`` [px]."""
-        parts = {
-            "w": self.w,
-            "best_fit": self.best_error,
-            "idic_to_best_fit": self.idic_to_best,
-        }
+        parts = {"w": self.w, "best_fit": self.best_error, "idic_to_best_fit": self.idic_to_best}
         px = self.grid.pixel_size
         return {name: VectorStatistics.of(part, self.mask, px) for name, part in parts.items()}
 
@@ -156,16 +145,12 @@ def compare(
     and from the result, and the better of the two is taken. ``camera``: whether the quantised
     images were measured.
     """
-    grid, mask, ansatz = images.grid, images.mask(), result.ansatz
-    truth = images.truth(strain).displacement
-    best = best_fit(images.truth(strain), result, guesses=(start,), progress=progress)
-    left = residual(
-        Assembly(ansatz, grid, mask),
-        result.unknowns,
-        images.reference(camera=camera),
-        SplineImage.of(images.deformed(strain, camera=camera)),
-    )
-    return Comparison(strain, grid, mask, truth, result, best, left.astype(np.float64))
+    grid, mask, truth = images.grid, images.mask(), images.truth(strain)
+    best = best_fit(truth, result, guesses=(start,), progress=progress)
+    f, g = images.reference(camera=camera), images.deformed(strain, camera=camera)
+    left = residual(Assembly(result.ansatz, grid, mask), result.unknowns, f, SplineImage.of(g))
+    displacement = truth.displacement
+    return Comparison(strain, grid, mask, displacement, result, best, left.astype(np.float64))
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,6 @@ def result_path(function: str, case: Case, folder: Path) -> Path:
     return folder / "cases" / f"{key}.json"
 
 
-def plain_row(result: Any) -> dict[str, Any]:
-    """What a case's function returned as the row of a table."""
-    return asdict(result) if is_dataclass(result) else dict(result)  # type: ignore[arg-type]
-
-
 def leave(content: Mapping[str, Any], folder: Path, path: str) -> str:
     """Leave in a campaign's folder what cases read, under its digest; returns that, their name.
 
@@ -73,12 +68,8 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     Dask has a case run again whose worker dies before the campaign has heard that it is done.
 
     ``folder``: the campaign's, absolute, as a worker elsewhere has another current one; ``code``:
-    digest of modeharvest's where the campaign was begun.
-
-    Raises
-    ------
-    InputError
-        If this worker has another: it came after the campaign had begun.
+    digest of modeharvest's where the campaign was begun, an InputError if this worker, which came
+    later, has another.
     """
     if code != source_digest():
         raise InputError(
@@ -90,7 +81,8 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     numba.set_num_threads(1)  # also in workers of a scheduler that were started without a limit
     result, error = None, ""
     try:
-        result = plain_row(named(function)(case, Path(folder)))
+        found = named(function)(case, Path(folder))
+        result = asdict(found) if is_dataclass(found) else dict(found)  # type: ignore[arg-type]
     except Exception:  # a case may fail in any way: that is its result
         error = traceback.format_exc()
     store(path, case, result, error)
@@ -127,10 +119,8 @@ this stands in the parent's own environment for a while, where numba must not ch
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
 _LOOPBACK = "127.0.0.1"
 _MOST_WORKERS = 1000
-"""On one machine."""
 _LEAST_BYTES = 2**28
 """Of a worker's memory: with less it is stopped, and begun again, before it has done anything."""
-_NEVER = "1000 days"
 LOCAL: dict[str, object] = {
     # Forks of one server process, which has imported dask: quicker than new processes.
     "distributed.worker.multiprocessing-method": "forkserver" if _FORKS else "spawn",
@@ -139,7 +129,7 @@ LOCAL: dict[str, object] = {
     # up a worker whose case keeps the interpreter for five minutes, and for good one that is not
     # back 15 s after its process was killed.
     "distributed.scheduler.worker-ttl": None,
-    "distributed.deploy.lost-worker-timeout": _NEVER,
+    "distributed.deploy.lost-worker-timeout": "1000 days",
     "distributed.comm.timeouts.connect": "10 minutes",
     "distributed.comm.timeouts.tcp": "1 hour",
     # A case whose worker dies is tried once more beside others, then alone: see Campaign.
@@ -155,15 +145,10 @@ LOCAL: dict[str, object] = {
 class Workers:
     """Who does the work.
 
-    Parameters
-    ----------
-    count
-        Processes on this machine.
-    memory
-        Most that each may take, e.g. "4GiB"; one that takes more is stopped and its case fails.
-    scheduler
-        Address of a running dask scheduler instead, e.g. "tcp://host:8786". Its workers must see
-        the campaign's folder and have this version of modeharvest.
+    ``count``: of processes on this machine; ``memory``: most that each may take, e.g. "4GiB", one
+    that takes more is stopped and its case fails; ``scheduler``: instead, address of a running dask
+    scheduler, e.g. "tcp://host:8786", whose workers must see the campaign's folder and have this
+    version of modeharvest.
     """
 
     count: int = 2
@@ -187,39 +172,29 @@ class Workers:
             ) from error
 
     def require_ready(self, function: str, folder: Path) -> None:
-        """Recognise workers elsewhere that can't do the work, before anything is computed for them.
-
-        Raises
-        ------
-        InputError
-            If the scheduler is not there, or its workers can't do the work.
-        """
-        if self.scheduler is None:
-            return
-        with _client_of(self.scheduler) as client:
-            _require_able(client, self.scheduler, function, folder)
+        """Recognise workers elsewhere that can't do the work, before anything is made for them."""
+        if self.scheduler is not None:
+            with self.client(function, folder):
+                pass
 
     @contextmanager
     def client(self, function: str, folder: Path) -> Iterator[Any]:
         """A dask client of the workers, which end with it if they are of this machine.
 
-        Raises
-        ------
-        InputError
-            If the scheduler is not there, or its workers can't do the work.
+        InputError if the scheduler is not there, or its workers can't do the work.
         """
         if self.scheduler is None:
             with _processes(self.count, self.memory) as client:
                 yield client
-            return
-        with _client_of(self.scheduler) as client:
-            _require_able(client, self.scheduler, function, folder)
-            yield client
+        else:
+            with _client_of(self.scheduler) as client:
+                _require_able(client, self.scheduler, function, folder)
+                yield client
 
 
 @contextmanager
 def _environment_kept() -> Iterator[None]:
-    """Whatever becomes of the environment's variables in here, dask's changes, is undone."""
+    """Undo dask's changes of the environment's variables."""
     before = dict(os.environ)
     try:
         yield
@@ -336,8 +311,5 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
 def handshake(function: str, mark: str) -> tuple[str, str, bool]:
     """A worker's version, code, and whether it can write where a file is."""
     named(function)
-    return (
-        __version__,
-        source_digest(),
-        Path(mark).exists() and os.access(Path(mark).parent, os.W_OK),
-    )
+    sees = Path(mark).exists() and os.access(Path(mark).parent, os.W_OK)
+    return __version__, source_digest(), sees

@@ -77,20 +77,17 @@ class Attenuation:
     def of(cls, star: Star, field: LocalField) -> Attenuation:
         """Read the curve off a field in px, on the star's grid.
 
-        Raises
-        ------
-        InputError
-            If it covers too few columns, or holds no such wave.
+        InputError if it covers too few columns, or holds no such wave.
         """
         with np.errstate(invalid="ignore"):
             inside = (field.x >= -0.5) & (field.x <= star.cols - 0.5)
             near = inside & (np.abs(field.y) <= 0.5 * star.period(field.x))
             row = np.abs(field.y).min(where=field.good, initial=np.inf)
             middle = inside & (np.abs(field.y) <= row + 0.5)
-        found = cls(Columns.of(star, field, near), Columns.of(star, field, middle))
-        _require_columns(found.columns, star, field.source)
-        _require_wave(found.columns, star, field)
-        return found
+        columns = Columns.of(star, field, near)
+        _require_columns(columns, star, field.source)
+        _require_wave(columns, star, field)
+        return cls(columns, Columns.of(star, field, middle))
 
     @cached_property
     def period(self) -> FloatArray:
@@ -125,9 +122,7 @@ class Attenuation:
 
         Above :attr:`finest_px` where a curve dips again.
         """
-        share = self.curve[0]
-        known = np.isfinite(share)
-        period, share = self.period[known], share[known]
+        period, share = self._known
         below = np.flatnonzero(share < KEPT)
         if not len(below) or below[-1] == len(share) - 1:
             return float("nan")
@@ -139,11 +134,11 @@ class Attenuation:
 
         Of degree 12 in the column; NaN if it never does, or the row has too few points.
         """
-        c = self.centre
-        if len(c.period) <= 4 * _CHALLENGE_DEGREE:
+        at, share = self.centre.period, self.centre.share
+        if len(at) <= 4 * _CHALLENGE_DEGREE:
             return float("nan")
-        fit = np.polynomial.Chebyshev.fit(c.period, c.share, _CHALLENGE_DEGREE)
-        period = np.linspace(c.period[0], c.period[-1], 20 * _POINTS)
+        fit = np.polynomial.Chebyshev.fit(at, share, _CHALLENGE_DEGREE)
+        period = np.linspace(at[0], at[-1], 20 * _POINTS)
         return first_rise(period, np.asarray(fit(period), dtype=np.float64))
 
     @cached_property
@@ -159,9 +154,13 @@ class Attenuation:
 
     def at(self, period: float) -> float:
         """Smoothed T at a period [px]; NaN outside."""
-        share = self.curve[0]
-        known = np.isfinite(share)
-        return float(np.interp(period, self.period[known], share[known], np.nan, np.nan))
+        return float(np.interp(period, *self._known, np.nan, np.nan))
+
+    @property
+    def _known(self) -> tuple[FloatArray, FloatArray]:
+        """Periods and T where there are columns enough for T."""
+        known = np.isfinite(self.curve[0])
+        return self.period[known], self.curve[0][known]
 
 
 def first_rise(period: FloatArray, share: FloatArray) -> float:

@@ -6,13 +6,12 @@ describes; what an ansatz makes of the wave is what is asked.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 from scipy import ndimage
 
 from modeharvest.fem.specimen import Specimen
@@ -27,11 +26,21 @@ from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
+from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.workers import leave
 
-SPACING = 0.2
-
+_SPACING = 0.2
+"""Of the points at which fields are compared [mm]."""
 _SPARSE = 2
+_MARGIN = 0.03
+"""Background around the specimen, as a share of its larger side."""
+LARGEST = 0.04
+"""max ||phi1|| of the paper's mode [-]."""
+_COARSE_STEPS, _NEWTON_STEPS, _STEPS = 20, 3, 50
+_AROUND_PX = 4
+"""A wave moves no pixel farther."""
+_ENOUGH_PX = 1e-6
+"""Residual of the inversion: a thousandth of what a correlation without noise errs by."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +58,7 @@ class ResolutionSpec:
 
     def write(self, folder: Path) -> str:
         """Leave it for workers; returns its name."""
-        content = asdict(self)
-        content["buckled"]["specimen"] = self.buckled.specimen.plain()
-        return leave(content, folder, "subjects/{}.json")
+        return leave(to_plain(self), folder, "subjects/{}.json")
 
     @classmethod
     def read(cls, folder: Path, name: str) -> ResolutionSpec:
@@ -61,8 +68,10 @@ class ResolutionSpec:
     @property
     def points(self) -> FloatArray:
         """(m, 2) points of the material at which fields are compared [mm]."""
-        width, height = self.buckled.specimen.half_size
-        x, y = (np.arange(-half + 0.5 * SPACING, half, SPACING) for half in (width, height))
+        x, y = (
+            np.arange(-half + 0.5 * _SPACING, half, _SPACING)
+            for half in self.buckled.specimen.half_size
+        )
         grid = np.stack(np.meshgrid(x, y), axis=-1)
         return np.asarray(grid[self.buckled.material(grid[..., 0], grid[..., 1])])
 
@@ -79,55 +88,29 @@ class ResolutionSpec:
 
     def start(self, degree: int, motion: str) -> FloatArray:
         """The base motion, or none."""
-        ansatz = self.ansatz(degree, motion)
         if motion == "still":
-            return np.zeros(ansatz.size)
-        return ansatz.initial_guess(self.buckled.strain, self.buckled.pattern)
+            return np.zeros(self.ansatz(degree, motion).size)
+        return self.buckled.start(degree, degree)
 
     def correlate(self, pair: ImagePair, degree: int, motion: str) -> Result:
         """Measure a pair from what is nearly its motion, on the full images."""
-        options = CorrelationOptions(
-            (Level(1, 0.0),), self.buckled.how.edge_px, self.buckled.how.order
-        )
-        guess = self.start(degree, motion)
+        how, guess = self.buckled.how, self.start(degree, motion)
+        options = CorrelationOptions((Level(1, 0.0),), how.edge_px, how.order)
         return correlate(pair, self.ansatz(degree, motion), guess=guess, options=options)
-
-
-_ADAPTER = TypeAdapter(ResolutionSpec)
 
 
 @lru_cache(maxsize=1)
 def _resolution_spec(folder: Path, name: str) -> ResolutionSpec:
-    return _ADAPTER.validate_python(read_json(folder / "subjects" / f"{name}.json"))
-
-
-_MARGIN = 0.03
-"""Background around the specimen, as a share of its larger side."""
-LARGEST = 0.04
-"""max ||phi1|| of the paper's mode [-]."""
-_COARSE_STEPS, _NEWTON_STEPS, _STEPS = 20, 3, 50
-_AROUND_PX = 4
-"""A wave moves no pixel farther."""
-_ENOUGH_PX = 1e-6
-"""Residual of the inversion: a thousandth of what a correlation without noise errs by."""
+    return made(ResolutionSpec, read_json(folder / "subjects" / f"{name}.json"))
 
 
 @dataclass(frozen=True)
 class AddedWave:
     """A small wave of v0 or of v1.
 
-    Parameters
-    ----------
-    part
-        "v0": a motion along ``axis`` itself; "v1": of the pattern's amplitude.
-    axis
-        0: the wave runs along x; 1: along y.
-    period
-        [mm].
-    phase
-        At x = y = 0 [rad].
-    amplitude
-        Of the displacement; for "v1" where the pattern is largest [mm].
+    ``part``: "v0", a motion along ``axis`` itself, or "v1", of the pattern's amplitude; ``axis``:
+    0 if the wave runs along x, 1 if along y; ``period`` [mm]; ``phase``: at x = y = 0 [rad];
+    ``amplitude``: of the displacement, for "v1" where the pattern is largest [mm].
     """
 
     part: str
@@ -146,13 +129,6 @@ class AddedWave:
     def shape(self, points: FloatArray) -> FloatArray:
         """(...) the wave alone at points (..., 2) [mm], of amplitude 1 [-]."""
         return np.asarray(np.cos(2.0 * np.pi / self.period * points[..., self.axis] + self.phase))
-
-
-def noisy(pair: ImagePair, level: float, rng: np.random.Generator) -> ImagePair:
-    """The pair with white noise of that standard deviation in both images."""
-    f, g = pair.reference, pair.deformed
-    n = rng.normal(scale=level, size=(2, *f.shape)).astype(np.float32)
-    return pair.with_images(f + n[0], g + n[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,21 +217,14 @@ class BuckledMotion:
 
     def images(self, wave: AddedWave | None = None) -> ImagePair:
         """Exact images before and after the motion."""
-        grid = self.grid
-        speckle = Speckle(self.speckle, grid.shape)
-        x, y = grid.x[None, :], grid.y[:, None]
-        mask = self.material(x, y)
-        base = self._base
-        shown, point = base.near, base.points
-        if wave is not None:
-            point = self._improved(base, wave)
+        still, base, grid = self.still(), self._base, self.grid
+        point = base.points if wave is None else self._improved(base, wave)
         inside = self.material(point[:, 0], point[:, 1])
-        deformed_mask = shown.copy()
-        deformed_mask[shown] = inside
+        deformed_mask = base.near.copy()
+        deformed_mask[base.near] = inside
         g = np.zeros(grid.shape, dtype=np.float32)
-        g[deformed_mask] = speckle(*grid.to_px(*point[inside].T))
-        f = np.where(mask, speckle.image(), 0.0).astype(np.float32)
-        return ImagePair(f, g, grid, mask, deformed_mask)
+        g[deformed_mask] = Speckle(self.speckle, grid.shape)(*grid.to_px(*point[inside].T))
+        return ImagePair(still.reference, g, grid, still.masks[0], deformed_mask)
 
     def still(self) -> ImagePair:
         """The image before the motion, twice."""

@@ -21,25 +21,11 @@ import numpy as np
 from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.typed import to_plain
+from modeharvest.util.typed import quantities, quantity, to_plain
 from modeharvest.validation.resolution.attenuation import Attenuation
 from modeharvest.validation.resolution.star import KEPT, Star, StarSet
 
 RESOLUTION_FORMAT = "modeharvest-resolution-1"
-
-GRADE_COLUMNS = {
-    "l10 [px]": "finest_px",
-    "± l10 [px]": "finest_se_px",
-    "n [px]": "noise_px",
-    "± n [px]": "noise_se_px",
-    "n l10 [px²]": "indicator_px2",
-    "± n l10 [px²]": "indicator_se_px2",
-    "l10, centre row [px]": "challenge_px",
-    "ripple [%]": "ripple_percent",
-    "left at the longest [%]": "left_percent",
-    "points": "points",
-    "returned [%]": "returned_percent",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,27 +43,51 @@ class StarGrading:
         return [*refused, *(note for grade in self.grades for note in grade.notes)]
 
 
+@dataclass(frozen=True)
+class GradeNumbers:
+    """A code's grade in numbers; NaN where not known.
+
+    Beyond what heads the table's columns: ``safe_px``, the period from which on less than 10 % are
+    lost for good, and the shortest and the longest period measured [px].
+    """
+
+    name: str
+    safe_px: float
+    shortest_px: float
+    longest_px: float
+    finest_px: float = quantity("l10", "px")
+    finest_se_px: float = quantity("± l10", "px")
+    noise_px: float = quantity("n", "px")
+    noise_se_px: float = quantity("± n", "px")
+    indicator_px2: float = quantity("n l10", "px²")
+    indicator_se_px2: float = quantity("± n l10", "px²")
+    challenge_px: float = quantity("l10, centre row", "px")
+    ripple_percent: float = quantity("ripple", "%")
+    left_percent: float = quantity("left at the longest", "%")
+    points: int = quantity("points")
+    returned_percent: float = quantity("returned", "%")
+
+    @classmethod
+    def of(cls, grade: StarGrade) -> GradeNumbers:
+        """All that is known of a code."""
+        found, noise = grade.attenuation, grade.noise
+        shortest, longest = (float(period) for period in found.period[[0, -1]])
+        return cls(
+            grade.name, found.safe_px, shortest, longest, found.finest_px, found.finest_se_px,
+            np.nan if noise is None else noise.v_px, np.nan if noise is None else noise.v_se_px,
+            grade.indicator_px2, grade.indicator_se_px2, found.challenge_px, 100.0 * found.ripple,
+            100.0 * found.at(longest), grade.moved.x.size, 100.0 * grade.moved.valid_share,
+        )  # fmt: skip
+
+
+GRADE_COLUMNS = {
+    f"{label} [{unit}]" if unit else label: name for label, unit, name in quantities(GradeNumbers)
+}
+
+
 def grade_numbers(grade: StarGrade) -> dict[str, Any]:
     """A code's grade as plain values, units in the names; None where not known."""
-    found, noise = grade.attenuation, grade.noise
-    row: dict[str, Any] = {
-        "name": grade.name,
-        "finest_px": found.finest_px,
-        "finest_se_px": found.finest_se_px,
-        "safe_px": found.safe_px,
-        "challenge_px": found.challenge_px,
-        "noise_px": np.nan if noise is None else noise.v_px,
-        "noise_se_px": np.nan if noise is None else noise.v_se_px,
-        "indicator_px2": grade.indicator_px2,
-        "indicator_se_px2": grade.indicator_se_px2,
-        "ripple_percent": 100.0 * found.ripple,
-        "left_percent": 100.0 * found.at(float(found.period[-1])),
-        "points": grade.moved.x.size,
-        "returned_percent": 100.0 * grade.moved.valid_share,
-        "shortest_px": float(found.period[0]),
-        "longest_px": float(found.period[-1]),
-    }
-    return {key: to_plain(value) for key, value in row.items()}
+    return dict(to_plain(GradeNumbers.of(grade)))
 
 
 def star_summary(grading: StarGrading) -> dict[str, Any]:
@@ -87,11 +97,7 @@ def star_summary(grading: StarGrading) -> dict[str, Any]:
         found = grade.attenuation
         share, error = found.curve
         curve = {"period_px": found.period, "left": share, "standard_error": error}
-        codes.append({
-            **grade_numbers(grade),
-            "noise": to_plain(grade.noise),
-            "curve": to_plain(curve),
-        })  # fmt: skip
+        codes.append({**grade_numbers(grade), **to_plain({"noise": grade.noise, "curve": curve})})
     star_set = grading.star_set
     return {"format": RESOLUTION_FORMAT, "benchmark": star_set.id, "spec": star_set.info["spec"],
             "codes": codes, "remarks": grading.notes}  # fmt: skip
@@ -134,10 +140,7 @@ class NoiseFloor:
     def of(cls, star: Star, still: LocalField) -> NoiseFloor:
         """From a field without motion, in px on the star's grid.
 
-        Raises
-        ------
-        InputError
-            If there are few points, or something moves.
+        InputError if there are few points, or something moves.
         """
         x, _, u = still.valid_points()
         if len(x) < _FEWEST_POINTS:
@@ -155,14 +158,9 @@ class NoiseFloor:
         squares = (u[:, 1] - mean[1]) ** 2
         by_part = [part.mean() for part in np.array_split(squares[np.argsort(x)], _PARTS)]
         variance_se = np.std(by_part, ddof=1) / np.sqrt(_PARTS)
-        return cls(
-            v_px=float(sd[1]),
-            u_px=float(sd[0]),
-            v_se_px=float(variance_se / (2.0 * sd[1])) if sd[1] > 0.0 else 0.0,
-            mean_px=(float(mean[0]), float(mean[1])),
-            points=still.x.size,
-            returned=still.valid_share,
-        )
+        v_se = float(variance_se / (2.0 * sd[1])) if sd[1] > 0.0 else 0.0
+        mean_px = float(mean[0]), float(mean[1])
+        return cls(float(sd[1]), float(sd[0]), v_se, mean_px, still.x.size, still.valid_share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,10 +198,8 @@ class StarGrade:
         """Its standard error [px^2]."""
         if self.noise is None or not self.noise.v_px > 0.0:
             return float("nan")
-        found = self.attenuation
-        relative = np.hypot(
-            self.noise.v_se_px / self.noise.v_px, found.finest_se_px / found.finest_px
-        )
+        found, noise = self.attenuation, self.noise
+        relative = np.hypot(noise.v_se_px / noise.v_px, found.finest_se_px / found.finest_px)
         return float(relative * self.indicator_px2)
 
     @cached_property
@@ -232,19 +228,16 @@ class StarGrade:
             )  # fmt: skip
         if self.still is None:
             notes.append(f"{self.name}: no field without motion was given, so n is not known")
-        lost = self.moved.lost
-        if lost:
-            notes.append(f"{self.name}: {lost} of {self.moved.x.size} points were not measured")
+        if self.moved.lost:
+            size = self.moved.x.size
+            notes.append(f"{self.name}: {self.moved.lost} of {size} points were not measured")
         return tuple(notes)
 
 
 def ranked_grades(grades: Sequence[StarGrade]) -> list[StarGrade]:
     """The best first: by the indicator; then those without one, by l10."""
 
-    def key(grade: StarGrade) -> tuple[float, float]:
-        return (
-            np.nan_to_num(grade.indicator_px2, nan=np.inf),
-            np.nan_to_num(grade.attenuation.finest_px, nan=np.inf),
-        )
+    def key(grade: StarGrade) -> tuple[float, ...]:
+        return tuple(np.nan_to_num([grade.indicator_px2, grade.attenuation.finest_px], nan=np.inf))
 
     return sorted(grades, key=key)

@@ -20,7 +20,7 @@ Nothing is secret: the displacement is a formula. The set's id is a digest of it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -34,7 +34,7 @@ from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util import __version__
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, read_json, read_record, reading, sha256_of, write_json
 from modeharvest.util.machine import require_memory
@@ -57,19 +57,9 @@ _NEAR = 1e-3
 class Star:
     """The wave and the image it is in.
 
-    Parameters
-    ----------
-    rows, cols
-        Size of the image [px]; an odd number of rows has a centre row.
-    amplitude_px
-        A [px].
-    shortest_px, longest_px
-        Periods at the first and at the last column [px].
-
-    Raises
-    ------
-    InputError
-        If the image would nearly fold, or is too small.
+    ``rows``, ``cols``: size of the image [px], with an odd number of rows; ``amplitude_px``: A
+    [px]; ``shortest_px``, ``longest_px``: periods at the first and at the last column [px].
+    InputError if the image would nearly fold, or is too small.
     """
 
     rows: int = 501
@@ -92,9 +82,8 @@ class Star:
         if not (0.0 < steepest <= _STEEPEST and 0.0 < self.shortest_px < self.longest_px < np.inf):
             raise InputError(
                 f"star: expected 0 < 2 pi amplitude <= {_STEEPEST} shortest period, and a longer "
-                "longest one, got an amplitude "
-                f"of {self.amplitude_px} px and periods of {self.shortest_px} to "
-                f"{self.longest_px} px"
+                f"longest one, got an amplitude of {self.amplitude_px} px and periods of "
+                f"{self.shortest_px} to {self.longest_px} px"
             )
 
     @property
@@ -157,84 +146,32 @@ def fine_speckle(seed: int = 0) -> SpeckleSpec:
     return SpeckleSpec(standard_deviation=0.1, blur_px=1.0, dark=0.1, bright=0.9, seed=seed)
 
 
-@dataclass(frozen=True, eq=False)
-class StarImages:
-    """The exact images of a star."""
-
-    star: Star = field(default_factory=Star)
-    speckle: SpeckleSpec = field(default_factory=fine_speckle)
-
-    def render(self) -> tuple[FloatArray, FloatArray, float]:
-        """(rows, cols) f and g [fraction of full scale], and the inversion's residual [px]."""
-        pattern = Speckle(self.speckle, (self.star.rows, self.star.cols))
-        row, residual_px = self.star.came_from()
-        col = np.broadcast_to(np.arange(self.star.cols, dtype=np.float64), row.shape)
-        return pattern.image(), pattern.exact(row, col), residual_px
+def exact_images(star: Star, speckle: SpeckleSpec) -> tuple[FloatArray, FloatArray, float]:
+    """(rows, cols) f and g [fraction of full scale], and the inversion's residual [px]."""
+    pattern = Speckle(speckle, (star.rows, star.cols))
+    row, residual_px = star.came_from()
+    col = np.broadcast_to(np.arange(star.cols, dtype=np.float64), row.shape)
+    return pattern.image(), pattern.exact(row, col), residual_px
 
 
+FORMAT = "modeharvest-star-1"
+SIDECAR, README = "star.json", "README.md"
 _README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
-
 _ROLES = {
     "reference": "before the motion",
     "still": "the same again, with other noise",
     "deformed": "after it",
 }
-
-
-def star_readme(info: Mapping[str, Any]) -> str:
-    """The README of a set, Markdown, from the content of its ``star.json``."""
-    star = info["spec"]["star"]
-    return _README.format(
-        id=info["id"],
-        made_with=info["made_with"],
-        files="\n".join(_readme_row(name, info) for name in info["files"]),
-        amplitude=star["amplitude_px"],
-        shortest=star["shortest_px"],
-        longest=star["longest_px"],
-        range=star["longest_px"] - star["shortest_px"],
-        last=star["cols"] - 1,
-        centre=star["rows"] // 2,
-        residual=info["law"]["residual_of_inversion_px"],
-    )
-
-
-def _readme_row(name: str, info: Mapping[str, Any]) -> str:
-    """A row of the table of files."""
-    role, _, level = name.removesuffix(".tif").partition("_")
-    percent = level.removesuffix("pct").replace("p", ".")
-    camera = f"{info['spec']['bits']} bit, noise {percent} % of full scale"
-    kind = camera if level else "exact, float"
-    return f"| `{name}` | {_ROLES[role]}; {kind} |"
-
-
-FORMAT = "modeharvest-star-1"
-SIDECAR, README = "star.json", "README.md"
-ROLES = ("reference", "still", "deformed")
-"""Images of a level of noise: still shows what reference shows, with noise of its own."""
+"""Of the images of a level of noise."""
 
 
 @dataclass(frozen=True)
 class StarSpec:
     """What a star set holds.
 
-    Parameters
-    ----------
-    star
-        The wave and the size of the image.
-    speckle
-        What moves.
-    noise
-        Standard deviations of the white noise in the camera's images [fraction of full scale]:
-        0.01 is 2.6 of 255 levels.
-    bits
-        Of the camera's images.
-    seed
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        If a level comes twice or is out of range.
+    ``noise``: standard deviations of the white noise in the camera's images [fraction of full
+    scale], 0.01 is 2.6 of 255 levels; ``bits``: of these images; ``seed``: of the noise.
+    InputError if a level comes twice or is out of range.
     """
 
     star: Star = field(default_factory=Star)
@@ -245,9 +182,8 @@ class StarSpec:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", tuple(self.noise))
-        if len({level_name(n) for n in self.noise}) < len(self.noise) or not all(
-            1e-4 <= n <= 0.1 for n in self.noise
-        ):
+        is_twice = len({image_name("", n) for n in self.noise}) < len(self.noise)
+        if is_twice or not all(1e-4 <= n <= 0.1 for n in self.noise):
             raise InputError(
                 "star: expected different levels of noise from 0.0001 to 0.1 of full scale, got "
                 f"{', '.join(f'{n:g}' for n in self.noise)}"
@@ -269,13 +205,7 @@ class StarSet:
 
     @classmethod
     def read(cls, folder: Path | str) -> StarSet:
-        """Open a set.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
+        """Open a set; InputError if there is none."""
         path = Path(folder) / SIDECAR
         what, remedy = "a star set", "'modeharvest benchmark star' makes one"
         with reading(path, what, remedy):
@@ -294,9 +224,13 @@ def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silen
     if not _is_whole(folder, spec):
         (folder / SIDECAR).unlink(missing_ok=True)
         progress(0, 3, "star: images")
-        f, g, residual_px = StarImages(spec.star, spec.speckle).render()
+        f, g, residual_px = exact_images(spec.star, spec.speckle)
         progress(1, 3, "star: images")
-        files = _write_images(folder, spec, f, g)
+        files = {}
+        for name, image in _images(spec, f.astype(np.float32), g.astype(np.float32)):
+            write_image(folder / name, image)
+            path = folder / name
+            files[name] = {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
         progress(2, 3, "star: images")
         info = _info(spec, files, residual_px)
         with atomic(folder / README) as part:
@@ -306,36 +240,40 @@ def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silen
     return StarSet.read(folder)
 
 
-def level_name(noise: float) -> str:
-    """A level of noise as part of a file's name: 0.01 is 1pct, 0.005 is 0p5pct."""
-    return f"{100.0 * noise:g}pct".replace(".", "p")
-
-
 def image_name(role: str, noise: float | None = None) -> str:
-    """The file of an image: an exact one, or one of a level of noise."""
-    return f"{role}.tif" if noise is None else f"{role}_{level_name(noise)}.tif"
+    """The file of an image: an exact one, or one of a level of noise, _1pct or _0p5pct."""
+    level = "" if noise is None else f"_{100.0 * noise:g}pct".replace(".", "p")
+    return f"{role}{level}.tif"
 
 
-def _write_images(
-    folder: Path, spec: StarSpec, f: NDArray[np.float64], g: NDArray[np.float64]
-) -> dict[str, Any]:
-    """Write all images; returns their sizes and digests."""
-    still, moved = f.astype(np.float32), g.astype(np.float32)
-    exact = {"reference": still, "still": still, "deformed": moved}
-    images: dict[str, NDArray[Any]] = {
-        image_name(role): exact[role] for role in ("reference", "deformed")
-    }
+def _images(spec: StarSpec, f: FloatImage, g: FloatImage) -> Iterator[tuple[str, NDArray[Any]]]:
+    """All images with the names of their files."""
+    yield from ((image_name("reference"), f), (image_name("deformed"), g))
     for noise in spec.noise:
         camera = Sensor(read_noise=noise, read_seed=spec.seed)
-        for role in ROLES:
+        for role, exact in zip(_ROLES, (f, f, g), strict=True):
             name = image_name(role, noise)
-            images[name] = camera.expose(exact[role], spec.bits, name)
-    for name, image in images.items():
-        write_image(folder / name, image)
-    return {
-        name: {"bytes": (folder / name).stat().st_size, "sha256": sha256_of(folder / name)}
-        for name in images
+            yield name, camera.expose(exact, spec.bits, name)
+
+
+def star_readme(info: Mapping[str, Any]) -> str:
+    """The README of a set, Markdown, from the content of its ``star.json``."""
+    star = info["spec"]["star"]
+    derived = {
+        "files": "\n".join(_readme_row(name, info["spec"]["bits"]) for name in info["files"]),
+        "range": star["longest_px"] - star["shortest_px"],
+        "last": star["cols"] - 1,
+        "centre": star["rows"] // 2,
     }
+    return _README.format_map({**info, **info["law"], **star, **derived})
+
+
+def _readme_row(name: str, bits: int) -> str:
+    """A row of the table of files."""
+    role, _, level = name.removesuffix(".tif").partition("_")
+    percent = level.removesuffix("pct").replace("p", ".")
+    kind = f"{bits} bit, noise {percent} % of full scale" if level else "exact, float"
+    return f"| `{name}` | {_ROLES[role]}; {kind} |"
 
 
 def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[str, Any]:

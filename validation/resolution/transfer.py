@@ -33,27 +33,32 @@ from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.resolution.buckled import AddedWave, BuckledMotion, ResolutionSpec
+from modeharvest.validation.resolution.buckled import AddedWave, ResolutionSpec
 from modeharvest.validation.resolution.star import KEPT
 
 _SCAN = 4001
+WAVED = ("v0", "v1")
+"""What a wave is of."""
+AXES = ("x", "y")
+_PERIODS = 80
+_SHORTEST, _LONGEST = 0.6, 8.0
+"""Of the periods, in cells and in lengths of the specimen."""
+_PHASES = (0.0, 0.5 * np.pi)
+QUANTITIES = ("v0", "v1", "v1phi1", "u")
+_FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
+"""Whose noise counts against the waves of a part."""
+_SUBSET_PX = 33
+"""A subset whose indicator stands for all: theory gives nearly the same for every size."""
+Kind = tuple[str, int, int]
+"""Part, axis and degree."""
 
 
 def subset_transfer(width: int, degree: int, period: ArrayLike) -> FloatArray:
-    """T of a square subset for a wave along one of its edges, read at its centre [-].
+    """(...) T of a square subset for waves along one of its edges, read at its centre [-].
 
-    Parameters
-    ----------
-    width
-        Edge of the subset, odd [px].
-    degree
-        Of the shape functions: 0 rigid, 1 affine (the same at the centre), 2 quadratic.
-    period
-        (...) of the wave [px].
-
-    Returns
-    -------
-    (...) T. For an affine subset it is sin(pi w/p) / (w sin(pi/p)).
+    ``width``: edge of the subset, odd [px]; ``degree``: of the shape functions, 0 rigid, 1 affine
+    (the same at the centre), 2 quadratic; ``period``: (...) of the wave [px]. For an affine subset
+    it is sin(pi w/p) / (w sin(pi/p)).
     """
     offsets, weights = savitzky_golay(width, degree)
     phase = 2.0 * np.pi * offsets / np.asarray(period, dtype=np.float64)[..., None]
@@ -88,12 +93,8 @@ def savitzky_golay(width: int, degree: int) -> tuple[FloatArray, FloatArray]:
 def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high: float) -> float:
     """The period between ``low`` and ``high`` above which a transfer stays at 0.9 or more.
 
-    ``transfer``: from periods (n,) to T (n,).
-
-    Raises
-    ------
-    InputError
-        If the transfer is below 0.9 at the longest period or nowhere.
+    ``transfer``: from periods (n,) to T (n,); InputError if it is below 0.9 at the longest period
+    or nowhere.
     """
     periods = np.asarray(np.geomspace(low, high, _SCAN), dtype=np.float64)
     below = np.flatnonzero(transfer(periods) < KEPT)
@@ -121,10 +122,6 @@ class PartFields:
     def whole(self) -> FloatArray:
         """(points, 2, waves): of the displacement [mm]."""
         return self.v0 + self.v1
-
-    def of(self, part: str) -> FloatArray:
-        """One of "v0", "v1" and "whole"."""
-        return np.asarray(getattr(self, part))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,17 +153,6 @@ def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
     return np.asarray((found * wave).sum(axis=(0, 1)) / (wave**2).sum(axis=(0, 1)))
 
 
-Kind = tuple[str, int, int]
-"""Part, axis and degree."""
-WAVED = ("v0", "v1")
-"""What a wave is of."""
-AXES = ("x", "y")
-_PERIODS = 80
-_SHORTEST, _LONGEST = 0.6, 8.0
-"""Of the periods, in cells and in lengths of the specimen."""
-_PHASES = (0.0, 0.5 * np.pi)
-
-
 @dataclass(frozen=True, eq=False)
 class TransferCurves:
     """Transfers T over the period.
@@ -191,18 +177,19 @@ class TransferCurves:
         own: dict[Kind, FloatArray] = {}
         whole: dict[Kind, FloatArray] = {}
         kinds = [(part, axis) for part in WAVED for axis in range(len(AXES))]
-        waves = np.concatenate(
-            [_waves(buckled, part, axis, periods, points) for part, axis in kinds], axis=-1
-        )
+        waves = np.stack(
+            [buckled.wave_at(AddedWave(part, axis, float(period), phase, 1.0), points)
+             for part, axis in kinds for period in periods for phase in _PHASES], axis=-1
+        )  # fmt: skip
         for n, degree in enumerate(degrees):
             progress(n, len(degrees), "resolution: best fits")
             start = spec.start(degree, "buckled")
             fit = TangentFit(spec.ansatz(degree, "buckled"), start, points).fit(waves)
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
-                wave = waves[..., here]
-                for found, among in ((own, fit.of(part)), (whole, fit.whole)):
-                    found[part, axis, degree] = _over_phases(among[..., here], wave)
+                for found, among in ((own, getattr(fit, part)), (whole, fit.whole)):
+                    share = _over_phases(among[..., here], waves[..., here])
+                    found[part, axis, degree] = share
         progress(len(degrees), len(degrees), "resolution: best fits")
         return cls(periods, own, whole)
 
@@ -211,13 +198,7 @@ class TransferCurves:
         return float(np.interp(period, self.periods, self.own[part, axis, degree]))
 
     def finest(self, part: str, axis: int, degree: int) -> float:
-        """l10 [mm]: the period from which on less than 10 % of the amplitude is lost.
-
-        Raises
-        ------
-        InputError
-            If there is none among the periods.
-        """
+        """l10 [mm], from which on less than 10 % is lost; InputError if there is no such period."""
         curve = self.own[part, axis, degree]
 
         def transfer(period: FloatArray) -> FloatArray:
@@ -242,18 +223,6 @@ def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
     return np.asarray((shares * power).sum(axis=1) / power.sum(axis=1))
 
 
-def _waves(
-    buckled: BuckledMotion, part: str, axis: int, periods: FloatArray, points: FloatArray
-) -> FloatArray:
-    """(m, 2, 2 n) waves of amplitude 1 mm in both phases."""
-    waves = [
-        buckled.wave_at(AddedWave(part, axis, float(period), phase, 1.0), points)
-        for period in periods
-        for phase in _PHASES
-    ]
-    return np.stack(waves, axis=-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Passband:
     """What becomes of a pattern of another wavelength than the mode's.
@@ -273,15 +242,13 @@ class Passband:
     def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
         """At one degree of v0 and v1."""
         points = spec.points
-        ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
+        fit = TangentFit(spec.ansatz(degree, "buckled"), spec.start(degree, "buckled"), points)
         stretch = np.concatenate([np.linspace(0.05, 0.8, 26), np.linspace(0.82, 1.3, 33)])
         waves = np.stack([_stretched(spec, s, points) for s in stretch], axis=-1)
-        added = wave_share(TangentFit(ansatz, start, points).fit(waves).whole, waves)
-        near = np.abs(stretch - 1.0) <= 0.18
-        itself, error = np.full(stretch.shape, np.nan), np.full(stretch.shape, np.nan)
-        for k in np.flatnonzero(near):
+        itself, error = np.full((2, stretch.size), np.nan)
+        for k in np.flatnonzero(np.abs(stretch - 1.0) <= 0.18):
             itself[k], error[k] = _refitted(spec, degree, float(stretch[k]))
-        return cls(stretch, added, itself, error)
+        return cls(stretch, wave_share(fit.fit(waves).whole, waves), itself, error)
 
     @property
     def retuned(self) -> float:
@@ -305,9 +272,8 @@ def _stretched(spec: ResolutionSpec, stretch: float, points: FloatArray) -> Floa
 def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float, float]:
     """Share of a stretched pattern that a fit from the mode finds; its wave number's error."""
     buckled = spec.buckled
-    size = np.array(buckled.specimen.half_size)
     step = 4.0 * buckled.pixel_size
-    cols, rows = (2 * int(np.ceil(half / step)) + 1 for half in size)
+    cols, rows = (2 * int(np.ceil(half / step)) + 1 for half in buckled.specimen.half_size)
     grid = PixelGrid.centred(rows, cols, step)
     at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     mask = buckled.material(at[..., 0], at[..., 1])
@@ -320,16 +286,8 @@ def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float,
     except InputError:
         return float("nan"), float("nan")
     fluctuation = found.fluctuation(0)[mask][..., None]
-    wave_numbers = found.mode_parameters(0)[1:5]
-    error = float(np.abs(np.abs(wave_numbers) / stretch - 1.0).max())
+    error = float(np.abs(np.abs(found.mode_parameters(0)[1:5]) / stretch - 1.0).max())
     return float(wave_share(fluctuation, pattern[mask][..., None])[0]), error
-
-
-QUANTITIES = ("v0", "v1", "v1phi1", "u")
-FLOOR_OF = {"v0": "v0", "v1": "v1phi1"}
-"""Whose noise counts against the waves of a part."""
-_SUBSET_PX = 33
-"""A subset whose indicator stands for all: theory gives nearly the same for every size."""
 
 
 @dataclass(frozen=True)
@@ -353,35 +311,28 @@ class DegreeResolution:
 def degrees_of(
     done: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
 ) -> list[DegreeResolution]:
-    """Every degree whose floor is known."""
+    """Every degree whose floor is known; InputError if there is none."""
     floors = done[done["task"] == "floor"]
     buckled = floors[floors["motion"] == "buckled"].sort_values("degree")
-    still = floors[floors["motion"] == "still"].set_index("degree")
+    still = floors[floors["motion"] == "still"].set_index("degree")["v1phi1"]
     if not len(buckled):
         raise InputError("study: expected the noise floor of a degree at least, got none")
-    return [
-        _degree(row, still["v1phi1"].get(row["degree"], np.nan), spec, curves)
-        for _, row in buckled.iterrows()
-    ]
-
-
-def _degree(
-    row: pd.Series, still_px: float, spec: ResolutionSpec, curves: TransferCurves
-) -> DegreeResolution:
-    """One of them; ``still_px`` is the floor of v1 phi1 without motion [px]."""
-    degree, px = int(row["degree"]), spec.buckled.pixel_size
-    finest = {
-        f"{part} {name}": curves.finest(part, axis, degree) / px
-        for part in WAVED
-        for axis, name in enumerate(AXES)
-    }
-    mean = {part: float(np.sqrt(finest[f"{part} x"] * finest[f"{part} y"])) for part in WAVED}
-    floor = {name: float(row[name]) for name in QUANTITIES}
-    indicator = {part: floor[FLOOR_OF[part]] * mean[part] for part in WAVED}
-    unknowns = int(row["unknowns"])
-    return DegreeResolution(
-        degree, unknowns, finest, floor, indicator, float(still_px) * mean["v1"]
-    )
+    found = []
+    for _, row in buckled.iterrows():
+        degree = int(row["degree"])
+        finest = {
+            f"{part} {name}": curves.finest(part, axis, degree) / spec.buckled.pixel_size
+            for part in WAVED
+            for axis, name in enumerate(AXES)
+        }
+        mean = {part: float(np.sqrt(finest[f"{part} x"] * finest[f"{part} y"])) for part in WAVED}
+        floor = {name: float(row[name]) for name in QUANTITIES}
+        indicator = {part: floor[_FLOOR_OF[part]] * mean[part] for part in WAVED}
+        fixed = float(still.get(degree, np.nan)) * mean["v1"]
+        found.append(
+            DegreeResolution(degree, int(row["unknowns"]), finest, floor, indicator, fixed)
+        )
+    return found
 
 
 def subset_indicator(spec: ResolutionSpec) -> float:

@@ -60,15 +60,14 @@ _README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
 def readme(info: Mapping[str, Any]) -> str:
     """The README of a set, Markdown, from the content of its ``benchmark.json``."""
     first = info["first_pixel_mm"]
-    return _README.format(
-        **{key: info[key] for key in ("id", "bits", "background", "unit_cell_mm", "pixel_size_mm",
-                                      "made_with")},
-        mask=info["reference"]["mask"],
-        files="\n".join(_files(info)),
-        strain=info["deformed"][-1]["nominal_strain"],
-        x0=first["x"],
-        y0=first["y_up"],
-    )  # fmt: skip
+    derived = {
+        "mask": info["reference"]["mask"],
+        "files": "\n".join(_files(info)),
+        "strain": info["deformed"][-1]["nominal_strain"],
+        "x0": first["x"],
+        "y0": first["y_up"],
+    }
+    return _README.format_map({**info, **derived})
 
 
 def _files(info: Mapping[str, Any]) -> list[str]:
@@ -97,20 +96,21 @@ SECRETS = ("solution*", "truth*", "images*", "stages.json", "*.h5", "*.vtu", "*.
 class BenchmarkTruth:
     """The truth behind a set of images.
 
-    ``info``: the content of its ``benchmark.json``.
+    ``grid``: the images' pixels; ``specimen``: the undeformed geometry; ``strains``: nominal, of
+    the deformed images [-].
     """
 
     folder: Path
-    info: Mapping[str, Any]
+    id: str
+    grid: PixelGrid
+    specimen: Specimen
+    strains: tuple[float, ...]
 
     @classmethod
     def read(cls, folder: Path | str) -> BenchmarkTruth:
         """Open a truth folder.
 
-        Raises
-        ------
-        InputError
-            If it is none, or its solution is not the one that the images were made of.
+        InputError if it is none, or its solution is not the one that the images were made of.
         """
         folder, what = Path(folder), "the truth of a benchmark"
         remedy = (
@@ -118,34 +118,15 @@ class BenchmarkTruth:
             f"{SIDECAR} without truth"
         )
         with reading(folder / SIDECAR, what, remedy):
-            known = cls(folder, read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy))
-            _ = known.grid, known.specimen, known.strains, known.id
-            if sha256_of(folder / SOLUTION) != known.info["solution_sha256"]:
+            info = read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy)
+            grid, specimen = made(PixelGrid, info["grid"]), made(Specimen, info["specimen"])
+            strains = tuple(map(float, info["strains"]))
+            if sha256_of(folder / SOLUTION) != info["solution_sha256"]:
                 raise InputError(
-                    f"expected in {folder / SOLUTION} the solution that benchmark {known.id} was "
+                    f"expected in {folder / SOLUTION} the solution that benchmark {info['id']} was "
                     "made of, got another one or none; make the benchmark again"
                 )
-            return known
-
-    @property
-    def id(self) -> str:
-        """Of the set."""
-        return str(self.info["id"])
-
-    @property
-    def grid(self) -> PixelGrid:
-        """The images' pixels."""
-        return made(PixelGrid, self.info["grid"])
-
-    @property
-    def specimen(self) -> Specimen:
-        """The undeformed geometry."""
-        return made(Specimen, self.info["specimen"])
-
-    @property
-    def strains(self) -> tuple[float, ...]:
-        """Nominal strains of the deformed images [-]."""
-        return tuple(map(float, self.info["strains"]))
+            return cls(folder, str(info["id"]), grid, specimen, strains)
 
     @cached_property
     def solution(self) -> Solution:
@@ -161,13 +142,8 @@ class BenchmarkTruth:
     def displacement(self, strain: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(n, 2) displacement at points of the reference, by the element that each lies in [mm].
 
-        NaN beside the material, and where a position is. ``strain``: of the deformed image [-];
-        ``x, y``: (n,) [mm].
-
-        Raises
-        ------
-        InputError
-            If there is no image at that strain.
+        NaN beside the material, and where a position is. ``strain``: of the deformed image [-], an
+        InputError if there is none; ``x, y``: (n,) [mm].
         """
         if not any(abs(strain - known) < 1e-9 for known in self.strains):
             have = ", ".join(f"{known:g}" for known in self.strains)
@@ -203,27 +179,11 @@ def publish(
 ) -> dict[str, Any]:
     """Write the public folder, and into the truth's folder what belongs to it.
 
-    Parameters
-    ----------
-    images
-        A finished set, made with a perfect lens.
-    specimen
-        The undeformed geometry.
-    public
-        Made if it does not exist; a finished set of the same images is left as it is.
-    truth
-        Holds ``solution.h5``, of which the images were made.
-
-    Returns
-    -------
-    dict
-        The content of the public ``benchmark.json``.
-
-    Raises
-    ------
-    InputError
-        If the images were made with a lens that distorts or are not what was rendered, or the
-        truth would be public.
+    ``images``: a finished set, made with a perfect lens; ``specimen``: the undeformed geometry;
+    ``public``: made if it does not exist, a finished set of the same images is left as it is;
+    ``truth``: holds ``solution.h5``, of which the images were made. Returns the content of the
+    public ``benchmark.json``. InputError if the images were made with a lens that distorts or are
+    not what was rendered, or the truth would be public.
     """
     public, truth = Path(public), Path(truth)
     require_apart(public, truth)
@@ -232,6 +192,7 @@ def publish(
         for part in (public / SIDECAR, truth / SIDECAR):
             part.unlink(missing_ok=True)
         info = _write_public(images, specimen, public)
+        write_json(public / SIDECAR, info)
         hidden = {
             "format": TRUTH_FORMAT,
             "id": info["id"],
@@ -240,9 +201,8 @@ def publish(
             "grid": asdict(images.grid),
             "specimen": specimen.plain(),
             "solution_sha256": sha256_of(truth / SOLUTION),
+            "public_sha256": {name: sha256_of(public / name) for name in (SIDECAR, README)},
         }
-        write_json(public / SIDECAR, info)
-        hidden["public_sha256"] = {n: sha256_of(public / n) for n in (SIDECAR, README)}
         write_json(truth / SIDECAR, hidden)  # last: it says that all is there
     content: dict[str, Any] = read_json(public / SIDECAR)
     return content

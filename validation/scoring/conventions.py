@@ -62,22 +62,11 @@ _COMPONENTS = (
 class Reading:
     """One way to take a field's numbers, relative to how they were declared.
 
-    Parameters
-    ----------
-    turn, shift
-        (2, 2), (2,) [mm]: positions are ``turn @ (x, y) + shift``.
-    origin
-        (2,) moves positions further [mm].
-    components
-        (2, 2), displacements are ``components @ (u, v)``.
-    scale
-        Factor of displacements: that of a wrong unit [-].
-    deformed
-        Whether the positions are those of the deformed image.
-    changes
-        How many things were declared wrongly.
-    text
-        What they are; empty for the field as declared.
+    ``turn``, ``shift``: (2, 2), (2,) [mm], positions are ``turn @ (x, y) + shift``; ``origin``:
+    (2,) moves them further [mm]; ``components``: (2, 2), displacements are ``components @ (u, v)``;
+    ``scale``: and multiplied by that, because of a wrong unit [-]; ``deformed``: whether the
+    positions are those of the deformed image; ``changes``: how many things were declared wrongly;
+    ``text``: what they are, empty for the field as declared.
     """
 
     turn: FloatArray
@@ -95,16 +84,11 @@ class Reading:
         text_of_all = (*self.text, text) if text else self.text
         return replace(changed, changes=self.changes + count, text=text_of_all)
 
-    def differs_in_origin(self, other: Reading) -> bool:
-        """Whether another reading has nothing but another origin."""
-        return (
-            self.scale == other.scale
-            and self.deformed == other.deformed
-            and all(
-                np.array_equal(getattr(self, name), getattr(other, name))
-                for name in ("turn", "shift", "components")
-            )
-        )
+    @property
+    def orientation(self) -> tuple[float, ...]:
+        """All numbers but the origin's."""
+        return (*self.turn.ravel(), *self.shift, *self.components.ravel(), self.scale,
+                self.deformed)  # fmt: skip
 
     def applied(
         self, x: FloatArray, y: FloatArray, u: FloatArray
@@ -115,9 +99,8 @@ class Reading:
         return (x - u[:, 0], y - u[:, 1], u) if self.deformed else (x, y, u)
 
 
-def as_declared() -> Reading:
-    """The reading that changes nothing."""
-    return Reading(_KEEP, np.zeros(2), np.zeros(2), _KEEP)
+DECLARED = Reading(_KEEP, np.zeros(2), np.zeros(2), _KEEP)
+"""The reading that changes nothing."""
 
 
 def check_conventions(
@@ -125,28 +108,20 @@ def check_conventions(
 ) -> tuple[Reading, tuple[str, ...]]:
     """What a field means: as declared, or with the fewest changes that explain its errors.
 
-    ``field`` as declared, ``grid``: the reference image's pixels.
-
-    Returns
-    -------
-    The reading, and a sentence about it; none if it is the declared one, or points are too few.
-
-    Raises
-    ------
-    InputError
-        If the displacements are in pixels and were declared as millimetres, or the reverse.
+    ``field`` as declared, ``grid``: the reference image's pixels. Returns the reading, and a
+    sentence about it; none if it is the declared one, or points are too few. InputError if the
+    displacements are in pixels and were declared as millimetres, or the reverse.
     """
     sample = _FieldSample.of(field, truth, grid)
-    declared = as_declared()
     if len(sample.x) < 4 * _FEWEST_BLOCKS or not np.isfinite(sample.cap):
-        return declared, ()
-    candidates = [declared, *_promising(sample, grid)]
+        return DECLARED, ()
+    candidates = [DECLARED, *_promising(sample, grid)]
     best = min(candidates, key=sample.cost)
     simplest = sorted(candidates, key=lambda reading: (reading.changes, sample.cost(reading)))
     meant = next(r for r in simplest if r is best or not sample.is_rejected(r, best))
-    if meant is declared or not sample.is_rejected(declared, meant):
-        return declared, ()
-    before, after = (sample.median_px(reading) for reading in (declared, meant))
+    if meant is DECLARED or not sample.is_rejected(DECLARED, meant):
+        return DECLARED, ()
+    before, after = (sample.median_px(reading) for reading in (DECLARED, meant))
     text = " and ".join(meant.text)
     explained = f"the median error of {before:.3g} px would be {after:.3g} px if {text}"
     if meant.scale != 1.0:
@@ -158,38 +133,36 @@ def check_conventions(
     return meant, (f"{field.source}: {explained}; check what the file holds",)
 
 
-def _orientations(grid: PixelGrid) -> Iterator[Reading]:
+def _orientations(grid: PixelGrid) -> list[Reading]:
     """All ways to turn positions and displacements: those with fewer changes first."""
     found: dict[tuple[float, ...], Reading] = {}
-    turned = [as_declared(), *_turned_positions(grid)]
+    turned = [DECLARED, *_turned_positions(grid)]
     for reading, (matrix, changes, text) in itertools.product(turned, _COMPONENTS):
         both = reading.with_change(changes, text, components=matrix @ reading.components)
-        key = tuple(np.round([*both.turn.ravel(), *both.shift, *both.components.ravel()], 9))
+        key = tuple(np.round(both.orientation, 9))
         if key not in found or both.changes < found[key].changes:
             found[key] = both
-    yield from found.values()
+    return list(found.values())
 
 
 def _turned_positions(grid: PixelGrid) -> Iterator[Reading]:
     """The y axis the other way, rows and columns exchanged; counted in px or mm, y up or down."""
-    declared = as_declared()
-    first, height = np.array([grid.x0, grid.y0]), (grid.rows - 1) * grid.pixel_size
-    low = first - [0.0, height]
-    for matrix, centres, text in (
-        (_TURN, (0.5 * (first + low), np.zeros(2)), "the y axis pointed the other way"),
-        (_EXCHANGE_DOWN, (first, np.zeros(2)), "rows and columns were exchanged"),
-        (_EXCHANGE_UP, (low, np.zeros(2)), "x and y (up) were exchanged"),
+    zero, first = np.zeros(2), np.array([grid.x0, grid.y0])
+    low = first - [0.0, (grid.rows - 1) * grid.pixel_size]
+    middle = 0.5 * (first + low)
+    flipped, exchanged = "the y axis pointed the other way", "rows and columns were exchanged"
+    both, pairs = f"{exchanged} and {flipped}", ((first, low), (low, first), (zero, zero))
+    for matrix, changes, centres, text in (  # a centre is where what was counted from it lies
+        (_TURN, 1, ((middle, middle), (zero, zero)), flipped),
+        (_EXCHANGE_DOWN, 1, ((first, first), (zero, zero)), exchanged),
+        (_EXCHANGE_UP, 1, ((low, low), (zero, zero)), "x and y (up) were exchanged"),
+        (_TURN @ _EXCHANGE_UP, 2, pairs, both),
+        (-_TURN @ _EXCHANGE_UP, 2, pairs, both),
     ):
-        for centre in centres:
-            shift = centre - matrix @ centre
-            yield declared.with_change(1, text, turn=matrix, shift=shift, components=matrix)
-            yield declared.with_change(1, f"{text}, of positions only", turn=matrix, shift=shift)
-    for matrix in (_TURN @ _EXCHANGE_UP, -_TURN @ _EXCHANGE_UP):
-        for before, after in ((first, low), (low, first), (np.zeros(2), np.zeros(2))):
-            shift = after - matrix @ before
-            text = "rows and columns were exchanged and the y axis pointed the other way"
-            yield declared.with_change(2, text, turn=matrix, shift=shift, components=matrix)
-            yield declared.with_change(2, f"{text}, of positions only", turn=matrix, shift=shift)
+        for before, after in centres:
+            turned = replace(DECLARED, turn=matrix, shift=after - matrix @ before)
+            yield turned.with_change(changes, text, components=matrix)
+            yield turned.with_change(changes, f"{text}, of positions only")
 
 
 def _far_origins(grid: PixelGrid) -> Iterator[tuple[FloatArray, str]]:
@@ -216,8 +189,7 @@ def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
     First all that change displacements by as much as they are, at a few points; to the best of
     them is added what changes less: deformed positions, then the first pixel.
     """
-    few = sample.every(4)
-    turned = list(_orientations(grid))
+    few, turned = sample.every(4), _orientations(grid)
     turned += [
         reading.with_change(1, text, origin=shift)
         for reading, (shift, text) in itertools.product(turned, _far_origins(grid))
@@ -229,10 +201,10 @@ def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
     ):
         if abs(np.log(factor)) > 0.1:
             best += few.best([reading.with_change(1, text, scale=factor) for reading in turned])
-    best += [_in_deformed_positions(reading) for reading in (as_declared(), *best)]
+    best += [_in_deformed_positions(reading) for reading in (DECLARED, *best)]
     return best + [
         reading.with_change(1, text, origin=reading.origin + shift)
-        for reading in (as_declared(), *sample.best(best))
+        for reading in (DECLARED, *sample.best(best))
         for shift, text in _near_origins(grid)
     ]
 
@@ -260,7 +232,7 @@ class _FieldSample:
         self.x, self.y, self.u, self.truth, self.unit = x, y, u, truth, unit
         self.block = _blocks(x, y)
         self._known: dict[tuple[object, ...], FloatArray] = {}
-        length = _length(self.errors(as_declared()))
+        length = _length(self.errors(DECLARED))
         self.cap = 3.0 * float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
 
     @classmethod
@@ -277,16 +249,12 @@ class _FieldSample:
 
     def look_up(self, readings: Sequence[Reading]) -> None:
         """Find the truth for many readings at once, which is quicker than for one after another."""
-        new = {
-            _place(reading): reading for reading in readings if _place(reading) not in self._known
-        }
-        if not new:
-            return
-        at = [reading.applied(self.x, self.y, self.u) for reading in new.values()]
-        true = self.truth(
-            np.concatenate([x for x, _, _ in at]), np.concatenate([y for _, y, _ in at])
-        )
-        self._known |= dict(zip(new, np.split(true, len(new)), strict=True))
+        by_place = {_place(reading): reading for reading in readings}
+        new = {place: r for place, r in by_place.items() if place not in self._known}
+        if new:
+            places = [reading.applied(self.x, self.y, self.u)[:2] for reading in new.values()]
+            true = self.truth(*np.concatenate(places, axis=1))
+            self._known |= dict(zip(new, np.split(true, len(new)), strict=True))
 
     def errors(self, reading: Reading) -> FloatArray:
         """(n, 2) of the numbers in the file, were they to hold the truth by that reading [px].
@@ -300,7 +268,8 @@ class _FieldSample:
 
     def cost(self, reading: Reading) -> float:
         """Mean length of the errors, each bounded; the bound where a point is off [px]."""
-        return float(_bounded(self.errors(reading), self.cap).mean())
+        length = np.nan_to_num(_length(self.errors(reading)), nan=np.inf)
+        return float(np.minimum(length, self.cap).mean())
 
     def best(self, readings: Sequence[Reading]) -> list[Reading]:
         """Those with the smallest errors."""
@@ -326,7 +295,7 @@ class _FieldSample:
         if not known.any():
             return True  # nowhere on the material but by the other one
         mine, others, block = mine[known], others[known], self.block[known]
-        if one.differs_in_origin(other):
+        if one.orientation == other.orientation:
             mine, others = (error - np.median(error, axis=0) for error in (mine, others))
         blocks = len(np.unique(block))
         if blocks < _FEWEST_BLOCKS:
@@ -386,8 +355,3 @@ def _blocks(x: FloatArray, y: FloatArray) -> NDArray[np.intp]:
 
 def _length(error: FloatArray) -> FloatArray:
     return np.hypot(error[:, 0], error[:, 1])
-
-
-def _bounded(error: FloatArray, bound: float) -> FloatArray:
-    """(n,) lengths, no larger than a bound; the bound for what is not known."""
-    return np.minimum(np.nan_to_num(_length(error), nan=np.inf), bound)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,8 @@ _ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 class Declared:
     """What is declared of a field's file that it doesn't state itself.
 
-    Parameters
-    ----------
-    name
-        Of the code, for tables; the file's by default.
-    units, displacement_units, y_axis, first_pixel, columns
-        As for :func:`modeharvest.idic.local.field.read_field`.
+    ``name``: of the code, for tables, the file's by default; the rest as for
+    :func:`modeharvest.idic.local.field.read_field`.
     """
 
     name: str | None = None
@@ -56,19 +53,12 @@ def read_measured(
 ) -> LocalField:
     """Read a field to be graded.
 
-    Parameters
-    ----------
-    path
-        CSV, NPZ, HDF5, MAT; VTK or VTU with a vector named u or displacement at its points.
-    grid, benchmark
-        The benchmark's pixels, and its id.
-
-    Raises
-    ------
-    InputError
-        If it can't be read, or says that it is of another benchmark.
+    ``path``: CSV, NPZ, HDF5, MAT; VTK or VTU with a vector named u or displacement at its points;
+    ``grid``, ``benchmark``: the benchmark's pixels, and its id. InputError if it can't be read, or
+    says that it is of another benchmark.
     """
-    path, declared = Path(path), declared or Declared()
+    path, how = Path(path), asdict(declared or Declared())
+    name = how.pop("name") or path.stem
     _require_file(path)
     claimed = claimed_benchmark(path)
     if claimed not in (None, benchmark):
@@ -76,18 +66,14 @@ def read_measured(
             f"{path}: expected a field of benchmark {benchmark}, but it says that it is of "
             f"{claimed}; take the truth of that one"
         )
-    how: dict[str, Any] = {
-        "units": declared.units,
-        "displacement_units": declared.displacement_units,
-        "y_axis": declared.y_axis,
-        "first_pixel": declared.first_pixel,
-        "columns": declared.columns,
-    }
     read = _read_vtk if path.suffix.lower() in _VTK else read_field
     try:
-        return replace(read(path, grid, **how), source=declared.name or path.stem)
+        return replace(read(path, grid, **how), source=name)
     except InputError as error:
-        raise InputError(_in_options(str(error))) from error
+        message = str(error)
+        for argument, option in _OPTIONS.items():
+            message = message.replace(argument, option)
+        raise InputError(message) from error
 
 
 def _require_file(path: Path) -> None:
@@ -100,13 +86,6 @@ def _require_file(path: Path) -> None:
             f"{path}: expected one of {', '.join(sorted(_KINDS))}, got {path.suffix!r}; "
             "save the field as CSV"
         )
-
-
-def _in_options(message: str) -> str:
-    """What to declare, by the options' names."""
-    for argument, option in _OPTIONS.items():
-        message = message.replace(argument, option)
-    return message
 
 
 def claimed_benchmark(path: Path) -> str | None:
@@ -122,9 +101,7 @@ def _claim(path: Path) -> str | None:
     suffix, text = path.suffix.lower(), ""
     if suffix in _TEXT:
         with path.open(encoding="utf-8", errors="replace") as file:
-            text = "".join(
-                line for _, line in zip(range(50), file, strict=False) if line[0] in "#%"
-            )
+            text = "".join(line for line in islice(file, 50) if line[0] in "#%")
     elif suffix == ".npz":
         with path.open("rb") as stream:
             file = np.load(stream, allow_pickle=False)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from modeharvest.util.arrays import BoolArray
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.scoring.benchmark import BenchmarkTruth
 from modeharvest.validation.scoring.score import (
@@ -45,16 +46,20 @@ class Grading:
     refused: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
-    def common(self) -> dict[str, RegionScore]:
-        """By name, the error over the material that all fields cover."""
-        where = np.logical_and.reduce([graded.near for graded in self.scores])
-        return {graded.source: graded.over(where, self.truth.grid) for graded in self.scores}
+    def _covered(self) -> BoolArray:
+        """(rows, cols) True where all fields cover the material."""
+        return np.asarray(np.logical_and.reduce([graded.near for graded in self.scores]))
 
     @cached_property
+    def common(self) -> dict[str, RegionScore]:
+        """By name, the error over the material that all fields cover."""
+        grid = self.truth.grid
+        return {graded.source: graded.over(self._covered, grid) for graded in self.scores}
+
+    @property
     def common_share(self) -> float:
         """Share of the material that all fields cover [-]."""
-        where = np.logical_and.reduce([graded.near for graded in self.scores])
-        return float(where.sum() / (self.labels >= 0).sum())
+        return float(self._covered.sum() / (self.labels >= 0).sum())
 
     def parts(self, graded: Score) -> dict[str, RegionScore]:
         """A field's rows of the table: everywhere, where all measure, by region."""
@@ -64,43 +69,35 @@ class Grading:
     @property
     def notes(self) -> list[str]:
         """What a reader has to know."""
-        notes = [f"not graded: {why}" for why in self.refused.values()]
-        notes += self.remarks
-        for graded in self.scores:
-            if graded.covered < ENOUGH_COVERED:
-                notes.append(
-                    f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less "
-                    f"than {100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
-                )
-        return notes
+        return [
+            *(f"not graded: {why}" for why in self.refused.values()),
+            *self.remarks,
+            *(f"{graded.source} covers {100 * graded.covered:.0f} % of the material, less than "
+              f"{100 * ENOUGH_COVERED:.0f} %, and is ranked after those that cover more"
+              for graded in self.scores if graded.covered < ENOUGH_COVERED),
+        ]  # fmt: skip
 
 
 def grading_summary(grading: Grading) -> dict[str, Any]:
     """The grades as plain values: for each field, the best first, all that is known of it."""
+    fields = [
+        {"name": graded.source, "points_off_material": graded.off_material,
+         "spacing_px": graded.spacing_px, "covered": graded.covered, **grading.parts(graded),
+         "spectrum": grading.spectra.get(graded.source)}
+        for graded in grading.scores
+    ]  # fmt: skip
     content = {
         "format": SCORES_FORMAT,
         "benchmark": grading.truth.id,
         "nominal_strain": grading.strain,
         "edge_px": grading.edge_px,
-        "percentiles": list(PERCENTILES),
+        "percentiles": PERCENTILES,
         "covered_by_all": grading.common_share,
-        "fields": [_plain_field(grading, graded) for graded in grading.scores],
-        "refused": dict(grading.refused),
+        "fields": fields,
+        "refused": grading.refused,
         "remarks": grading.notes,
     }
-    return {key: to_plain(value) for key, value in content.items()}
-
-
-def _plain_field(grading: Grading, graded: Score) -> dict[str, Any]:
-    spectrum = grading.spectra.get(graded.source)
-    return {
-        "name": graded.source,
-        "points_off_material": graded.off_material,
-        "spacing_px": graded.spacing_px,
-        "covered": graded.covered,
-        **grading.parts(graded),
-        "spectrum": spectrum,
-    }
+    return dict(to_plain(content))
 
 
 def csv_lines(grading: Grading) -> Iterator[str]:

@@ -29,16 +29,12 @@ EDGE_PX = 10
 def regions(
     mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int = EDGE_PX
 ) -> NDArray[np.int8]:
-    """Label every pixel of the undeformed specimen.
+    """(rows, cols) index of every pixel into :data:`REGIONS`, -1 where there is no material.
 
-    ``mask``: (rows, cols) True on material; ``specimen``: its scatter, if any, is small against
-    the ligaments; ``edge_px``: width of the edges [px].
-
-    Returns
-    -------
-    (rows, cols) index into :data:`REGIONS`, -1 where there is no material. Edges come first,
-    then what lies outside the cellular part (bulk); the rest belongs to the ligament or junction
-    whose middle is nearest.
+    Edges come first, then what lies outside the cellular part (bulk); the rest belongs to the
+    ligament or junction whose middle is nearest. ``mask``: (rows, cols) True on material of the
+    undeformed ``specimen``, whose scatter, if any, is small against the ligaments; ``edge_px``:
+    width of the edges [px].
     """
     labels = np.full(grid.shape, -1, dtype=np.int8)
     # A pixel on the boundary belongs to the cellular part, however its position was rounded.
@@ -61,9 +57,8 @@ def _nearest(specimen: Specimen, points: FloatArray) -> NDArray[np.int8]:
         np.min([np.hypot(*(quarter - place).T) for place in places], axis=0)
         for places in specimen.quarter_places
     )
-    kinds = REGIONS.index(LIGAMENTS), REGIONS.index(JUNCTIONS)
     is_junction = junction < ligament - 1e-9 * specimen.pitch
-    return np.where(is_junction, kinds[1], kinds[0]).astype(np.int8)
+    return np.where(is_junction, REGIONS.index(JUNCTIONS), REGIONS.index(LIGAMENTS)).astype(np.int8)
 
 
 _ENOUGH_POINTS = 20_000
@@ -100,15 +95,11 @@ class RegionScore:
             share = 0.0 if len(valid) else nan
             return cls(len(valid), share, (nan, nan), nan, (nan,) * len(PERCENTILES), nan)
         length = np.hypot(found[:, 0], found[:, 1])
-        mean = found.mean(axis=0)
+        bias_x, bias_y = map(float, found.mean(axis=0))
         return cls(
-            points=len(valid),
-            returned=float(valid.mean()),
-            bias_px=(float(mean[0]), float(mean[1])),
-            rms_px=float(np.sqrt(np.mean(found**2))),
-            percentiles_px=tuple(float(p) for p in np.percentile(length, PERCENTILES)),
-            max_px=float(length.max()),
-        )
+            len(valid), float(valid.mean()), (bias_x, bias_y), float(np.sqrt(np.mean(found**2))),
+            tuple(map(float, np.percentile(length, PERCENTILES))), float(length.max()),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,25 +149,12 @@ def score(
     grid: PixelGrid,
     reach_px: float = float("inf"),
 ) -> Score:
-    """Grade a field.
+    """Grade a field of displacements at points of the reference [mm].
 
-    Parameters
-    ----------
-    field
-        Displacements at points of the reference [mm].
-    truth
-        (n, 2) true displacements at the field's points [mm]; NaN off the material.
-    labels
-        (rows, cols) of :func:`modeharvest.validation.scoring.score.regions`.
-    grid
-        The reference image's pixels.
-    reach_px
-        Farthest from a point that its displacement can stand for [px].
-
-    Raises
-    ------
-    InputError
-        If no point lies on the material.
+    ``truth``: (n, 2) true displacements at these points [mm], NaN off the material; ``labels``:
+    (rows, cols) of :func:`regions`; ``grid``: the reference image's pixels; ``reach_px``: farthest
+    from a point that its displacement can stand for [px]. InputError if no point lies on the
+    material.
     """
     here = _labels_at(field.x, field.y, labels, grid)
     _require_on_specimen(field, labels, grid)
@@ -186,15 +164,14 @@ def score(
     spacing_px = max(1.0, _spacing_px(field.x[on_material], field.y[on_material], grid))
     reach_px = min(spacing_px, reach_px)
     near = _near(field, used, reach_px, grid) & (labels >= 0)
+
+    def over(part: BoolArray) -> RegionScore:
+        return RegionScore.of(error[part], field.good[part])
+
     return Score(
         source=field.source,
-        everywhere=RegionScore.of(error[on_material], field.good[on_material]),
-        by_region={
-            name: RegionScore.of(
-                error[on_material & (here == k)], field.good[on_material & (here == k)]
-            )
-            for k, name in enumerate(REGIONS)
-        },
+        everywhere=over(on_material),
+        by_region={name: over(on_material & (here == k)) for k, name in enumerate(REGIONS)},
         off_material=int((~on_material).sum()),
         spacing_px=spacing_px,
         reach_px=reach_px,
@@ -211,9 +188,9 @@ def _labels_at(
 ) -> NDArray[np.int8]:
     """(n,) labels of the pixels nearest to positions [mm]; -1 off the image."""
     row, col = grid.to_px(x, y)
-    inside = (np.abs(row - 0.5 * (grid.rows - 1)) <= 0.5 * grid.rows - 0.5) & (
-        np.abs(col - 0.5 * (grid.cols - 1)) <= 0.5 * grid.cols - 0.5
-    )
+    inside = np.ones(x.shape, dtype=np.bool_)
+    for at, count in ((row, grid.rows), (col, grid.cols)):
+        inside &= np.abs(at - 0.5 * (count - 1)) <= 0.5 * count - 0.5
     found = np.full(x.size, -1, dtype=np.int8)
     found[inside] = labels[np.rint(row[inside]).astype(int), np.rint(col[inside]).astype(int)]
     return found
@@ -223,8 +200,11 @@ def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: Pixe
     """Recognise positions in another unit, or beside the specimen."""
     some = slice(None, None, -(-field.x.size // _ENOUGH_POINTS))
     own_x, own_y = field.x[some], field.y[some]
-    there = float((_labels_at(own_x, own_y, labels, grid) >= 0).mean())
-    row, col = grid.to_px(own_x, own_y)
+
+    def share_of(x: FloatArray, y: FloatArray) -> float:
+        return float((_labels_at(x, y, labels, grid) >= 0).mean())
+
+    there, (row, col) = share_of(own_x, own_y), grid.to_px(own_x, own_y)
     last, px, mm = grid.rows - 1, "pixels declared as mm", "mm declared as pixels"
     for (x, y), text in (
         (grid.to_mm(-own_y, own_x), px),  # rows down
@@ -232,7 +212,7 @@ def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: Pixe
         ((col, -row), mm),
         ((col, last - row), mm),
     ):
-        share = float((_labels_at(x, y, labels, grid) >= 0).mean())
+        share = share_of(x, y)
         if share > 0.1 and there < 0.2 * share:
             raise InputError(
                 f"{field.source}: expected positions in the declared unit, got {100 * there:.0f} % "
@@ -318,10 +298,8 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     square_mm = np.bincount(band - low, density[waves] * cell) / (2.0 * area)
     middle = 2.0 ** ((low + np.arange(square_mm.size)) / BANDS_AN_OCTAVE)
     there = np.bincount(band - low) > 0
-    rms = np.sqrt(square_mm) / grid.pixel_size
-    return ErrorSpectrum(
-        middle[there], rms[there], _affine_rms(graded, spectrum.affine) / grid.pixel_size
-    )
+    rms, affine = np.sqrt(square_mm), _affine_rms(graded, spectrum.affine)
+    return ErrorSpectrum(middle[there], rms[there] / grid.pixel_size, affine / grid.pixel_size)
 
 
 def _averaged(graded: Score, grid: PixelGrid) -> LocalField:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 from modeharvest.util.errors import InputError
@@ -25,6 +26,7 @@ from modeharvest.validation.studies.lattice_pattern import (
 
 SHOWN = (0.95, 0.7895, 0.25)
 """Of d/l in the paper's Fig. "graded", from left to right."""
+Work = Callable[[StudiedLattice], ModeRow]
 
 
 @dataclass(frozen=True)
@@ -68,51 +70,45 @@ class ModeTable:
     def __init__(self, path: Path | str | None = None) -> None:
         self.path = path
         rows = () if path is None else read_rows(path)
-        self.rows: dict[object, ModeRow] = {row.key: row for row in rows}
+        self.known: dict[object, ModeRow] = {row.key: row for row in rows}
 
-    def row(self, lattice: StudiedLattice, work: Callable[[StudiedLattice], ModeRow]) -> ModeRow:
+    def row(self, lattice: StudiedLattice, work: Work) -> ModeRow:
         """The row of a lattice, from the table or by ``work``."""
-        if lattice.key not in self.rows:
-            self.rows[lattice.key] = work(lattice)
+        if lattice.key not in self.known:
+            self.known[lattice.key] = work(lattice)
             if self.path is not None:
-                write_rows(self.path, self.rows.values())
-        return self.rows[lattice.key]
+                write_rows(self.path, self.known.values())
+        return self.known[lattice.key]
 
-
-def study_modes(
-    lattices: Sequence[StudiedLattice], table: ModeTable | None = None, progress: Progress = silent
-) -> tuple[ModeRow, ...]:
-    """The rows of some lattices, in their order."""
-    table, rows = table or ModeTable(), []
-    for n, lattice in enumerate(lattices):
-        progress(n, len(lattices), "mode study")
-        rows.append(table.row(lattice, pattern_row))
-    progress(1, 1, "mode study")
-    return tuple(rows)
+    def rows(
+        self, lattices: Sequence[StudiedLattice], work: Work, progress: Progress = silent
+    ) -> tuple[ModeRow, ...]:
+        """The rows of some lattices, in their order."""
+        found = []
+        for n, lattice in enumerate(lattices):
+            progress(n, len(lattices), "mode study")
+            found.append(self.row(lattice, work))
+        progress(1, 1, "mode study")
+        return tuple(found)
 
 
 def study_likeness(
     reference: StudiedLattice,
     others: Sequence[StudiedLattice],
-    table: ModeTable | None = None,
+    table: ModeTable,
     progress: Progress = silent,
 ) -> tuple[ModeRow, ...]:
     """The rows of lattices of the reference's d/l, their modes compared with its mode."""
-    table = table or ModeTable()
-    made: list[PatternMode] = []
+
+    @cache
+    def own() -> PatternMode:
+        return pattern_mode(reference, table.row(reference, pattern_row))
 
     def work(lattice: StudiedLattice) -> ModeRow:
-        if not made:
-            made.append(pattern_mode(reference, table.row(reference, pattern_row)))
-        mode = pattern_mode(lattice)
-        return replace(mode.row, likeness=mode_likeness(made[0], mode))
+        compared = own(), pattern_mode(lattice)
+        return replace(compared[1].row, likeness=mode_likeness(*compared))
 
-    rows = []
-    for n, lattice in enumerate(others):
-        progress(n, len(others), "mode study")
-        rows.append(table.row(lattice, work))
-    progress(1, 1, "mode study")
-    return tuple(rows)
+    return table.rows(others, work, progress)
 
 
 def first_mode_limit(
@@ -125,13 +121,8 @@ def first_mode_limit(
     """Bisect d/l to where the pattern stops being the first mode of a loading.
 
     ``base``: all else about the lattice; ``rows``: known ones, to begin with; ``tolerance``: of
-    d/l [-]. None if among the rows there is none with the pattern first and one below with
-    something else.
-
-    Raises
-    ------
-    InputError
-        If the tolerance is not positive.
+    d/l [-], an InputError if it is not positive. None if among the rows there is none with the
+    pattern first and one below with something else.
     """
     if not tolerance > 0:
         raise InputError(f"mode study: expected a positive tolerance of d/l, got {tolerance}")
@@ -146,8 +137,7 @@ def first_mode_limit(
         return None
     while high.ratio - low.ratio > tolerance:
         ratio = round(0.5 * (low.ratio + high.ratio), 6)
-        lattice = replace(base, ratio=ratio, loading=LOADINGS[loading])
-        middle = table.row(lattice, pattern_row)
+        middle = table.row(replace(base, ratio=ratio, loading=LOADINGS[loading]), pattern_row)
         low, high = (low, middle) if middle.is_first else (middle, high)
     return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
 
@@ -165,21 +155,13 @@ def run_lattice_study(
 ) -> LatticeModeStudy:
     """The whole study about one lattice: hole sizes, scales, materials, limits, overlays.
 
-    Parameters
-    ----------
-    table
-        CSV that keeps the rows, and that a study which was broken off goes on from.
-    ratios, loadings
-        d/l [-] and names of loadings: every combination.
-    pitches
-        Other l [mm]; the mesh is scaled, too.
-    materials
-        Names of other materials, among ``STUDIED_MATERIALS``.
-    shown
-        d/l of the overlays [-], under the reference's loading.
+    ``table``: CSV that keeps the rows, and that a study which was broken off goes on from;
+    ``ratios``, ``loadings``: d/l [-] and names of loadings, every combination; ``pitches``: other l
+    [mm], the mesh is scaled, too; ``materials``: names of other materials, among
+    ``STUDIED_MATERIALS``; ``shown``: d/l of the overlays [-], under the reference's loading.
     """
     kept = ModeTable(table)
-    rows = study_modes(ratio_lattices(ratios, loadings, base), kept, progress)
+    rows = kept.rows(ratio_lattices(ratios, loadings, base), pattern_row, progress)
     limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
     scaled = [replace(base, pitch=pitch) for pitch in pitches]
     others = [replace(base, material=STUDIED_MATERIALS[name]) for name in materials]

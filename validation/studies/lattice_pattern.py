@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
     from modeharvest.fem.lattice.cell import CellPath
 
-
-Wave = tuple[float, float]
 Key = tuple[str, str, float, float, int]
 
 
@@ -94,13 +92,7 @@ def write_rows(path: Path | str, rows: Iterable[ModeRow]) -> None:
 
 
 def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
-    """Read a table that :func:`write_rows` wrote; empty where there is no file.
-
-    Raises
-    ------
-    InputError
-        If the file is not such a table.
-    """
+    """Read what :func:`write_rows` wrote; empty without a file, InputError if it is another."""
     path = Path(path)
     if not path.exists():
         return ()
@@ -120,7 +112,7 @@ def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
         ) from error
 
 
-PATTERN: Wave = (math.pi, math.pi)
+PATTERN = (math.pi, math.pi)
 """The wave of the paper's pattern, as phases from cell to cell [rad]."""
 
 EQ_MODE = square_family("hole")
@@ -156,18 +148,8 @@ STUDIED_MATERIALS: dict[str, Material] = {
 class StudiedLattice:
     """One lattice of the study: everything that its pattern may depend on.
 
-    Parameters
-    ----------
-    ratio
-        Hole diameter over cell size d/l [-].
-    loading, material
-        What is done to it, and what it is made of.
-    pitch
-        Unit cell size l [mm].
-    divisions
-        Elements along l; the mesh size is l over it.
-    largest
-        Load up to which to look for critical points [-].
+    ``ratio``: hole diameter over cell size d/l [-]; ``pitch``: unit cell size l [mm];
+    ``divisions``: elements along l; ``largest``: load up to which to look for critical points [-].
     """
 
     ratio: float = 0.7895
@@ -218,13 +200,7 @@ def overlap_of_fields(mesh: Mesh, first: FloatArray, second: FloatArray) -> floa
 
 
 def mode_likeness(reference: PatternMode, other: PatternMode) -> float:
-    """Overlap of two lattices' modes whose meshes differ by no more than a factor [-].
-
-    Raises
-    ------
-    InputError
-        If they aren't the same but for a factor.
-    """
+    """Overlap of two lattices' modes [-]; InputError unless the meshes differ by a factor only."""
     nodes = other.mesh.nodes / other.row.pitch, reference.mesh.nodes / reference.row.pitch
     if nodes[0].shape != nodes[1].shape or not np.allclose(*nodes, rtol=0, atol=1e-9):
         raise InputError(
@@ -265,10 +241,7 @@ def pattern_row(lattice: StudiedLattice) -> ModeRow:
 def pattern_mode(lattice: StudiedLattice, row: ModeRow | None = None) -> PatternMode:
     """The mode that a lattice's row is about; without a row, that is found first.
 
-    Raises
-    ------
-    InputError
-        If there is no equilibrium at the row's state: it is another lattice's.
+    InputError if there is no equilibrium at the row's state: it is another lattice's.
     """
     from modeharvest.fem.bloch.real_modes import real_modes
 

@@ -9,7 +9,7 @@ One case in ``specimens/NAME/`` of the study's folder, NAME the digest of the de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.result import Result
-from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.spectra.pattern import mode_equivalent
 from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.util.arrays import FloatArray
@@ -32,15 +31,8 @@ from modeharvest.validation.studies.modes_specimen import (
     LatticeMode,
     SpecimenSpec,
     buckle,
-    specimen_folder,
 )
-from modeharvest.validation.studies.study import (
-    ImagePairSpec,
-    Study,
-    VirtualImagePair,
-    require_different,
-    require_mode,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.truth import Comparison
 from modeharvest.validation.workers import Case
 
@@ -72,24 +64,19 @@ class SpecimenPatterns:
 
     @classmethod
     def read(cls, folder: Path) -> SpecimenPatterns:
-        """Of what :func:`~modeharvest.validation.studies.modes.one_specimen` left."""
+        """Of what :func:`one_specimen` left."""
         solution = Solution.read(folder / "solution.h5")
         result, best = (Result.read(folder / f"{name}.json") for name in ("result", "best"))
         (snapshot,) = solution.snapshots
         x, y = solution.mesh.nodes.T[:, :, None]
-
-        def at_nodes(field: Callable[..., FloatArray], fit: Result) -> FloatArray:
-            return np.asarray(field(fit.unknowns, x, y)[:, 0])
-
-        true = snapshot.displacement
-        ansatz = result.ansatz
+        ansatz, a = result.ansatz, result.unknowns
         return cls(
             solution.mesh,
             ansatz.modes[0].half_wavelength,
-            true,
-            at_nodes(ansatz.displacement, result),
-            true - at_nodes(best.ansatz.v0, best),
-            at_nodes(lambda a, x, y: ansatz.fluctuation(0, a, x, y), result),
+            snapshot.displacement,
+            ansatz.displacement(a, x, y)[:, 0],
+            snapshot.displacement - best.ansatz.v0(best.unknowns, x, y)[:, 0],
+            ansatz.fluctuation(0, a, x, y)[:, 0],
         )
 
 
@@ -105,25 +92,20 @@ def standardised_errors(measured: pd.DataFrame) -> NDArray[np.float64]:
     return np.asarray((deviations(measured) - deviations(measured, "best_")).to_numpy() / sd)
 
 
-def one_specimen(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Buckle, image, measure and compare.
-
-    ``case``: one of :meth:`MeasuredModesStudy.prepare`, ``folder``: the study's. Returns
-    :class:`SpecimenRow` and, where it buckles, what :func:`_measured_row` returns.
-    """
-    own = specimen_folder(folder, case["specimen"])
+def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
+    """Buckle, image, measure and compare: a :class:`SpecimenRow`, and :func:`_measured_row`."""
+    own = folder / "specimens" / case["specimen"]
     described = SpecimenSpec.read(own / "specimen.json")
     solution = _solution(described, folder)
-    lattice = LatticeMode.of(described.specimen, described.material, described.divisions)
-    row = SpecimenRow.of(described, solution, lattice)
-    if row.first == "none":
-        return asdict(row)
-    spec = ImagePairSpec(
-        described.experiment, described.imaging, described.correlation, lambda: solution
-    )
-    pair = VirtualImagePair.open(own, spec.describe(own, row.strain))
+    experiment = described.experiment
+    lattice = LatticeMode.of(experiment.specimen, experiment.material, described.divisions)
+    row = asdict(SpecimenRow.of(described, solution, lattice))
+    if row["first"] == "none":
+        return row
+    spec = ImagePairSpec(experiment, described.imaging, described.correlation, lambda: solution)
+    pair = VirtualImagePair.open(own, spec.describe(own, row["strain"]))
     try:
-        return asdict(row) | _measured_row(pair, lattice, own)
+        return row | _measured_row(pair, lattice, own)
     finally:
         pair.discard()
 
@@ -168,60 +150,55 @@ class SpecimenRow:
     def of(cls, described: SpecimenSpec, solution: Solution, lattice: LatticeMode) -> SpecimenRow:
         """Of a simulated specimen."""
         specimen, critical = described.specimen, solution.info.get("critical")
-        share = critical["pattern_overlap_by_cell"] if critical else np.nan
-        buckled = "pattern" if share >= PATTERN_SHARE else "other"
+        first, share, buckles_at = "none", np.nan, np.nan
+        if critical:
+            share, buckles_at = critical["pattern_overlap_by_cell"], critical["strain"]
+            first = "pattern" if share >= PATTERN_SHARE else "other"
         strain = max(s.nominal_strain for s in solution.snapshots)
+        pitch, diameters, row = specimen.pitch, specimen.diameters, lattice.mode.row
         return cls(
-            specimen.diameter / specimen.pitch,
-            float(specimen.diameters.min() / specimen.pitch),
-            float(specimen.diameters.max() / specimen.pitch),
-            specimen.pitch,
-            buckled if critical else "none",
-            share,
-            critical["strain"] if critical else np.nan,
-            strain,
-            solution.at(strain).negative_pivots,
-            solution.info.get("outcome", ""),
-            lattice.mode.row.kind,
-            lattice.mode.row.pattern,
-            lattice.mode.row.overlap,
-            lattice.aspect,
-        )
+            specimen.diameter / pitch, float(diameters.min() / pitch),
+            float(diameters.max() / pitch), pitch, first, share, buckles_at, strain,
+            solution.at(strain).negative_pivots, solution.info.get("outcome", ""),
+            row.kind, row.pattern, row.overlap, lattice.aspect,
+        )  # fmt: skip
 
 
 def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> dict[str, Any]:
     """Correlate from the standard initial guess; compare with truth, best fit and lattice.
 
-    Returns
-    -------
-    dict
-        ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form
-        nearest to the ideal one, phases in shares of l; ``a1_sd_model_error`` and ``a1_sd_noise``
-        ...: standard deviations by model error, and by noise of :data:`NOISE`.
-        The fields of :class:`~modeharvest.validation.truth.ErrorParts`.
-        ``overlap_lattice``: of the mode, of constant amplitude, with the infinite lattice's over
-        all cells; ``overlap_truth``: of v₁φ₁ with the truth less the best fit's v₀ over the
-        cellular material; ``best_...`` the same of the best fit. ``amplitude``: rms length of
-        v₁φ₁ over the cellular material, in shares of l.
+    ``a1`` ... ``a7`` of the measurement and ``best_a1`` ... of the best fit, in the form nearest to
+    the ideal one, phases in shares of l; ``a1_sd_model_error`` and ``a1_sd_noise`` ...: standard
+    deviations by model error, and by noise of :data:`NOISE`. ``overlap_lattice``: of the mode, of
+    constant amplitude, with the infinite lattice's over all cells; ``overlap_truth``: of v₁φ₁ with
+    the truth less the best fit's v₀ over the cellular material; ``best_...`` the same of the best
+    fit. ``amplitude``: rms length of v₁φ₁ over the cellular material, in shares of l. And the
+    fields of :class:`~modeharvest.validation.truth.ErrorParts`.
     """
     result = pair.correlate()
     found, specimen = pair.compare(result), pair.specimen
     result.write(own / "result.json")
     found.best.write(own / "best.json")
+    units = np.array([1.0] * 5 + [specimen.pitch] * 2)
     row: dict[str, Any] = {"outcome": result.outcome.value, "iterations": len(result.history)}
     for prefix, fit in (("", result), ("best_", found.best)):
-        values = _nearest_parameters(fit, specimen.pitch)
-        row |= {prefix + name: value for name, value in zip(PARAMETERS, values, strict=True)}
-        row[prefix + "overlap_lattice"] = lattice.overlap(
-            specimen, fit.ansatz.modes[0].family, fit.mode_parameters()
-        )
+        family, a = fit.ansatz.modes[0].family, fit.mode_parameters()
+        nearest, _ = mode_equivalent(a, specimen.pitch, family.start)
+        row |= _columns(nearest / units, prefix + "{}")
+        row[prefix + "overlap_lattice"] = lattice.overlap(specimen, family, a)
+    matched = MatchedImages.of(result, pair.pair, pair.options.edge_px)
     for cause, covariance in (
-        ("model_error", _model_error_covariance(pair, result)),
+        ("model_error", matched.sandwich_covariance(specimen.pitch)),
         ("noise", result.covariance(NOISE)),
     ):
-        sd = np.sqrt(np.diag(covariance)[result.ansatz.phi_slice(0)]) / _units(specimen.pitch)
-        row |= {f"{name}_sd_{cause}": value for name, value in zip(PARAMETERS, sd, strict=True)}
+        sd = np.sqrt(np.diag(covariance)[result.ansatz.phi_slice(0)]) / units
+        row |= _columns(sd, "{}_sd_" + cause)
     return row | asdict(found.error_parts()) | _patterns(found, specimen)
+
+
+def _columns(values: Iterable[float], name: str) -> dict[str, float]:
+    """The mode's seven parameters under their names, which replace the {} in ``name``."""
+    return {name.format(key): value for key, value in zip(PARAMETERS, values, strict=True)}
 
 
 def _patterns(found: Comparison, specimen: Specimen) -> dict[str, float]:
@@ -240,21 +217,6 @@ def likeness(first: FloatArray, second: FloatArray) -> float:
     """Normalised overlap |Σ u·φ| / (‖u‖ ‖φ‖) of two fields (n, 2), both without their mean [-]."""
     u, phi = (values - values.mean(axis=0) for values in (first, second))
     return float(abs((u * phi).sum()) / np.sqrt((u**2).sum() * (phi**2).sum()))
-
-
-def _nearest_parameters(fit: Result, pitch: float) -> FloatArray:
-    """(7,) in the form nearest to the ideal one; the phases in shares of l [-]."""
-    nearest, _ = mode_equivalent(fit.mode_parameters(), pitch, fit.ansatz.modes[0].family.start)
-    return np.asarray(nearest / _units(pitch))
-
-
-def _model_error_covariance(pair: VirtualImagePair, result: Result) -> FloatArray:
-    matched = MatchedImages.of(result, pair.pair, pair.options.edge_px)
-    return matched.sandwich_covariance(pair.specimen.pitch)
-
-
-def _units(pitch: float) -> FloatArray:
-    return np.array([1.0] * 5 + [pitch] * 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,28 +251,13 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
 
     Each is compressed until its pattern is as strong as the base's, in shares of l.
 
-    Parameters
-    ----------
-    strain
-        Of the base's deformed image [-]; it has to be buckled there.
-    ratios
-        Other d/l than the base's [-].
-    pitches
-        Other l [mm]; specimen, elements and pixels are scaled with it.
-    materials
-        Names among :data:`modeharvest.validation.studies.lattice_pattern.STUDIED_MATERIALS`.
-    gradings_x, gradings_y
-        Change of the diameter along and across the load [mm/mm], each by itself; d at the
-        specimen's centre stays.
-    largest
-        Strain up to which to look for where a specimen buckles [-].
-    divisions
-        Elements along l of the infinite lattice's cell.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range, or comes twice.
+    ``strain``: of the base's deformed image [-]; it has to be buckled there. ``ratios``: other d/l
+    [-]; ``pitches``: other l [mm], with which specimen, elements and pixels are scaled;
+    ``materials``: names among ``STUDIED_MATERIALS``; ``gradings_x``,
+    ``gradings_y``: change of the diameter along and across the load [mm/mm], each by itself, d at
+    the specimen's centre stays. ``largest``: strain up to which to look for where a specimen
+    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell. InputError if a
+    value is out of its range, or comes twice.
     """
 
     question: ClassVar[str] = (
@@ -322,6 +269,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         "displacement."
     )
     function: ClassVar[str] = f"{__name__}:one_specimen"
+    measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
@@ -350,48 +298,33 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
                 f"{self.largest} and {self.divisions}"
             )
         for name in ("ratios", "pitches", "materials", "gradings_x", "gradings_y"):
-            require_different(name, getattr(self, name))
+            self.require_different(name, getattr(self, name))
 
     @property
     def seeds(self) -> str:
         """The only thing that is random."""
         return "one speckle, of imaging.speckle.seed"
 
-    def require(self, correlation: SquareLatticeOptions) -> None:
-        """The mode's parameters have to be free."""
-        require_mode(correlation)
-
     def quick(self) -> Self:
         """A third of the d/l beside the base's, and one graded specimen."""
-        return replace(
-            self,
-            ratios=self.ratios[2::3],
-            pitches=(),
-            materials=(),
-            gradings_x=(),
-            gradings_y=self.gradings_y[:1],
-        )
+        fewer = replace(self, ratios=self.ratios[2::3], gradings_y=self.gradings_y[:1])
+        return replace(fewer, pitches=(), materials=(), gradings_x=())
 
     def prepare(
         self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Describe the specimens; they are simulated and imaged case by case.
 
-        Raises
-        ------
-        InputError
-            If the base has no critical point below the strain, or a specimen can't be.
+        InputError if the base has no critical point below the strain, or a specimen can't be.
         """
         base = SpecimenSpec.of(spec, self.strain, self.largest, self.divisions)
-        name = base.leave(folder)
         snapshot = spec.solution.at(self.strain)
         own = Solution(spec.solution.mesh, (snapshot,), spec.solution.info)
         own.write(base.solution_path(folder))
-        others = [
+        return tuple(
             {"varied": varied, "level": level, "specimen": described.leave(folder)}
-            for varied, level, described in self._others(base)
-        ]
-        return ({"varied": BASE, "level": "", "specimen": name}, *others)
+            for varied, level, described in ((BASE, "", base), *self._others(base))
+        )
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
         """The specimens whose pattern was measured."""

@@ -7,16 +7,15 @@ content.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
 
-from modeharvest.fem.experiment import Experiment, PathOptions
+from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.materials import MATERIALS, Material, material_of, material_table
 from modeharvest.fem.specimen import Specimen
@@ -30,7 +29,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, MissingDependencyError
 from modeharvest.util.files import read_json
 from modeharvest.util.stages import digest
-from modeharvest.util.typed import made
+from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.studies.lattice_pattern import PatternMode, StudiedLattice, pattern_mode
 from modeharvest.validation.studies.study import ImagePairSpec
 from modeharvest.validation.workers import leave
@@ -44,26 +43,11 @@ _QUADRATURE = 4
 
 
 def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
-    """Compress a specimen until its pattern is as strong as wanted (needs dolfinx).
+    """Compress a specimen until its pattern is as strong as wanted, by ``simulate_pattern``.
 
-    Parameters
-    ----------
-    experiment
-        Specimen, material, mesh, edges and path options; strains and branches are not used.
-    wanted
-        The pattern's amplitude to be reached, see :meth:`PatternCells.amplitude` [mm].
-    largest
-        Nominal strain up to which to look for the first critical point [-].
-
-    Returns
-    -------
-    Solution
-        Of :func:`modeharvest.fem.simulate.simulate_pattern`.
-
-    Raises
-    ------
-    MissingDependencyError
-        If dolfinx is not there.
+    ``experiment``: its strains and branches are not used; ``wanted``: the pattern's amplitude to be
+    reached, see :meth:`PatternCells.amplitude` [mm]; ``largest``: nominal strain up to which to
+    look for the first critical point [-]. MissingDependencyError without dolfinx.
     """
     try:
         from modeharvest.fem.meshing import mesh_specimen
@@ -117,34 +101,18 @@ class PatternCells:
         return float(np.abs(blocks.mean(axis=(2, 3))).max())
 
 
-_SPEC = TypeAdapter(ImagingSpec)
-
-
 @dataclass(frozen=True)
 class SpecimenSpec:
     """All that a specimen's measurement depends on.
 
-    Parameters
-    ----------
-    specimen, material, mesh_size, edges, path
-        As in :class:`~modeharvest.fem.experiment.Experiment`.
-    amplitude
-        The pattern's amplitude that it is compressed to [mm].
-    largest
-        Strain up to which to look for where it buckles [-].
-    divisions
-        Elements along l of the infinite lattice's cell.
-    imaging, correlation
-        How it is imaged and correlated.
-    given
-        The digest of a solution that is there already; "" to simulate.
+    ``experiment``: the compression test, its strains still to be found; ``amplitude``: of the
+    pattern that it is compressed to [mm]; ``largest``: strain up to which to look for where it
+    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell; ``imaging``,
+    ``correlation``: how it is imaged and correlated; ``given``: the digest of a solution that is
+    there already, "" to simulate.
     """
 
-    specimen: Specimen
-    material: Material
-    mesh_size: float
-    edges: str
-    path: PathOptions
+    experiment: Experiment
     amplitude: float
     largest: float
     divisions: int
@@ -156,11 +124,8 @@ class SpecimenSpec:
     def of(cls, spec: ImagePairSpec, strain: float, largest: float, divisions: int) -> SpecimenSpec:
         """Of a simulated experiment, as strongly buckled as it is at a strain [-].
 
-        Raises
-        ------
-        InputError
-            If the experiment is not perfect, did not buckle, or has a material that can't be
-            written down.
+        InputError if the experiment is not perfect, did not buckle, or has a material that can't
+        be written down.
         """
         e = spec.experiment
         if not e.is_perfect or e.guided:
@@ -184,55 +149,42 @@ class SpecimenSpec:
                 + " critical strain"
             )
         there = spec.solution.at(strain).displacement
-        amplitude = PatternCells(spec.solution.mesh, e.specimen).amplitude(there)
         return cls(
-            specimen=e.specimen,
-            material=e.material,
-            mesh_size=e.mesh_size,
-            edges=e.edges,
-            path=e.path,
-            amplitude=amplitude,
-            largest=largest,
-            divisions=divisions,
-            imaging=spec.imaging,
-            correlation=spec.correlation,
+            Experiment(e.specimen, e.material, mesh_size=e.mesh_size, edges=e.edges, path=e.path),
+            PatternCells(spec.solution.mesh, e.specimen).amplitude(there),
+            largest,
+            divisions,
+            spec.imaging,
+            spec.correlation,
             given=image_key(spec.solution, spec.imaging, (strain,))[:16],
         )
 
     @property
-    def experiment(self) -> Experiment:
-        """The compression test, its strains still to be found."""
-        return Experiment(
-            self.specimen,
-            self.material,
-            mesh_size=self.mesh_size,
-            edges=self.edges,
-            path=self.path,
-        )
+    def specimen(self) -> Specimen:
+        """The geometry."""
+        return self.experiment.specimen
 
     def changed(self, material: Material | None = None, **specimen: Any) -> SpecimenSpec:
         """With another material, or other values of the specimen; to be simulated."""
-        return replace(
-            self,
+        experiment = replace(
+            self.experiment,
             specimen=replace(self.specimen, **specimen),
-            material=material or self.material,
-            given="",
+            material=material or self.experiment.material,
         )
+        return replace(self, experiment=experiment, given="")
 
     def scaled(self, pitch: float) -> SpecimenSpec:
         """Everything in the same proportions to another l [mm], elements and pixels included."""
         old, factor = self.specimen, pitch / self.specimen.pitch
         lengths = {n: factor * getattr(old, n) for n in ("diameter", "bulk_x", "bulk_y")}
-        specimen = replace(old, pitch=pitch, **lengths)
+        other = self.changed(pitch=pitch, **lengths)
         pixel, start = self.imaging.pixel_size, self.correlation.start_amplitude
         return replace(
-            self,
-            specimen=specimen,
-            mesh_size=factor * self.mesh_size,
+            other,
+            experiment=replace(other.experiment, mesh_size=factor * self.experiment.mesh_size),
             amplitude=factor * self.amplitude,
             imaging=replace(self.imaging, pixel_size=factor * pixel),
             correlation=replace(self.correlation, start_amplitude=factor * start),
-            given="",
         )
 
     def solution_path(self, folder: Path) -> Path:
@@ -243,25 +195,21 @@ class SpecimenSpec:
 
     def plain(self) -> dict[str, Any]:
         """As plain JSON values."""
-        material = material_table(self.material)
-        imaging = _SPEC.dump_python(self.imaging, mode="json")
-        specimen = self.specimen.plain()
-        return {**asdict(self), "specimen": specimen, "material": material, "imaging": imaging}
+        values: dict[str, Any] = to_plain(self)
+        values["experiment"]["material"] = material_table(self.experiment.material)
+        return values
 
     @classmethod
     def read(cls, path: Path) -> SpecimenSpec:
         """Read what :meth:`leave` wrote."""
         values = dict(read_json(path))
-        return made(cls, values | {"material": material_of(values["material"])})
+        experiment = values["experiment"]
+        experiment["material"] = material_of(experiment["material"])
+        return made(cls, values)
 
     def leave(self, folder: Path) -> str:
         """Write it into the study's folder; returns the specimen's name."""
         return leave(self.plain(), folder, "specimens/{}/specimen.json")
-
-
-def specimen_folder(folder: Path, name: str) -> Path:
-    """Where a specimen of a study is."""
-    return folder / "specimens" / name
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,18 +227,13 @@ class LatticeMode:
 
         In its first critical state, or where it stays stable in the last one looked at. Of a graded
         specimen: the lattice of the cell at its centre. ``divisions``: elements along l.
-
-        Raises
-        ------
-        MissingDependencyError
-            If dolfinx is not there.
+        MissingDependencyError without dolfinx.
         """
-        ratio = specimen.diameter / specimen.pitch
-        lattice = StudiedLattice(
-            ratio, material=material, pitch=specimen.pitch, divisions=divisions
-        )
+        ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
         try:
-            return cls(pattern_mode(lattice))
+            return cls(pattern_mode(StudiedLattice(
+                ratio, material=material, pitch=pitch, divisions=divisions
+            )))  # fmt: skip
         except ModuleNotFoundError as error:
             raise MissingDependencyError(NO_DOLFINX) from error
 

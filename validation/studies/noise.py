@@ -20,10 +20,10 @@ gradient of g's own noise is no longer small against the speckle's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -35,6 +35,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.campaign import grid
 from modeharvest.validation.studies.noise_statistics import (
     COVARIANCES,
     HESSIAN_CORRECTED,
@@ -42,13 +43,7 @@ from modeharvest.validation.studies.noise_statistics import (
     FieldPoints,
     NoiseAnalysis,
 )
-from modeharvest.validation.studies.study import (
-    MOST,
-    ImagePairSpec,
-    Study,
-    VirtualImagePair,
-    require_different,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair, noisy
 from modeharvest.validation.workers import Case
 
 EXAMPLES = 24
@@ -75,10 +70,10 @@ def zero_residual(images: MatchedImages) -> MatchedImages:
 def covariances_by_cause(
     pair: VirtualImagePair, result: Result, seed: int
 ) -> dict[str, FloatArray]:
-    """The (n, n) covariances of the unknowns for noise of 1 in both images, by their causes.
+    """The (n, n) covariances of the unknowns for noise of 1 in both images, by ``COVARIANCES``.
 
-    ``result``: of a pair of exact images; ``seed``: of the examples of noise. For each of
-    ``COVARIANCES``; infinite on the diagonal where the images say nothing.
+    ``result``: of a pair of exact images; ``seed``: of the examples of noise. Infinite on the
+    diagonal where the images say nothing.
     """
     matched, cell = matched_images(pair, result), pair.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
@@ -121,22 +116,14 @@ def _noise_examples(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, F
 
 @dataclass(frozen=True)
 class Realisation:
-    """What is found under one realisation of the noise, or without it.
+    """What a correlation finds under one realisation of the noise, or without it.
 
-    Parameters
-    ----------
-    outcome, iterations, residual, unknowns
-        Of the correlation.
-    predicted
-        Standard deviations of the unknowns by the result's own covariance given the noise,
-        followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
-        each of ``COVARIANCES``, for noise of 1.
-    curvature_sd_mm
-        Rms over the points of u's standard deviation by the covariance H⁻¹: without noise and in
-        the first realisation of each level, else None.
-    w_px, model_error_px, measurement_error_px, v1_percent
-        Errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
-        :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
+    ``predicted``: standard deviations of the unknowns by the result's own covariance given the
+    noise, followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
+    each of ``COVARIANCES``, for noise of 1. ``curvature_sd_mm``: rms over the points of u's
+    standard deviation by the covariance H⁻¹, without noise and in the first realisation of each
+    level. The rest are errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
+    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
     """
 
     outcome: str
@@ -155,21 +142,9 @@ class Realisation:
 class NoiseStudy(Study[NoiseAnalysis]):
     """Correlate a pair of images under white noise in both, many times.
 
-    Parameters
-    ----------
-    strain
-        Of the deformed image [-].
-    levels
-        Standard deviations of the noise [fraction of full scale]: 0.01 is 2.6 of 255 levels.
-    pairs
-        Realisations n at each level; each comes as -n, too.
-    seed
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range, or a level comes twice.
+    ``levels``: standard deviations of the noise [fraction of full scale], 0.01 is 2.6 of 255
+    levels; ``pairs``: of realisations n and -n at each level; ``seed``: of the noise. InputError if
+    a value is out of its range, or a level comes twice.
     """
 
     question: ClassVar[str] = (
@@ -190,12 +165,12 @@ class NoiseStudy(Study[NoiseAnalysis]):
             raise InputError(
                 f"study: expected levels above 0 and below 1 of full scale, got {list(self.levels)}"
             )
-        if not 2 <= self.pairs <= MOST or self.seed < 0:
+        if not 2 <= self.pairs <= self.most or self.seed < 0:
             raise InputError(
-                f"study: expected 2 to {MOST} pairs and a seed of 0 or more, got "
+                f"study: expected 2 to {self.most} pairs and a seed of 0 or more, got "
                 f"{self.pairs} and {self.seed}"
             )
-        require_different("levels", self.levels)
+        self.require_different("levels", self.levels)
 
     @property
     def seeds(self) -> str:
@@ -221,64 +196,44 @@ class NoiseStudy(Study[NoiseAnalysis]):
         name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)
         base = {"images": name, "level": 0.0, "pair": 0, "sign": 1, "seed": self.seed}
-        noisy = [
-            {**base, "level": level, "pair": number, "sign": sign}
-            for level in self.levels
-            for number in range(self.pairs)
-            for sign in (1, -1)
-        ]
-        return (base, *noisy)
+        return base, *grid(base, level=self.levels, pair=range(self.pairs), sign=(1, -1))
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> NoiseAnalysis:
-        """Errors of all realisations against their bounds.
-
-        Raises
-        ------
-        InputError
-            If the case without noise failed, or no level has two whole pairs.
-        """
+        """Errors against their bounds; InputError without two whole pairs or a noise-free case."""
         return NoiseAnalysis.of(table, VirtualImagePair.open(folder, table["images"].iloc[0]))
 
 
-def one_realisation(case: Mapping[str, Any], folder: Path) -> Realisation:
-    """Correlate under one realisation of the noise, from the standard initial guess.
-
-    ``case``: one of :meth:`NoiseStudy.prepare`, ``folder``: the study's.
-    """
+def one_realisation(case: Case, folder: Path) -> Realisation:
+    """Correlate under one realisation of the noise, from the standard initial guess."""
     virtual, level = VirtualImagePair.open(folder, case["images"]), float(case["level"])
-    points = FieldPoints.of(virtual)
-    pair = _noisy(virtual.pair, case) if level else virtual.pair
+    points, pair = FieldPoints.of(virtual), virtual.pair
+    if level:
+        rng = np.random.default_rng([case["seed"], case["pair"], round(1e9 * level)])
+        pair = noisy(pair, level, rng, case["sign"])
     result = virtual.correlate(pair=pair)
     curvature_sd = None
     if not level or (case["pair"] == 0 and case["sign"] == 1):
         hessian = matched_images(virtual, result, pair).inverse_hessian
         sd = points.predicted(result, hessian)[:, PARTS["u"]]
         curvature_sd = float(np.sqrt((sd**2).mean()))
-    if level:
-        errors, predicted = {}, [_predicted(points, result, result.covariance(level))]
-    else:
-        by_cause = covariances_by_cause(virtual, result, case["seed"])
-        predicted = [_predicted(points, result, by_cause[name]) for name in COVARIANCES]
-        comparison = virtual.compare(result)
-        errors = asdict(comparison.error_parts())
-        errors["v1_percent"] = comparison.v1_percent(virtual.specimen)
-    return Realisation(
+    found = Realisation(
         result.outcome.value,
         result.iterations,
         result.residual_rms,
         list(map(float, result.unknowns)),
-        predicted[0] if level else predicted,
+        _predicted(points, result, result.covariance(level)) if level else [],
         curvature_sd,
-        **errors,
     )
-
-
-def _noisy(pair: ImagePair, case: Mapping[str, Any]) -> ImagePair:
-    f, g = pair.reference, pair.deformed
-    rng = np.random.default_rng([case["seed"], case["pair"], round(1e9 * case["level"])])
-    n_f, n_g = rng.normal(scale=case["level"], size=(2, *f.shape)).astype(np.float32)
-    sign = np.float32(case["sign"])
-    return pair.with_images(f + sign * n_f, g + sign * n_g)
+    if level:
+        return found
+    by_cause = covariances_by_cause(virtual, result, case["seed"])
+    comparison = virtual.compare(result)
+    return replace(
+        found,
+        predicted=[_predicted(points, result, by_cause[name]) for name in COVARIANCES],
+        **asdict(comparison.error_parts()),
+        v1_percent=comparison.v1_percent(virtual.specimen),
+    )
 
 
 def _predicted(points: FieldPoints, result: Result, covariance: FloatArray) -> list[float]:

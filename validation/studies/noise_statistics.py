@@ -65,19 +65,15 @@ class FieldPoints:
     def fields(self, unknowns: FloatArray) -> FloatArray:
         """(points, 7): u, v0 (2 each), v1, v1 phi1 (2) [mm], in the order of ``PARTS``."""
         ansatz, x, y = self.pair.ansatz, self.x[:, None], self.y[:, None]
-        parts = (
-            ansatz.displacement(unknowns, x, y),
-            ansatz.v0(unknowns, x, y),
-            ansatz.v(0, unknowns, x, y)[..., None],
-            ansatz.fluctuation(0, unknowns, x, y),
-        )
-        return np.concatenate([part[:, 0] for part in parts], axis=-1)
+        u, v0 = ansatz.displacement(unknowns, x, y), ansatz.v0(unknowns, x, y)
+        v1, v1phi1 = ansatz.v(0, unknowns, x, y), ansatz.fluctuation(0, unknowns, x, y)
+        return np.concatenate([u, v0, v1[..., None], v1phi1], axis=-1)[:, 0]
 
     def predicted(self, result: Result, covariance: FloatArray) -> FloatArray:
         """(points, 7) standard deviations of :meth:`fields` by a covariance of the unknowns."""
-        errors = field_errors(result, self.x[:, None], self.y[:, None], covariance)
-        parts = (errors.displacement, errors.v0, errors.v[0][..., None], errors.fluctuation[0])
-        return np.concatenate([part[:, 0] for part in parts], axis=-1)
+        sd = field_errors(result, self.x[:, None], self.y[:, None], covariance)
+        parts = [sd.displacement, sd.v0, sd.v[0][..., None], sd.fluctuation[0]]
+        return np.asarray(np.concatenate(parts, axis=-1)[:, 0])
 
     def map(self, values: FloatArray) -> FloatArray:
         """(rows, cols) of values at the points; NaN where there is no material."""
@@ -110,15 +106,10 @@ class Estimate:
 class PairedErrors:
     """Errors under noise.
 
-    Parameters
-    ----------
-    errors
-        (pairs, 2, ...) of the realisations n and -n, in any unit.
-    predicted
-        Same shape: the standard deviations that each result predicts.
-    bound
-        (...): the least standard deviations there can be; 0 for what no noise moves (a mode
-        outside its support), which does not count.
+    ``errors``: (pairs, 2, ...) of the realisations n and -n, in any unit; ``predicted``, of the
+    same shape: the standard deviations that each result predicts; ``bound``: (...) the least
+    standard deviations there can be, 0 for what no noise moves (a mode outside its support), which
+    does not count.
     """
 
     errors: FloatArray
@@ -134,9 +125,8 @@ class PairedErrors:
     def standardised(self) -> PairedErrors:
         """What counts in units of the bound, flat: everything weighs alike."""
         kept = self.of(self.counted)
-        return PairedErrors(
-            kept.errors / kept.bound, kept.predicted / kept.bound, np.ones_like(kept.bound)
-        )
+        scaled = kept.errors / kept.bound, kept.predicted / kept.bound
+        return PairedErrors(*scaled, np.ones_like(kept.bound))
 
     def of(self, part: NDArray[np.bool_]) -> PairedErrors:
         """Some of the quantities: those where ``part``, of the bound's shape, is True."""
@@ -207,26 +197,18 @@ Levels = Mapping[float, Mapping[str, PairedErrors]]
 """For each level of noise, in order, the errors of the "unknowns" and of the fields."""
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseErrors:
-    """Standard deviations, or errors.
+def by_field(unknowns: FloatArray, fields: FloatArray) -> dict[str, FloatArray]:
+    """Standard deviations, or errors, by what they are of.
 
     ``unknowns``: (..., n), each in its own unit; ``fields``: (..., points, 7) [mm], see ``PARTS``.
     """
+    return {"unknowns": unknowns, **{name: fields[..., part] for name, part in PARTS.items()}}
 
-    unknowns: FloatArray
-    fields: FloatArray
 
-    @classmethod
-    def of(cls, flat: FloatArray, n: int) -> NoiseErrors:
-        """From (..., n + 7 points), as the cases store it."""
-        fields = flat[..., n:]
-        return cls(flat[..., :n], fields.reshape(*fields.shape[:-1], -1, 7))
-
-    def parts(self) -> dict[str, FloatArray]:
-        """By their names."""
-        fields = {name: self.fields[..., part] for name, part in PARTS.items()}
-        return {"unknowns": self.unknowns, **fields}
+def _predictions(flat: FloatArray, n: int) -> dict[str, FloatArray]:
+    """Of n unknowns and of the fields, from (..., n + 7 points) as the cases store it."""
+    fields = flat[..., n:]
+    return by_field(flat[..., :n], fields.reshape(*fields.shape[:-1], -1, 7))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,32 +230,23 @@ class NoiseFreeCase:
         """(n,) what all errors are measured from."""
         return np.array(self.row["unknowns"])
 
-    def predicted(self, cause: str) -> NoiseErrors:
-        """Standard deviations for noise of 1 by one of ``COVARIANCES``."""
+    def predicted(self, cause: str) -> dict[str, FloatArray]:
+        """Standard deviations for noise of 1 by one of ``COVARIANCES``, see :func:`by_field`."""
         flat = np.array(self.row["predicted"][COVARIANCES.index(cause)], dtype=np.float64)
-        return NoiseErrors.of(flat, len(self.row["unknowns"]))
+        return _predictions(flat, len(self.row["unknowns"]))
 
     def factors(self, cause: str) -> dict[str, FloatArray]:
         """How much larger than the bound they are: 1 where there is none."""
-        found = {}
-        for (name, sd), bound in zip(
-            self.predicted(cause).parts().items(),
-            self.predicted("bound").parts().values(),
-            strict=True,
-        ):
+        bounds, found = self.predicted("bound"), {}
+        for name, sd in self.predicted(cause).items():
+            bound = bounds[name]
             known = np.isfinite(bound) & (bound > 0.0)
             found[name] = np.divide(sd, bound, out=np.ones_like(bound), where=known)
         return found
 
 
 def read_levels(table: pd.DataFrame, noise_free: NoiseFreeCase, points: FieldPoints) -> Levels:
-    """The errors of all realisations, and their bound 2 s²M⁻¹.
-
-    Raises
-    ------
-    InputError
-        If no level has two whole pairs.
-    """
+    """All realisations' errors and their bound 2 s²M⁻¹; InputError without two whole pairs."""
     noisy = table[(table["error"] == "") & (table["level"] > 0.0)]
     found = {}
     for level, part in noisy.groupby("level"):
@@ -282,6 +255,26 @@ def read_levels(table: pd.DataFrame, noise_free: NoiseFreeCase, points: FieldPoi
             found[float(level)] = _read_level(float(level), by_pair, noise_free, points)
     if not found:
         raise InputError("study: expected two whole pairs of realisations at a level, got fewer")
+    return found
+
+
+def _read_level(
+    level: float, by_pair: list[pd.DataFrame], noise_free: NoiseFreeCase, points: FieldPoints
+) -> dict[str, PairedErrors]:
+    def column(name: str) -> FloatArray:
+        return np.array([[np.array(v, dtype=np.float64) for v in pair[name]] for pair in by_pair])
+
+    true, a = noise_free.unknowns, column("unknowns")
+    fields = np.array([[points.fields(one) for one in pair] for pair in a]) - points.fields(true)
+    predicted, least = _predictions(column("predicted"), len(true)), noise_free.predicted("bound")
+    least["v1"][~points.cellular] = 0.0  # where phi1 fades out it does not count
+    found = {}
+    for name, off in by_field(a - true, fields).items():
+        bound = level * least[name]
+        known = np.isfinite(bound)  # the others are not determined by the images
+        found[name] = PairedErrors(
+            np.where(known, off, 0.0), predicted[name], np.where(known, bound, 0.0)
+        )
     return found
 
 
@@ -294,30 +287,6 @@ def against_bound(levels: Levels, noise_free: NoiseFreeCase, cause: str) -> Leve
     }
 
 
-def _read_level(
-    level: float, by_pair: list[pd.DataFrame], noise_free: NoiseFreeCase, points: FieldPoints
-) -> dict[str, PairedErrors]:
-    def column(name: str) -> FloatArray:
-        return np.array([[np.array(v, dtype=np.float64) for v in pair[name]] for pair in by_pair])
-
-    true, a = noise_free.unknowns, column("unknowns")
-    fields = np.array([[points.fields(one) for one in pair] for pair in a]) - points.fields(true)
-    errors, predicted = (
-        NoiseErrors(a - true, fields),
-        NoiseErrors.of(column("predicted"), len(true)),
-    )
-    least = noise_free.predicted("bound")
-    least.fields[~points.cellular, PARTS["v1"]] = 0.0  # where phi1 fades out it does not count
-    found = {}
-    for name, off in errors.parts().items():
-        bound = level * least.parts()[name]
-        known = np.isfinite(bound)  # the others are not determined by the images
-        found[name] = PairedErrors(
-            np.where(known, off, 0.0), predicted.parts()[name], np.where(known, bound, 0.0)
-        )
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseAnalysis:
     """What the table of a noise study says.
@@ -328,7 +297,6 @@ class NoiseAnalysis:
     number.
     """
 
-    pair: VirtualImagePair
     points: FieldPoints
     noise_free: NoiseFreeCase
     by_bound: Levels
@@ -345,7 +313,6 @@ class NoiseAnalysis:
         done = table[table["error"] == ""]
         sd = done[done["curvature_sd_mm"].notna()].set_index("level")["curvature_sd_mm"]
         return cls(
-            pair,
             points,
             noise_free,
             levels,

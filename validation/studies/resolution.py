@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +24,6 @@ from modeharvest.validation.resolution.buckled import (
     AddedWave,
     BuckledMotion,
     ResolutionSpec,
-    noisy,
 )
 from modeharvest.validation.resolution.transfer import (
     AXES,
@@ -36,13 +35,7 @@ from modeharvest.validation.resolution.transfer import (
     subset_indicator,
     wave_share,
 )
-from modeharvest.validation.studies.study import (
-    MOST,
-    ImagePairSpec,
-    Study,
-    require_different,
-    require_mode,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, Study, noisy
 from modeharvest.validation.workers import Case
 
 Row = dict[str, Any]
@@ -65,17 +58,15 @@ def _noise_free(folder: Path, name: str, motion: str, degree: int) -> Result:
     )
 
 
-def one_case(case: Mapping[str, Any], folder: Path) -> Row:
+def one_case(case: Case, folder: Path) -> Row:
     """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor."""
-    tasks: dict[str, Callable[[Mapping[str, Any], Path], Row]] = {
-        "wave": _wave,
-        "noise": _noise,
-        "floor": _floor,
-    }
-    return tasks[case["task"]](case, folder)
+    run: Callable[[Case, Path], Row] = {"wave": _wave, "noise": _noise, "floor": _floor}[
+        case["task"]
+    ]
+    return run(case, folder)
 
 
-def _wave(case: Mapping[str, Any], folder: Path) -> Row:
+def _wave(case: Case, folder: Path) -> Row:
     """The shares of a wave that are found in its own part and in the whole, by degree."""
     name = case["images"]
     spec = ResolutionSpec.read(folder, name)
@@ -87,27 +78,25 @@ def _wave(case: Mapping[str, Any], folder: Path) -> Row:
     row: Row = {"power": float((true**2).sum())}
     for degree in spec.measured:
         found = spec.correlate(pair, degree, "buckled")
-        quiet = _noise_free(folder, name, "buckled", degree)
-        change = {
-            part: _part_at(found, part, points) - _part_at(quiet, part, points) for part in WAVED
-        }
-        row[f"own_{degree}"] = float(wave_share(change[case["part"]][..., None], true)[0])
-        row[f"whole_{degree}"] = float(
-            wave_share((change["v0"] + change["v1"])[..., None], true)[0]
-        )
+        change = _changes(_noise_free(folder, name, "buckled", degree), found, points)
+        own, whole = change[case["part"]], change["v0"] + change["v1"]
+        row[f"own_{degree}"] = float(wave_share(own[..., None], true)[0])
+        row[f"whole_{degree}"] = float(wave_share(whole[..., None], true)[0])
         row[f"outcome_{degree}"] = found.outcome.value
     return row
 
 
-def _part_at(result: Result, part: str, points: FloatArray) -> FloatArray:
-    """(m, 2) v0 or v1 phi1 at points [mm]."""
-    ansatz, a = result.ansatz, result.unknowns
+def _changes(quiet: Result, found: Result, points: FloatArray) -> dict[str, FloatArray]:
+    """(m, 2) by how much v0 and v1 phi1 ("v1") of a result differ from another's at points [mm]."""
     x, y = points[:, 0, None], points[:, 1, None]
-    found = ansatz.v0(a, x, y) if part == "v0" else ansatz.fluctuation(0, a, x, y)
-    return np.asarray(found[:, 0])
+    parts = [
+        (fit.ansatz.v0(fit.unknowns, x, y), fit.ansatz.fluctuation(0, fit.unknowns, x, y))
+        for fit in (quiet, found)
+    ]
+    return {name: (b - a)[:, 0] for name, a, b in zip(WAVED, *parts, strict=True)}
 
 
-def _floor(case: Mapping[str, Any], folder: Path) -> Row:
+def _floor(case: Case, folder: Path) -> Row:
     """Standard deviations by 2 s^2 M^-1 of the exact images, rms over the material [px]."""
     spec = ResolutionSpec.read(folder, case["images"])
     result = _noise_free(folder, case["images"], case["motion"], case["degree"])
@@ -115,7 +104,7 @@ def _floor(case: Mapping[str, Any], folder: Path) -> Row:
     return {"unknowns": result.ansatz.size, "outcome": result.outcome.value, **predicted}
 
 
-def _noise(case: Mapping[str, Any], folder: Path) -> Row:
+def _noise(case: Case, folder: Path) -> Row:
     """Errors of fields from noisy images, and those their covariance predicts, by degree [px]."""
     name, motion = case["images"], case["motion"]
     spec = ResolutionSpec.read(folder, name)
@@ -134,37 +123,34 @@ def _noise(case: Mapping[str, Any], folder: Path) -> Row:
 
 def _predicted(spec: ResolutionSpec, result: Result, covariance: FloatArray) -> Row:
     """Rms standard deviations of the fields by a covariance of the unknowns [px]."""
-    points, cellular = spec.sparse
-    errors = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
-    return _rms_px(
-        spec, errors.v0, errors.v[0][cellular], errors.fluctuation[0][cellular], errors.displacement
-    )
+    points, _ = spec.sparse
+    sd = field_errors(result, points[:, 0, None], points[:, 1, None], covariance)
+    return _rms_px(spec, sd.v0, sd.v[0], sd.fluctuation[0], sd.displacement)
 
 
 def _errors(spec: ResolutionSpec, found: Result, quiet: Result) -> Row:
     """Rms differences of the fields of two results [px]."""
-    points, cellular = spec.sparse
+    points, _ = spec.sparse
     x, y = points[:, 0, None], points[:, 1, None]
-    v0, v1phi1 = (_part_at(found, part, points) - _part_at(quiet, part, points) for part in WAVED)
+    v0, v1phi1 = _changes(quiet, found, points).values()
     v1 = found.ansatz.v(0, found.unknowns, x, y) - quiet.ansatz.v(0, quiet.unknowns, x, y)
-    return _rms_px(spec, v0, v1[cellular], v1phi1[cellular], v0 + v1phi1)
+    return _rms_px(spec, v0, v1, v1phi1, v0 + v1phi1)
 
 
 def _rms_px(
     spec: ResolutionSpec, v0: FloatArray, v1: FloatArray, v1phi1: FloatArray, u: FloatArray
 ) -> Row:
-    """Root mean squares of fields [mm] in px; of v1 that of v1 phi1 where phi1 is largest."""
-    px = spec.buckled.pixel_size
-    return {
-        "v0": rms(v0) / px,
-        "v1": LARGEST * rms(v1) / px,
-        "v1phi1": rms(v1phi1) / px,
-        "u": rms(u) / px,
-    }
+    """Rms of fields (k, ...) [mm] at ``spec.sparse`` in px; v1 is scaled to its largest v1 phi1.
+
+    v1 and v1 phi1 count in the cellular part only.
+    """
+    _, cellular = spec.sparse
+    rms = {"v0": _rms(v0), "v1": LARGEST * _rms(v1[cellular]), "v1phi1": _rms(v1phi1[cellular]),
+           "u": _rms(u)}  # fmt: skip
+    return {name: value / spec.buckled.pixel_size for name, value in rms.items()}
 
 
-def rms(values: FloatArray) -> float:
-    """Root mean square of all values."""
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -201,29 +187,11 @@ class ResolutionAnalysis:
 class ResolutionStudy(Study[ResolutionAnalysis]):
     """Small waves of v0 and v1 on a buckled specimen, and noise, against the polynomial degree.
 
-    Parameters
-    ----------
-    strain
-        Nominal compression of the base motion [-].
-    pattern
-        Its v1, the same everywhere [mm].
-    degrees
-        Of v0 and v1 alike.
-    measured
-        Those of them that images are measured with, too.
-    amplitude_px
-        Of a wave [px].
-    noise
-        Standard deviation in each image [fraction of full scale].
-    realisations
-        Of the noise.
-    seed
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range.
+    ``strain``: nominal compression of the base motion [-]; ``pattern``: its v1, the same everywhere
+    [mm]; ``degrees``: of v0 and v1 alike; ``measured``: those of them that images are measured
+    with, too; ``amplitude_px``: of a wave [px]; ``noise``: standard deviation in each image
+    [fraction of full scale], with so many ``realisations``, from ``seed``. InputError if a value is
+    out of its range.
     """
 
     question: ClassVar[str] = (
@@ -234,6 +202,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
         "parametrised fields."
     )
     function: ClassVar[str] = f"{__name__}:one_case"
+    measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
     pattern: float = 7.0
@@ -245,7 +214,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        require_different("degrees", self.degrees)
+        self.require_different("degrees", self.degrees)
         if not self.degrees or not all(1 <= d <= 12 for d in self.degrees):
             raise InputError(f"study: expected degrees from 1 to 12, got {list(self.degrees)}")
         if not self.measured or not set(self.measured) <= set(self.degrees):
@@ -258,9 +227,9 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
                 "study: expected an amplitude above 0 and up to 2 px and noise above 0 and below "
                 f"0.1 of full scale, got {self.amplitude_px} and {self.noise}"
             )
-        if self.pattern == 0.0 or not 2 <= self.realisations <= MOST or self.seed < 0:
+        if self.pattern == 0.0 or not 2 <= self.realisations <= self.most or self.seed < 0:
             raise InputError(
-                f"study: expected a pattern that is not 0 mm, 2 to {MOST} realisations and a seed "
+                f"study: expected a pattern that is not 0 mm, 2 to {self.most} realisations and a seed "
                 f"of 0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
             )
 
@@ -271,7 +240,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
 
     def require(self, correlation: SquareLatticeOptions) -> None:
         """The mode is measured, in exact images, and brightness is none of the question."""
-        require_mode(correlation)
+        super().require(correlation)
         if correlation.camera or correlation.brightness.size:
             raise InputError(
                 "study: expected correlation.camera = false and neither gain nor offset, got "
@@ -287,13 +256,9 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
         self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
         """Say what is measured; the cases are waves, noise, and the floors of exact images."""
+        specimen, how, imaging = spec.experiment.specimen, spec.correlation, spec.imaging
         buckled = BuckledMotion(
-            spec.experiment.specimen,
-            spec.correlation,
-            spec.imaging.speckle,
-            spec.imaging.pixel_size,
-            self.strain,
-            self.pattern,
+            specimen, how, imaging.speckle, imaging.pixel_size, self.strain, self.pattern
         )
         measured = ResolutionSpec(buckled, self.measured, self.amplitude_px, self.noise)
         base: Case = {

@@ -6,24 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.study import (
-    MOST,
-    ImagePairSpec,
-    Study,
-    VirtualImagePair,
-    require_different,
-    require_mode,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.workers import Case
 
 SAME_PX = 0.01
@@ -54,12 +46,7 @@ class Proportion:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval by Wilson's score.
-
-        References
-        ----------
-        E. B. Wilson, J. Am. Stat. Assoc. 22 (1927), doi 10.1080/01621459.1927.10502953.
-        """
+        """95 % confidence interval by Wilson's score, doi 10.1080/01621459.1927.10502953."""
         low, high = binomtest(self.good, self.count).proportion_ci(0.95, method="wilson")
         return float(low), float(high)
 
@@ -133,8 +120,8 @@ class RobustnessAnalysis:
 class GuessResult:
     """Where an initial guess leads.
 
-    ``distance_px``, ``start_distance_px``: rms length of the difference of two displacements, the
-    reference solution's and this one's, or the guess' own. ``epsilon_percent``: the paper's, the
+    ``distance_px``, ``start_distance_px``: rms length of the difference of the solution's, or the
+    guess', displacement from the reference solution's. ``epsilon_percent``: the paper's, the
     difference of their norms. The others are of the correlation.
     """
 
@@ -151,24 +138,11 @@ class GuessResult:
 class RobustnessStudy(Study[RobustnessAnalysis]):
     """Correlate from many initial guesses.
 
-    Parameters
-    ----------
-    strain
-        Of the deformed image [-].
-    initial_guesses, radius
-        Number of guesses whose mode parameters are perturbed by up to ``radius``: a share of 1
-        for a1 ... a5, of the unit cell for the two phases. The paper: 100 and 0.1.
-    radii, per_radius
-        For the basin: further radii, and guesses for each.
-    strain_errors
-        And guesses whose v0 has the applied strain times 1 plus these, with the mode as it is.
-    seed
-        Of the perturbations.
-
-    Raises
-    ------
-    InputError
-        If a value is out of its range, or one comes twice.
+    ``initial_guesses`` have mode parameters perturbed by up to ``radius``: a share of 1 for a1 ...
+    a5, of the unit cell for the two phases; the paper: 100 and 0.1. ``radii``, ``per_radius``: for
+    the basin, further radii, and guesses for each. ``strain_errors``: and guesses whose v0 has the
+    applied strain times 1 plus these, with the mode as it is. ``seed``: of the perturbations.
+    InputError if a value is out of its range, or one comes twice.
     """
 
     question: ClassVar[str] = (
@@ -177,6 +151,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         "compared with that of the standard guess."
     )
     function: ClassVar[str] = f"{__name__}:one_start"
+    measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
     initial_guesses: int = 100
@@ -187,10 +162,10 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        counts_fit = 1 <= self.initial_guesses <= MOST and 0 <= self.per_radius <= MOST
+        counts_fit = 1 <= self.initial_guesses <= self.most and 0 <= self.per_radius <= self.most
         if not counts_fit or self.seed < 0:
             raise InputError(
-                f"study: expected 1 to {MOST} initial guesses, per_radius and seed from 0 on, got "
+                f"study: expected 1 to {self.most} initial guesses, per_radius and seed from 0 on, got "
                 f"{self.initial_guesses}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
@@ -203,17 +178,13 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
                 f"study: expected radii other than radius = {self.radius}, which has its own "
                 f"initial guesses, got {list(self.radii)}"
             )
-        require_different("radii", self.radii)
-        require_different("strain_errors", self.strain_errors)
+        self.require_different("radii", self.radii)
+        self.require_different("strain_errors", self.strain_errors)
 
     @property
     def seeds(self) -> str:
         """Of the perturbations."""
         return f"seed {self.seed} of the perturbations"
-
-    def require(self, correlation: SquareLatticeOptions) -> None:
-        """A mode that is fixed has no initial guess."""
-        require_mode(correlation)
 
     def quick(self) -> Self:
         """A fifth of the initial guesses."""
@@ -245,11 +216,8 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         return RobustnessAnalysis(moved, at_radius, strains, statistics)
 
 
-def one_start(case: Mapping[str, Any], folder: Path) -> GuessResult:
-    """Correlate from one perturbed initial guess, and compare with the reference solution.
-
-    ``case``: one of :meth:`RobustnessStudy.prepare`, ``folder``: the study's.
-    """
+def one_start(case: Case, folder: Path) -> GuessResult:
+    """Correlate from one perturbed initial guess, and compare with the reference solution."""
     pair = VirtualImagePair.open(folder, case["images"])
     reference = _reference_solution(folder, case["images"])
     guess = _perturbed_guess(pair, case)
@@ -266,13 +234,11 @@ def one_start(case: Mapping[str, Any], folder: Path) -> GuessResult:
     )
 
 
-def _perturbed_guess(pair: VirtualImagePair, case: Mapping[str, Any]) -> FloatArray:
+def _perturbed_guess(pair: VirtualImagePair, case: Case) -> FloatArray:
     """(n,) of a case; the same directions for every radius."""
-    ansatz = pair.ansatz
-    strain = pair.strain * (1.0 + case["strain_error"])
+    ansatz, strain = pair.ansatz, pair.strain * (1.0 + case["strain_error"])
     guess = ansatz.initial_guess(strain, pair.options.start_amplitude)
-    rng = np.random.default_rng([case["seed"], case["start"]])
-    unit = rng.uniform(-1.0, 1.0, 7)
+    unit = np.random.default_rng([case["seed"], case["start"]]).uniform(-1.0, 1.0, 7)
     scale = np.array([1.0] * 5 + [pair.specimen.pitch] * 2)
     guess[ansatz.phi_slice(0)] += case["radius"] * unit * scale
     return guess

@@ -17,8 +17,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
+import numpy as np
 import pandas as pd
-from pydantic import TypeAdapter
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
@@ -34,10 +34,10 @@ from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.util.progress import Progress, silent
+from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.truth import Comparison, compare
 from modeharvest.validation.workers import Case, leave
 
-_SPEC = TypeAdapter(ImagingSpec)
 PAPERS_TAPER = 0.5
 """Width over which a mode fades out beside the cellular part [unit cells]."""
 
@@ -77,13 +77,9 @@ class ImagePairSpec:
     ) -> str:
         """Leave in a study's folder what a worker needs to open a pair; returns the pair's name.
 
-        ``strain``: of the deformed image [-]; ``imaging``, ``correlation``: instead of the
-        specification's own; ``taper``: width over which the mode fades out [unit cells].
-
-        Raises
-        ------
-        InputError
-            If the solution has no snapshot at that strain.
+        ``strain``: of the deformed image [-], an InputError if the solution has no snapshot there;
+        ``imaging``, ``correlation``: instead of the specification's own; ``taper``: width over
+        which the mode fades out [unit cells].
         """
         have = sorted({s.nominal_strain for s in self.solution.snapshots})
         if not any(abs(strain - e) < 1e-9 for e in have):
@@ -91,17 +87,17 @@ class ImagePairSpec:
                 f"study: expected a strain among {have}, which the solution has, got {strain}"
             )
         spec = imaging or self.imaging
+        if not (folder / "solution.h5").is_file():
+            self.solution.write(folder / "solution.h5")
         description = {
             "images": image_key(self.solution, spec, (strain,))[:16],
             "strain": strain,
-            "imaging": _SPEC.dump_python(spec, mode="json"),
+            "imaging": spec,
             "specimen": self.experiment.specimen.plain(),
-            "correlation": vars(correlation or self.correlation),
+            "correlation": correlation or self.correlation,
             "taper": taper,
         }
-        if not (folder / "solution.h5").is_file():
-            self.solution.write(folder / "solution.h5")
-        return leave(description, folder, "subjects/{}.json")
+        return leave(to_plain(description), folder, "subjects/{}.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,19 +118,15 @@ class VirtualImagePair:
     def open(cls, folder: Path, name: str, progress: Progress = silent) -> VirtualImagePair:
         """The pair that :meth:`ImagePairSpec.describe` described; its images are made if need be.
 
-        Where several workers open the same pair, it is to be opened once before.
-
-        Raises
-        ------
-        InputError
-            If there is no such pair, or the folder's solution is not the one it is of.
+        Where several workers open the same pair, it is to be opened once before. InputError if
+        there is no such pair, or the folder's solution is not the one it is of.
         """
         described = _description(folder, name)
         return cls(
             _image_set(folder, described, progress),
             float(described["strain"]),
-            Specimen(**described["specimen"]),
-            SquareLatticeOptions(**described["correlation"]),
+            made(Specimen, described["specimen"]),
+            made(SquareLatticeOptions, described["correlation"]),
             float(described["taper"]),
         )
 
@@ -181,6 +173,13 @@ class VirtualImagePair:
         return compare(self.images, self.strain, result, guess, camera)
 
 
+def noisy(pair: ImagePair, level: float, rng: np.random.Generator, sign: float = 1.0) -> ImagePair:
+    """The pair with white noise of that standard deviation, or its negative, in both images."""
+    n = rng.normal(scale=level, size=(2, *pair.reference.shape)).astype(np.float32)
+    n *= np.float32(sign)
+    return pair.with_images(pair.reference + n[0], pair.deformed + n[1])
+
+
 def _description(folder: Path, name: str) -> dict[str, Any]:
     return dict(read_json(folder / "subjects" / f"{name}.json"))
 
@@ -195,7 +194,7 @@ def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> I
     except InputError:
         pass
     solution, strain = Solution.read(folder / "solution.h5"), float(described["strain"])
-    spec = _SPEC.validate_python(described["imaging"])
+    spec = made(ImagingSpec, described["imaging"])
     if image_key(solution, spec, (strain,))[:16] != described["images"]:
         raise InputError(
             f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
@@ -220,6 +219,10 @@ class Study(ABC, Generic[A]):
     """What is asked, for the report."""
     function: ClassVar[str]
     """The "package.module:name" of what runs one case."""
+    most: ClassVar[int] = 100_000
+    """Of what is repeated in a study; each is a case and its file."""
+    measures_mode: ClassVar[bool] = False
+    """Whether the mode's parameters have to be free."""
     strain: float
     """Of the deformed image [-]."""
 
@@ -230,6 +233,17 @@ class Study(ABC, Generic[A]):
 
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Raise InputError if the correlation contradicts the study."""
+        if self.measures_mode and correlation.fixed_mode:
+            raise InputError(
+                "study: expected correlation.fixed_mode = false, got true: nothing of the mode "
+                "would be found"
+            )
+
+    @staticmethod
+    def require_different(name: str, values: tuple[Any, ...]) -> None:
+        """Raise InputError if a value comes twice."""
+        if len(set(values)) < len(values):
+            raise InputError(f"study: expected {name} that differ, got {list(values)}")
 
     @abstractmethod
     def quick(self) -> Self:
@@ -247,22 +261,3 @@ class Study(ABC, Generic[A]):
     @abstractmethod
     def analyse(self, table: pd.DataFrame, folder: Path) -> A:
         """What a table with a row for each case says; failed ones have an ``error``."""
-
-
-def require_mode(correlation: SquareLatticeOptions) -> None:
-    """Raise InputError where the mode is fixed: nothing of it would be measured."""
-    if correlation.fixed_mode:
-        raise InputError(
-            "study: expected correlation.fixed_mode = false, got true: nothing of the mode would "
-            "be found"
-        )
-
-
-MOST = 100_000
-"""Of what is repeated in a study; each is a case and its file."""
-
-
-def require_different(name: str, values: tuple[Any, ...]) -> None:
-    """Raise InputError if a value comes twice."""
-    if len(set(values)) < len(values):
-        raise InputError(f"study: expected {name} that differ, got {list(values)}")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -21,21 +22,26 @@ from modeharvest.validation.studies.study import (
     ImagePairSpec,
     Study,
     VirtualImagePair,
-    require_different,
 )
 from modeharvest.validation.workers import Case
+
+T = TypeVar("T")
+
+
+def changed(thing: T, options: str, **values: Any) -> T:
+    """A dataclass of dataclasses with other values in the one at a dotted path; "" is itself."""
+    name, _, rest = options.partition(".")
+    if name:
+        values = {name: changed(getattr(thing, name), rest, **values)}
+    other: T = replace(thing, **values)  # type: ignore[type-var]
+    return other
 
 
 @dataclass(frozen=True)
 class StudySetting:
     """How a pair is imaged and correlated.
 
-    ``taper``: width over which the mode fades out [unit cells].
-
-    Raises
-    ------
-    InputError
-        If the taper has no width.
+    ``taper``: width over which the mode fades out [unit cells]; InputError if it has none.
     """
 
     imaging: ImagingSpec
@@ -46,41 +52,15 @@ class StudySetting:
         if not self.taper > 0.0:
             raise InputError(f"study: expected a taper wider than 0 unit cells, got {self.taper}")
 
-    def imaged(self, **options: Any) -> StudySetting:
-        """With other options of the imaging."""
-        return replace(self, imaging=replace(self.imaging, **options))
-
-    def speckled(self, **options: Any) -> StudySetting:
-        """With another speckle."""
-        return self.imaged(speckle=replace(self.imaging.speckle, **options))
-
-    def sensed(self, **options: Any) -> StudySetting:
-        """With another sensor."""
-        return self.imaged(sensor=replace(self.imaging.sensor, **options))
-
-    def correlated(self, **options: Any) -> StudySetting:
-        """With other options of the correlation."""
-        return replace(self, correlation=replace(self.correlation, **options))
-
 
 @dataclass(frozen=True)
 class VariedFactor:
     """Something to change.
 
-    Parameters
-    ----------
-    label
-        What it is called, with its unit.
-    levels
-        What it is changed to unless a study says otherwise.
-    change
-        The setting with that level.
-    base
-        The level that a setting has; None where it has none (float images have no bits).
-    whole
-        Whether levels are whole numbers.
-    names
-        Of levels that are a choice and not a size: their numbers count these.
+    ``label``: what it is called, with its unit; ``levels``: what it is changed to unless a study
+    says otherwise, for a choice the numbers of its ``names``; ``change``: the setting with that
+    level; ``base``: the level that a setting has, None where it has none (float images have no
+    bits); ``whole``: whether levels are whole numbers.
     """
 
     label: str
@@ -91,16 +71,27 @@ class VariedFactor:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
-        """One of several names of an option of the correlation."""
+    def option(
+        cls, label: str, path: str, levels: tuple[float, ...], whole: bool = False
+    ) -> VariedFactor:
+        """The option at a dotted path of a :class:`StudySetting`."""
+        options, _, name = path.rpartition(".")
         return cls(
-            label,
-            tuple(range(len(names))),
-            lambda s, v: s.correlated(**{option: names[v]}),
-            lambda s: _number(names, getattr(s.correlation, option)),
-            whole=True,
-            names=names,
+            label, levels, lambda s, v: changed(s, options, **{name: v}), attrgetter(path), whole
         )
+
+    @classmethod
+    def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
+        """One of several names of an option of the correlation, or none: left to the images."""
+
+        def base(setting: StudySetting) -> int | None:
+            chosen = getattr(setting.correlation, option)
+            return None if chosen is None else names.index(chosen)
+
+        def change(setting: StudySetting, level: int) -> StudySetting:
+            return changed(setting, "correlation", **{option: names[level]})
+
+        return cls(label, tuple(range(len(names))), change, base, whole=True, names=names)
 
     def number(self, level: float | str) -> float:
         """A level as a number; InputError if there is no such name."""
@@ -116,13 +107,7 @@ class VariedFactor:
         return self.names[round(level)] if self.names else f"{level:g}"
 
     def set(self, setting: StudySetting, level: float) -> StudySetting:
-        """Change a setting.
-
-        Raises
-        ------
-        InputError
-            If the level is out of the factor's range.
-        """
+        """Change a setting; InputError if the level is out of the factor's range."""
         if self.names and level not in range(len(self.names)):
             raise InputError(
                 f"study: expected one of {list(self.names)} for {self.label}, got {level:g}"
@@ -137,9 +122,9 @@ def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
     if not factor > 0.0:
         raise InputError(f"study: expected a speckle_size above 0 times the base's, got {factor}")
     speckle = setting.imaging.speckle
-    return setting.speckled(
-        standard_deviation=speckle.standard_deviation / factor, blur_px=speckle.blur_px * factor
-    )
+    sizes = {"standard_deviation": speckle.standard_deviation / factor,
+             "blur_px": speckle.blur_px * factor}  # fmt: skip
+    return changed(setting, "imaging.speckle", **sizes)
 
 
 def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
@@ -147,8 +132,12 @@ def _contrast(setting: StudySetting, contrast: float) -> StudySetting:
     speckle = setting.imaging.speckle
     middle = 0.5 * (speckle.dark + speckle.bright)
     middle = min(max(middle, 0.5 * contrast), 1.0 - 0.5 * contrast)
-    changed = setting.speckled(dark=middle - 0.5 * contrast, bright=middle + 0.5 * contrast)
-    return changed.correlated(camera=True)
+    dark, bright = middle - 0.5 * contrast, middle + 0.5 * contrast
+    return _by_camera(changed(setting, "imaging.speckle", dark=dark, bright=bright))
+
+
+def _by_camera(setting: StudySetting) -> StudySetting:
+    return changed(setting, "correlation", camera=True)
 
 
 def _camera(setting: StudySetting, level: float) -> float | None:
@@ -156,15 +145,9 @@ def _camera(setting: StudySetting, level: float) -> float | None:
     return level if setting.correlation.camera else None
 
 
-def _number(names: tuple[str, ...], chosen: str | None) -> int | None:
-    """Of a name; None for a choice that is left to the images."""
-    return None if chosen is None else names.index(chosen)
-
-
 FACTORS: dict[str, VariedFactor] = {
-    "order": VariedFactor(
-        "order of the spline [-]", (3, 5, 11), lambda s, v: s.correlated(order=v),
-        lambda s: s.correlation.order, whole=True,
+    "order": VariedFactor.option(
+        "order of the spline [-]", "correlation.order", (3, 5, 11), whole=True
     ),
     "gradient": VariedFactor.choice(
         "gradient that weighs the residual", "gradient", ("deformed", "reference")
@@ -175,49 +158,39 @@ FACTORS: dict[str, VariedFactor] = {
     ),
     "contrast": VariedFactor(
         "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
-        _contrast,
-        lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
+        _contrast, lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
     ),
-    "blur": VariedFactor(
-        "blur of the speckle [px]", (1.5, 2.0, 3.0, 4.0, 6.0), lambda s, v: s.speckled(blur_px=v),
-        lambda s: s.imaging.speckle.blur_px,
+    "blur": VariedFactor.option(
+        "blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3.0, 4.0, 6.0)
     ),
     "bits": VariedFactor(
         "bits of camera images [-]", (4, 6, 8, 10, 12),
-        lambda s, v: s.imaged(bits=v).correlated(camera=True),
+        lambda s, v: _by_camera(changed(s, "imaging", bits=v)),
         lambda s: _camera(s, s.imaging.bits), whole=True,
     ),
-    "fill_factor": VariedFactor(
-        "fill factor of the sensor [-]", (0.0, 0.25, 0.5, 0.75, 1.0),
-        lambda s, v: s.sensed(fill_factor=v), lambda s: s.imaging.sensor.fill_factor,
+    "fill_factor": VariedFactor.option(
+        "fill factor of the sensor [-]", "imaging.sensor.fill_factor", (0.0, 0.25, 0.5, 0.75, 1.0)
     ),
-    "pixel_size": VariedFactor(
-        "pixel [mm]", (0.01, 0.014, 0.02, 0.028, 0.04), lambda s, v: s.imaged(pixel_size=v),
-        lambda s: s.imaging.pixel_size,
+    "pixel_size": VariedFactor.option(
+        "pixel [mm]", "imaging.pixel_size", (0.01, 0.014, 0.02, 0.028, 0.04)
     ),
-    "v0_degree": VariedFactor(
-        "degree of v0 [-]", (2, 3, 4, 5, 6, 7, 8), lambda s, v: s.correlated(v0_degree=v),
-        lambda s: s.correlation.v0_degree, whole=True,
+    "v0_degree": VariedFactor.option(
+        "degree of v0 [-]", "correlation.v0_degree", (2, 3, 4, 5, 6, 7, 8), whole=True
     ),
-    "v_degree": VariedFactor(
-        "degree of v1 [-]", (2, 3, 4, 5, 6, 7, 8), lambda s, v: s.correlated(v_degree=v),
-        lambda s: s.correlation.v_degree, whole=True,
+    "v_degree": VariedFactor.option(
+        "degree of v1 [-]", "correlation.v_degree", (2, 3, 4, 5, 6, 7, 8), whole=True
     ),
-    "taper": VariedFactor(
-        "width of the mode's taper [unit cells]", (0.125, 0.25, 0.5, 0.75, 1.0),
-        lambda s, v: replace(s, taper=v), lambda s: s.taper,
+    "taper": VariedFactor.option(
+        "width of the mode's taper [unit cells]", "taper", (0.125, 0.25, 0.5, 0.75, 1.0)
     ),
-    "edge_px": VariedFactor(
-        "pixels left out at edges [px]", (0, 1, 2, 3, 5, 8), lambda s, v: s.correlated(edge_px=v),
-        lambda s: s.correlation.edge_px, whole=True,
+    "edge_px": VariedFactor.option(
+        "pixels left out at edges [px]", "correlation.edge_px", (0, 1, 2, 3, 5, 8), whole=True
     ),
 }  # fmt: skip
 """By the names that a study uses."""
 
 
 BASE = "base"
-
-
 ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 
 
@@ -260,22 +233,10 @@ class SystematicAnalysis:
 class SystematicStudy(Study[SystematicAnalysis]):
     """Correlate exact images with one option changed at a time.
 
-    Parameters
-    ----------
-    strain
-        Of the deformed image [-].
-    factors
-        What to change: names in :data:`modeharvest.validation.studies.systematic.FACTORS`.
-    levels
-        Other levels than a factor's own, by its name: numbers, or names where it has names.
-    seeds_of_speckle
-        Every level is measured on each of these speckles.
-
-    Raises
-    ------
-    InputError
-        If a factor is unknown, levels are given for one that is not asked for, or a value comes
-        twice.
+    ``factors``: what to change, names in :data:`FACTORS`; ``levels``: other levels than a factor's
+    own, by its name, numbers or names where it has names; ``seeds_of_speckle``: every level is
+    measured on each of these speckles. InputError if a factor is unknown, levels are given for one
+    that is not asked for, or a value comes twice.
     """
 
     question: ClassVar[str] = (
@@ -307,12 +268,12 @@ class SystematicStudy(Study[SystematicAnalysis]):
                 "study: expected at least one seed of a speckle, of 0 or more, got "
                 f"{list(self.seeds_of_speckle)}"
             )
-        require_different("factors", self.factors)
-        require_different("seeds_of_speckle", self.seeds_of_speckle)
+        self.require_different("factors", self.factors)
+        self.require_different("seeds_of_speckle", self.seeds_of_speckle)
         for name, levels in self.levels.items():
             if not levels:
                 raise InputError(f"study: expected at least one level of {name}, got none")
-            require_different(f"levels of {name}", self._levels(name))
+            self.require_different(f"levels of {name}", self._levels(name))
 
     @property
     def seeds(self) -> str:
@@ -325,30 +286,25 @@ class SystematicStudy(Study[SystematicAnalysis]):
         levels = {}
         for name in self.factors:
             own = self._levels(name)
-            some = {0, len(own) // 2, len(own) - 1}
-            levels[name] = tuple(own[k] for k in sorted(some))
+            levels[name] = tuple(own[k] for k in sorted({0, len(own) // 2, len(own) - 1}))
         return replace(self, levels=levels, seeds_of_speckle=self.seeds_of_speckle[:1])
 
     def prepare(
         self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
     ) -> tuple[Case, ...]:
-        """Make the base's images, which many cases share; the others are made case by case.
-
-        Raises
-        ------
-        InputError
-            If a level is out of its range.
-        """
+        """Make the base's images, which many cases share; the others are made case by case."""
         cases = []
         for seed in self.seeds_of_speckle:
-            base = StudySetting(spec.imaging, spec.correlation).speckled(seed=seed)
+            setting = StudySetting(spec.imaging, spec.correlation)
+            base = changed(setting, "imaging.speckle", seed=seed)
             own = _described(spec, folder, self.strain, base)
             images = VirtualImagePair.open(folder, own, progress).images.folder
             cases.append({"factor": BASE, "level": 0.0, "seed": seed, "images": own, "keep": True})
             for name in self.factors:
                 for level in self._levels(name):
-                    setting = FACTORS[name].set(base, level)
-                    described = _described(spec, folder, self.strain, setting)
+                    described = _described(
+                        spec, folder, self.strain, FACTORS[name].set(base, level)
+                    )
                     if described != own:
                         shared = VirtualImagePair.images_folder(folder, described) == images
                         cases.append({"factor": name, "level": float(level), "seed": seed,
@@ -375,14 +331,14 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
 def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
     """Errors in pixels of one size: a ligament shows how large a level's own are."""
-    at_base = done.loc[done["factor"] == "base", "pixels_per_ligament"].mean()
+    at_base = done.loc[done["factor"] == BASE, "pixels_per_ligament"].mean()
     factor = at_base / done["pixels_per_ligament"]
     return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
 
 
 def _moved(done: pd.DataFrame) -> pd.Series:
     """Rms per component of a measurement's difference from the base's on the same speckle [mm]."""
-    base = done[done["factor"] == "base"].set_index("seed")["at_junctions_mm"]
+    base = done[done["factor"] == BASE].set_index("seed")["at_junctions_mm"]
 
     def moved(row: pd.Series) -> float:
         if row["seed"] not in base.index:
@@ -397,12 +353,8 @@ def _described(spec: ImagePairSpec, folder: Path, strain: float, setting: StudyS
     return spec.describe(folder, strain, setting.imaging, setting.correlation, setting.taper)
 
 
-def one_level(case: Mapping[str, Any], folder: Path) -> LevelResult:
-    """Image, correlate and set against the truth.
-
-    ``case``: one of :meth:`SystematicStudy.prepare`, ``folder``: the study's. Images that no
-    other case needs are removed again.
-    """
+def one_level(case: Case, folder: Path) -> LevelResult:
+    """Image, correlate and set against the truth; images that no other case needs are removed."""
     pair = VirtualImagePair.open(folder, case["images"])
     try:
         return _result_of(pair)
@@ -432,9 +384,7 @@ def _at_junctions(pair: VirtualImagePair, result: Result) -> FloatArray:
     specimen = pair.specimen
     x, y = (
         distance * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
-        for distance, count in (
-            (specimen.pitch, specimen.holes_x),
-            (specimen.row_distance, specimen.holes_y),
-        )
-    )
+        for distance, count in ((specimen.pitch, specimen.holes_x),
+                                (specimen.row_distance, specimen.holes_y))
+    )  # fmt: skip
     return pair.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)

@@ -38,7 +38,6 @@ from modeharvest.validation.studies.modes import (
     deviations,
     standardised_errors,
 )
-from modeharvest.validation.studies.modes_specimen import specimen_folder
 
 _BUCKLING = {
     "smallest_ratio": "d/l from", "largest_ratio": "to", "first": "buckles first into",
@@ -496,7 +495,7 @@ def _pattern_card(name: str, title: str, rows: pd.DataFrame, folder: Path) -> Ca
     for _, row in rows.iterrows():
         is_size = row["varied"] in ("base", "d/l")
         text = f"d/l = {row['ratio']:.3g}" if is_size else f"{row['varied']} {row['level']}"
-        shown[text] = SpecimenPatterns.read(specimen_folder(folder, row["specimen"]))
+        shown[text] = SpecimenPatterns.read(folder / "specimens" / row["specimen"])
     caption = (
         "The component across the load, in shares of l, on the specimens as they are deformed. v₀ "
         "is the best fit’s. The colours of the error, below, are finer."

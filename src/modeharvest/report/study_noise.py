@@ -107,7 +107,7 @@ def causes_table(levels: Levels, noise_free: NoiseFreeCase) -> pd.DataFrame:
     first = levels[min(levels)]
     rows = []
     for cause in CAUSES:
-        predicted = noise_free.predicted(cause).parts()
+        predicted = noise_free.predicted(cause)
         row: dict[str, Any] = {"what": CAUSE_LABELS[cause]}
         for name in PARTS:
             counted = first[name].counted
@@ -349,7 +349,7 @@ def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
     """The findings of an analysis; ``seeds`` in words."""
     levels, ours, row = found.by_bound, found.by_least, found.noise_free.row
     shown = sorted(levels)[len(levels) // 2]
-    summary = summary_table(levels, ours, found.by_hessian, found.pair)
+    summary = summary_table(levels, ours, found.by_hessian, found.points.pair)
     causes = causes_table(levels, found.noise_free)
     parts = ("w_px", "model_error_px", "measurement_error_px")
     return Findings(
@@ -361,7 +361,7 @@ def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
             "not_converged": found.not_converged,
         },
         sentences=(
-            *_level_sentences(levels, ours, found.pair),
+            *_level_sentences(levels, ours, found.points.pair),
             _cause_sentence(causes),
             *_other_sentences(found),
         ),
@@ -373,7 +373,7 @@ def noise_findings(found: NoiseAnalysis, seeds: str) -> Findings:
         ],
         attachments=[
             ReportTable.of("Noise levels", summary),
-            ReportTable.of("Each unknown", unknowns_table(levels, ours, found.pair)),
+            ReportTable.of("Each unknown", unknowns_table(levels, ours, found.points.pair)),
             ReportTable.of("Maps", maps_table(levels, ours, found.points)),
         ],
     )
