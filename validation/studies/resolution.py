@@ -229,8 +229,8 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
             )
         if self.pattern == 0.0 or not 2 <= self.realisations <= self.most or self.seed < 0:
             raise InputError(
-                f"study: expected a pattern that is not 0 mm, 2 to {self.most} realisations and a seed "
-                f"of 0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
+                f"study: expected a pattern that is not 0 mm, 2 to {self.most} realisations and a "
+                f"seed of 0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
             )
 
     @property

@@ -165,8 +165,8 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         counts_fit = 1 <= self.initial_guesses <= self.most and 0 <= self.per_radius <= self.most
         if not counts_fit or self.seed < 0:
             raise InputError(
-                f"study: expected 1 to {self.most} initial guesses, per_radius and seed from 0 on, got "
-                f"{self.initial_guesses}, {self.per_radius} and {self.seed}"
+                f"study: expected 1 to {self.most} initial guesses, per_radius and seed from 0 on, "
+                f"got {self.initial_guesses}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
             raise InputError(
