@@ -124,28 +124,18 @@ class PartFields:
         return self.v0 + self.v1
 
 
-@dataclass(frozen=True, eq=False)
-class TangentFit:
-    """An ansatz with one mode near some unknowns.
-
-    ``points``: (m, 2) of the material that the fit counts [mm].
-    """
-
-    ansatz: Ansatz
-    unknowns: FloatArray
-    points: FloatArray
-
-    def fit(self, waves: FloatArray) -> PartFields:
-        """The best fits of waves (m, 2, k) at the points [mm]."""
-        x, y = self.points.T
-        S = self.ansatz.sensitivities(self.unknowns, x[:, None], y[:, None])[:, 0]
-        flat = S.reshape(-1, self.ansatz.size)
-        scale = np.sqrt((flat**2).sum(axis=0))
-        q, r = np.linalg.qr(flat / scale)
-        step = np.linalg.solve(r, q.T @ waves.reshape(len(flat), -1)) / scale[:, None]
-        slow = 2 * self.ansatz.v0_space.size
-        v0, v1 = S[..., :slow] @ step[:slow], S[..., slow:] @ step[slow:]
-        return PartFields(v0, v1)
+def tangent_fit(
+    ansatz: Ansatz, unknowns: FloatArray, points: FloatArray, waves: FloatArray
+) -> PartFields:
+    """The best fits of waves (m, 2, k) by an ansatz near some unknowns, at points (m, 2) [mm]."""
+    x, y = points.T
+    S = ansatz.sensitivities(unknowns, x[:, None], y[:, None])[:, 0]
+    flat = S.reshape(-1, ansatz.size)
+    scale = np.sqrt((flat**2).sum(axis=0))
+    q, r = np.linalg.qr(flat / scale)
+    step = np.linalg.solve(r, q.T @ waves.reshape(len(flat), -1)) / scale[:, None]
+    slow = 2 * ansatz.v0_space.size
+    return PartFields(S[..., :slow] @ step[:slow], S[..., slow:] @ step[slow:])
 
 
 def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
@@ -183,8 +173,8 @@ class TransferCurves:
         )  # fmt: skip
         for n, degree in enumerate(degrees):
             progress(n, len(degrees), "resolution: best fits")
-            start = spec.start(degree, "buckled")
-            fit = TangentFit(spec.ansatz(degree, "buckled"), start, points).fit(waves)
+            ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
+            fit = tangent_fit(ansatz, start, points, waves)
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
                 for found, among in ((own, getattr(fit, part)), (whole, fit.whole)):
@@ -208,12 +198,12 @@ class TransferCurves:
 
     def cross_talk(self) -> tuple[float, float]:
         """Largest share of a wave of one part found in the other: at any period, from l10 on."""
-        everywhere, resolved = [], []
+        everywhere = resolved = 0.0
         for key, own in self.own.items():
             other = np.abs(self.whole[key] - own)
-            everywhere.append(other.max())
-            resolved.append(other[self.periods >= self.finest(*key)].max())
-        return float(max(everywhere)), float(max(resolved))
+            everywhere = max(everywhere, float(other.max()))
+            resolved = max(resolved, float(other[self.periods >= self.finest(*key)].max()))
+        return everywhere, resolved
 
 
 def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
@@ -242,13 +232,14 @@ class Passband:
     def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
         """At one degree of v0 and v1."""
         points = spec.points
-        fit = TangentFit(spec.ansatz(degree, "buckled"), spec.start(degree, "buckled"), points)
+        ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
         stretch = np.concatenate([np.linspace(0.05, 0.8, 26), np.linspace(0.82, 1.3, 33)])
         waves = np.stack([_stretched(spec, s, points) for s in stretch], axis=-1)
         itself, error = np.full((2, stretch.size), np.nan)
         for k in np.flatnonzero(np.abs(stretch - 1.0) <= 0.18):
             itself[k], error[k] = _refitted(spec, degree, float(stretch[k]))
-        return cls(stretch, wave_share(fit.fit(waves).whole, waves), itself, error)
+        added = wave_share(tangent_fit(ansatz, start, points, waves).whole, waves)
+        return cls(stretch, added, itself, error)
 
     @property
     def retuned(self) -> float:
