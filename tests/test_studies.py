@@ -37,13 +37,8 @@ from modeharvest.validation.studies.robustness import (
     RobustnessStudy,
     one_start,
 )
-from modeharvest.validation.studies.study import ImagePairSpec, VirtualImagePair
-from modeharvest.validation.studies.systematic import (
-    FACTORS,
-    StudySetting,
-    SystematicStudy,
-    one_level,
-)
+from modeharvest.validation.studies.study import ImagePairSpec, StudySetting, VirtualImagePair
+from modeharvest.validation.studies.systematic import FACTORS, SystematicStudy, one_level
 from modeharvest.validation.workers import run_case, store
 
 PAPER = shipped_solution("paper-virtual")

@@ -27,11 +27,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.lattice_pattern import STUDIED_MATERIALS
-from modeharvest.validation.studies.modes_specimen import (
-    LatticeMode,
-    SpecimenSpec,
-    buckle,
-)
+from modeharvest.validation.studies.modes_specimen import LatticeMode, SpecimenSpec, buckle
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.truth import Comparison
 from modeharvest.validation.workers import Case

@@ -38,8 +38,22 @@ from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.truth import Comparison, compare
 from modeharvest.validation.workers import Case, leave
 
-PAPERS_TAPER = 0.5
-"""Width over which a mode fades out beside the cellular part [unit cells]."""
+
+@dataclass(frozen=True)
+class StudySetting:
+    """How a pair is imaged and correlated.
+
+    ``taper``: width over which the mode fades out beside the cellular part [unit cells]; InputError
+    if it has none.
+    """
+
+    imaging: ImagingSpec
+    correlation: SquareLatticeOptions
+    taper: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.taper > 0.0:
+            raise InputError(f"study: expected a taper wider than 0 unit cells, got {self.taper}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,52 +81,42 @@ class ImagePairSpec:
         """The exact displacements."""
         return self.load()
 
-    def describe(
-        self,
-        folder: Path,
-        strain: float,
-        imaging: ImagingSpec | None = None,
-        correlation: SquareLatticeOptions | None = None,
-        taper: float = PAPERS_TAPER,
-    ) -> str:
+    @property
+    def setting(self) -> StudySetting:
+        """How it is imaged and correlated unless a study says otherwise."""
+        return StudySetting(self.imaging, self.correlation)
+
+    def describe(self, folder: Path, strain: float, setting: StudySetting | None = None) -> str:
         """Leave in a study's folder what a worker needs to open a pair; returns the pair's name.
 
         ``strain``: of the deformed image [-], an InputError if the solution has no snapshot there;
-        ``imaging``, ``correlation``: instead of the specification's own; ``taper``: width over
-        which the mode fades out [unit cells].
+        ``setting``: instead of the specification's own.
         """
         have = sorted({s.nominal_strain for s in self.solution.snapshots})
         if not any(abs(strain - e) < 1e-9 for e in have):
             raise InputError(
                 f"study: expected a strain among {have}, which the solution has, got {strain}"
             )
-        spec = imaging or self.imaging
+        setting = setting or self.setting
         if not (folder / "solution.h5").is_file():
             self.solution.write(folder / "solution.h5")
         description = {
-            "images": image_key(self.solution, spec, (strain,))[:16],
+            "images": image_key(self.solution, setting.imaging, (strain,))[:16],
             "strain": strain,
-            "imaging": spec,
-            "specimen": self.experiment.specimen.plain(),
-            "correlation": correlation or self.correlation,
-            "taper": taper,
+            "specimen": self.experiment.specimen,
+            "setting": setting,
         }
         return leave(to_plain(description), folder, "subjects/{}.json")
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualImagePair:
-    """A pair of images and how to correlate it: what a worker keeps between cases.
-
-    ``strain``: of the deformed image [-]; ``options``: of the correlation; ``taper``: width over
-    which the mode fades out [unit cells].
-    """
+    """A pair of images and how to correlate it; ``strain``: of the deformed image [-]."""
 
     images: ImageSet
     strain: float
     specimen: Specimen
-    options: SquareLatticeOptions
-    taper: float = PAPERS_TAPER
+    setting: StudySetting
 
     @classmethod
     def open(cls, folder: Path, name: str, progress: Progress = silent) -> VirtualImagePair:
@@ -122,13 +126,23 @@ class VirtualImagePair:
         there is no such pair, or the folder's solution is not the one it is of.
         """
         described = _description(folder, name)
-        return cls(
-            _image_set(folder, described, progress),
-            float(described["strain"]),
-            made(Specimen, described["specimen"]),
-            made(SquareLatticeOptions, described["correlation"]),
-            float(described["taper"]),
-        )
+        strain, specimen = float(described["strain"]), made(Specimen, described["specimen"])
+        setting = made(StudySetting, described["setting"])
+        own = folder / "images" / described["images"]
+        try:
+            images = ImageSet.read(own)
+            if images.is_whole():
+                return cls(images, strain, specimen, setting)
+        except InputError:
+            pass
+        solution = Solution.read(folder / "solution.h5")
+        if image_key(solution, setting.imaging, (strain,))[:16] != described["images"]:
+            raise InputError(
+                f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
+                "take another folder for another experiment"
+            )
+        images = make_images(solution, setting.imaging, own, (strain,), progress)
+        return cls(images, strain, specimen, setting)
 
     @staticmethod
     def images_folder(folder: Path, name: str) -> Path:
@@ -140,11 +154,16 @@ class VirtualImagePair:
         shutil.rmtree(self.images.folder, ignore_errors=True)
 
     @property
+    def options(self) -> SquareLatticeOptions:
+        """Of the correlation."""
+        return self.setting.correlation
+
+    @property
     def ansatz(self) -> Ansatz:
         """The paper's, on this specimen."""
         usual = self.options.ansatz(self.specimen)
         (mode,) = usual.modes
-        taper = replace(mode.taper, width=self.taper * self.specimen.pitch)
+        taper = replace(mode.taper, width=self.setting.taper * self.specimen.pitch)
         return replace(usual, modes=(replace(mode, taper=taper),))
 
     def initial_guess(self) -> FloatArray:
@@ -182,25 +201,6 @@ def noisy(pair: ImagePair, level: float, rng: np.random.Generator, sign: float =
 
 def _description(folder: Path, name: str) -> dict[str, Any]:
     return dict(read_json(folder / "subjects" / f"{name}.json"))
-
-
-def _image_set(folder: Path, described: dict[str, Any], progress: Progress) -> ImageSet:
-    """The images of a pair, made if they are not there."""
-    own = folder / "images" / described["images"]
-    try:
-        images = ImageSet.read(own)
-        if images.is_whole():
-            return images
-    except InputError:
-        pass
-    solution, strain = Solution.read(folder / "solution.h5"), float(described["strain"])
-    spec = made(ImagingSpec, described["imaging"])
-    if image_key(solution, spec, (strain,))[:16] != described["images"]:
-        raise InputError(
-            f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
-            "take another folder for another experiment"
-        )
-    return make_images(solution, spec, own, (strain,), progress)
 
 
 @lru_cache(maxsize=1)

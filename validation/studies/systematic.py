@@ -12,15 +12,13 @@ import numpy as np
 import pandas as pd
 
 from modeharvest.idic.result import Result
-from modeharvest.idic.setup import SquareLatticeOptions
-from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.study import (
-    PAPERS_TAPER,
     ImagePairSpec,
     Study,
+    StudySetting,
     VirtualImagePair,
 )
 from modeharvest.validation.workers import Case
@@ -35,22 +33,6 @@ def changed(thing: T, options: str, **values: Any) -> T:
         values = {name: changed(getattr(thing, name), rest, **values)}
     other: T = replace(thing, **values)  # type: ignore[type-var]
     return other
-
-
-@dataclass(frozen=True)
-class StudySetting:
-    """How a pair is imaged and correlated.
-
-    ``taper``: width over which the mode fades out [unit cells]; InputError if it has none.
-    """
-
-    imaging: ImagingSpec
-    correlation: SquareLatticeOptions
-    taper: float = PAPERS_TAPER
-
-    def __post_init__(self) -> None:
-        if not self.taper > 0.0:
-            raise InputError(f"study: expected a taper wider than 0 unit cells, got {self.taper}")
 
 
 @dataclass(frozen=True)
@@ -83,15 +65,12 @@ class VariedFactor:
     @classmethod
     def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
         """One of several names of an option of the correlation, or none: left to the images."""
-
-        def base(setting: StudySetting) -> int | None:
-            chosen = getattr(setting.correlation, option)
-            return None if chosen is None else names.index(chosen)
-
-        def change(setting: StudySetting, level: int) -> StudySetting:
-            return changed(setting, "correlation", **{option: names[level]})
-
-        return cls(label, tuple(range(len(names))), change, base, whole=True, names=names)
+        numbers = {name: number for number, name in enumerate(names)}
+        return cls(
+            label, tuple(numbers.values()),
+            lambda s, v: changed(s, "correlation", **{option: names[v]}),
+            lambda s: numbers.get(getattr(s.correlation, option)), whole=True, names=names,
+        )  # fmt: skip
 
     def number(self, level: float | str) -> float:
         """A level as a number; InputError if there is no such name."""
@@ -295,16 +274,14 @@ class SystematicStudy(Study[SystematicAnalysis]):
         """Make the base's images, which many cases share; the others are made case by case."""
         cases = []
         for seed in self.seeds_of_speckle:
-            setting = StudySetting(spec.imaging, spec.correlation)
-            base = changed(setting, "imaging.speckle", seed=seed)
-            own = _described(spec, folder, self.strain, base)
+            base = changed(spec.setting, "imaging.speckle", seed=seed)
+            own = spec.describe(folder, self.strain, base)
             images = VirtualImagePair.open(folder, own, progress).images.folder
             cases.append({"factor": BASE, "level": 0.0, "seed": seed, "images": own, "keep": True})
             for name in self.factors:
                 for level in self._levels(name):
-                    described = _described(
-                        spec, folder, self.strain, FACTORS[name].set(base, level)
-                    )
+                    setting = FACTORS[name].set(base, level)
+                    described = spec.describe(folder, self.strain, setting)
                     if described != own:
                         shared = VirtualImagePair.images_folder(folder, described) == images
                         cases.append({"factor": name, "level": float(level), "seed": seed,
@@ -317,8 +294,7 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> SystematicAnalysis:
         """Errors in pixels of the base, and how far each level moves the measurement."""
-        pair = VirtualImagePair.open(folder, table["images"].iloc[0])
-        setting = StudySetting(pair.images.spec, pair.options, pair.taper)
+        setting = VirtualImagePair.open(folder, table["images"].iloc[0]).setting
         done = table[table["error"] == ""]
         base = done[done["factor"] == BASE]
         rows = _in_base_pixels(done).assign(moved=_moved(done) / setting.imaging.pixel_size)
@@ -349,34 +325,27 @@ def _moved(done: pd.DataFrame) -> pd.Series:
     return done.apply(moved, axis=1)
 
 
-def _described(spec: ImagePairSpec, folder: Path, strain: float, setting: StudySetting) -> str:
-    return spec.describe(folder, strain, setting.imaging, setting.correlation, setting.taper)
-
-
 def one_level(case: Case, folder: Path) -> LevelResult:
     """Image, correlate and set against the truth; images that no other case needs are removed."""
     pair = VirtualImagePair.open(folder, case["images"])
+    specimen = pair.specimen
+    ligament = specimen.largest_diameter - specimen.diameter
     try:
-        return _result_of(pair)
+        result = pair.correlate()
+        comparison = pair.compare(result)
+        return LevelResult(
+            **asdict(comparison.error_parts()),
+            v1_percent=comparison.v1_percent(specimen),
+            outcome=result.outcome.value,
+            iterations=result.iterations,
+            residual=result.residual_rms,
+            pixels=result.pixels,
+            pixels_per_ligament=ligament / pair.images.grid.pixel_size,
+            at_junctions_mm=_at_junctions(pair, result).ravel().tolist(),
+        )
     finally:
         if not case["keep"]:
             pair.discard()
-
-
-def _result_of(pair: VirtualImagePair) -> LevelResult:
-    result, specimen = pair.correlate(), pair.specimen
-    comparison = pair.compare(result)
-    ligament = specimen.largest_diameter - specimen.diameter
-    return LevelResult(
-        **asdict(comparison.error_parts()),
-        v1_percent=comparison.v1_percent(specimen),
-        outcome=result.outcome.value,
-        iterations=result.iterations,
-        residual=result.residual_rms,
-        pixels=result.pixels,
-        pixels_per_ligament=ligament / pair.images.grid.pixel_size,
-        at_junctions_mm=_at_junctions(pair, result).ravel().tolist(),
-    )
 
 
 def _at_junctions(pair: VirtualImagePair, result: Result) -> FloatArray:
