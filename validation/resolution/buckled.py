@@ -243,10 +243,13 @@ class BuckledMotion:
         material = self.material(point[..., 0], point[..., 1])
         near = ndimage.binary_dilation(material, iterations=_AROUND_PX)
         at, point = at[near], point[near]
-        for _ in range(_NEWTON_STEPS):
-            slope = np.asarray(np.linalg.inv(self._gradient(point)), dtype=np.float64)
-            error = point + self.displacement(point) - at
-            point = point - (slope @ error[..., None])[..., 0]
+        h = 1e-5 * self.pixel_size
+        for _ in range(_NEWTON_STEPS):  # dx/dX by forward differences
+            u = self.displacement(point)
+            ahead = [(self.displacement(point + h * e) - u) / h for e in np.eye(2)]
+            gradient = np.eye(2) + np.stack(ahead, axis=-1)
+            slope = np.asarray(np.linalg.inv(gradient), dtype=np.float64)
+            point = point - (slope @ (point + u - at)[..., None])[..., 0]
         found = InverseMotion(near, at, point, slope)
         return replace(found, points=self._improved(found, None))
 
@@ -262,9 +265,3 @@ class BuckledMotion:
             "study: expected a motion that can be inverted, got one that folds the specimen; take "
             "a smaller strain, pattern or wave"
         )
-
-    def _gradient(self, point: FloatArray) -> FloatArray:
-        """(..., 2, 2) dx/dX of the base, by forward differences."""
-        here, h = self.displacement(point), 1e-5 * self.pixel_size
-        ahead = [(self.displacement(point + h * e) - here) / h for e in np.eye(2)]
-        return np.asarray(np.eye(2) + np.stack(ahead, axis=-1))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.covariance import field_errors
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.study import VirtualImagePair
 
@@ -36,7 +36,7 @@ class FieldPoints:
     pair: VirtualImagePair
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
-    inside: NDArray[np.bool_]
+    inside: BoolArray
 
     @classmethod
     def of(cls, pair: VirtualImagePair) -> FieldPoints:
@@ -57,7 +57,7 @@ class FieldPoints:
         return np.asarray(self.pair.images.grid.y[self.rows[np.nonzero(self.inside)[0]]])
 
     @property
-    def cellular(self) -> NDArray[np.bool_]:
+    def cellular(self) -> BoolArray:
         """(points,) True in the part with holes: elsewhere v1 says little or nothing."""
         a, b = self.pair.specimen.cellular_half_size
         return np.asarray((np.abs(self.x) <= a) & (np.abs(self.y) <= b))
@@ -117,7 +117,7 @@ class PairedErrors:
     bound: FloatArray
 
     @property
-    def counted(self) -> NDArray[np.bool_]:
+    def counted(self) -> BoolArray:
         """(...): True where there is something to be off."""
         return np.asarray(self.bound > 0.0)
 
@@ -128,7 +128,7 @@ class PairedErrors:
         scaled = kept.errors / kept.bound, kept.predicted / kept.bound
         return PairedErrors(*scaled, np.ones_like(kept.bound))
 
-    def of(self, part: NDArray[np.bool_]) -> PairedErrors:
+    def of(self, part: BoolArray) -> PairedErrors:
         """Some of the quantities: those where ``part``, of the bound's shape, is True."""
         return PairedErrors(self.errors[:, :, part], self.predicted[:, :, part], self.bound[part])
 
@@ -136,28 +136,24 @@ class PairedErrors:
         """The same errors, bound and error bars ``factor`` (...) as large."""
         return PairedErrors(self.errors, factor * self.predicted, factor * self.bound)
 
-    # -- each quantity by itself; NaN for what does not count ---------------------------------
-
     @property
     def ratios(self) -> FloatArray:
-        """(...): rms error over bound [-]."""
+        """(...): rms error over bound, each by itself [-]; NaN for what does not count."""
         return self._over_bound(np.sqrt((self.errors**2).mean(axis=(0, 1))))
 
     @property
     def biases(self) -> FloatArray:
-        """(...): mean error over bound [-]."""
+        """(...): mean error over bound, likewise [-]."""
         return self._over_bound(self.errors.mean(axis=(0, 1)))
 
     @property
     def covered(self) -> FloatArray:
-        """(...): share of the 95 % intervals that contain the truth [-]."""
+        """(...): share of the 95 % intervals that contain the truth, likewise [-]."""
         return np.asarray(np.where(self.counted, self._inside.mean(axis=(0, 1)), np.nan))
-
-    # -- all that count together --------------------------------------------------------------
 
     @property
     def rms_bound(self) -> float:
-        """Rms of the bound."""
+        """Rms of the bound; as all that follows, of what counts."""
         return float(np.sqrt((self.bound[self.counted] ** 2).mean()))
 
     @property
@@ -184,13 +180,16 @@ class PairedErrors:
         return Estimate(float(shares.mean()), float(shares.std(ddof=1) / np.sqrt(len(shares))))
 
     def _over_bound(self, values: FloatArray) -> FloatArray:
-        return np.asarray(
-            np.divide(values, self.bound, out=np.full(values.shape, np.nan), where=self.counted)
-        )
+        return _divided(values, self.bound, self.counted, np.nan)
 
     @property
     def _inside(self) -> FloatArray:
         return np.asarray(np.abs(self.errors) < _NORMAL_95 * self.predicted, dtype=np.float64)
+
+
+def _divided(a: FloatArray, by: FloatArray, where: BoolArray, otherwise: float) -> FloatArray:
+    """(...) quotients where it is said, and elsewhere a number."""
+    return np.asarray(np.divide(a, by, out=np.full(a.shape, otherwise), where=where))
 
 
 Levels = Mapping[float, Mapping[str, PairedErrors]]
@@ -235,15 +234,6 @@ class NoiseFreeCase:
         flat = np.array(self.row["predicted"][COVARIANCES.index(cause)], dtype=np.float64)
         return _predictions(flat, len(self.row["unknowns"]))
 
-    def factors(self, cause: str) -> dict[str, FloatArray]:
-        """How much larger than the bound they are: 1 where there is none."""
-        bounds, found = self.predicted("bound"), {}
-        for name, sd in self.predicted(cause).items():
-            bound = bounds[name]
-            known = np.isfinite(bound) & (bound > 0.0)
-            found[name] = np.divide(sd, bound, out=np.ones_like(bound), where=known)
-        return found
-
 
 def read_levels(table: pd.DataFrame, noise_free: NoiseFreeCase, points: FieldPoints) -> Levels:
     """All realisations' errors and their bound 2 s²M⁻¹; InputError without two whole pairs."""
@@ -280,7 +270,10 @@ def _read_level(
 
 def against_bound(levels: Levels, noise_free: NoiseFreeCase, cause: str) -> Levels:
     """Set the same errors against another bound, and error bars by the same cause."""
-    factors = noise_free.factors(cause)
+    bounds, factors = noise_free.predicted("bound"), {}
+    for name, sd in noise_free.predicted(cause).items():
+        known = np.isfinite(bounds[name]) & (bounds[name] > 0.0)
+        factors[name] = _divided(sd, bounds[name], known, 1.0)
     return {
         level: {name: pairs.against(factors[name]) for name, pairs in parts.items()}
         for level, parts in levels.items()
@@ -312,12 +305,9 @@ class NoiseAnalysis:
         levels = read_levels(table, noise_free, points)
         done = table[table["error"] == ""]
         sd = done[done["curvature_sd_mm"].notna()].set_index("level")["curvature_sd_mm"]
-        return cls(
-            points,
-            noise_free,
-            levels,
-            against_bound(levels, noise_free, "least"),
-            against_bound(levels, noise_free, HESSIAN_CORRECTED),
-            {float(level): float(sd[level] / sd[0.0]) for level in sd.index if level},
-            int((done["outcome"] != "converged").sum()),
+        by_least, by_hessian = (
+            against_bound(levels, noise_free, cause) for cause in ("least", HESSIAN_CORRECTED)
         )
+        ratios = {float(level): float(sd[level] / sd[0.0]) for level in sd.index if level}
+        lost = int((done["outcome"] != "converged").sum())
+        return cls(points, noise_free, levels, by_least, by_hessian, ratios, lost)

@@ -82,23 +82,17 @@ class GuessStatistics:
         epsilon = guesses["epsilon_percent"].dropna()
         outliers = epsilon > OUTLIER_PERCENT
         others = guesses[~same & (guesses["error"] == "")]
+        largest = (
+            float(distances.max())
+            for distances in (guesses["distance_px"], guesses.loc[same, "distance_px"],
+                              guesses["start_distance_px"])
+        )  # fmt: skip
         return cls(
-            success.count,
-            radius,
-            success.good,
-            success.value,
-            success.interval,
-            float(epsilon.mean()),
-            float(epsilon.max()),
-            float(epsilon[~outliers].mean()),
-            int(outliers.sum()),
-            float(guesses["distance_px"].max()),
-            float(guesses.loc[same, "distance_px"].max()),
-            float(guesses["start_distance_px"].max()),
-            int((others["outcome"] == "converged").sum()),
-            int((guesses["error"] != "").sum()),
-            PUBLISHED,
-        )
+            success.count, radius, success.good, success.value, success.interval,
+            float(epsilon.mean()), float(epsilon.max()), float(epsilon[~outliers].mean()),
+            int(outliers.sum()), *largest, int((others["outcome"] == "converged").sum()),
+            int((guesses["error"] != "").sum()), PUBLISHED,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,14 +218,10 @@ def one_start(case: Case, folder: Path) -> GuessResult:
     result = pair.correlate(guess)
     found, size = _field(pair, result.unknowns), _rms(reference)
     return GuessResult(
-        _rms(found - reference),
-        _rms(_field(pair, guess) - reference),
-        100.0 * abs(size - _rms(found)) / size,
-        result.outcome.value,
-        result.iterations,
-        len(result.history),
-        result.residual_rms,
-    )
+        _rms(found - reference), _rms(_field(pair, guess) - reference),
+        100.0 * abs(size - _rms(found)) / size, result.outcome.value, result.iterations,
+        len(result.history), result.residual_rms,
+    )  # fmt: skip
 
 
 def _perturbed_guess(pair: VirtualImagePair, case: Case) -> FloatArray:
