@@ -25,16 +25,8 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, require_writable
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import exclusive, source_digest
-from modeharvest.validation.workers import (
-    Case,
-    Workers,
-    named,
-    read_result,
-    result_path,
-    run_case,
-    store,
-    stored,
-)
+from modeharvest.validation import workers as work
+from modeharvest.validation.workers import Case, Cases, Workers
 
 _KILLED = "KilledWorker: its workers died; it may need more memory than they are given"
 _ATTEMPTS = 3
@@ -51,7 +43,7 @@ class Campaign:
     """
 
     function: str
-    cases: tuple[Case, ...]
+    cases: Cases
     folder: Path
 
     def __post_init__(self) -> None:
@@ -63,15 +55,17 @@ class Campaign:
             if other != keys:
                 some = sorted(keys ^ other)
                 raise InputError(f"expected cases with the same keys, got {some} in some only")
-        named(self.function)
+        work.named(self.function)
 
     def path(self, case: Case) -> Path:
         """Where the result of a case is stored."""
-        return result_path(self.function, case, self.folder)
+        return work.result_path(self.function, case, self.folder)
 
-    def missing(self) -> tuple[Case, ...]:
+    def missing(self) -> Cases:
         """The cases that have no result yet, or failed."""
-        return tuple(case for case in self.cases if read_result(self.path(case)).get("error") != "")
+        return tuple(
+            case for case in self.cases if work.read_result(self.path(case)).get("error") != ""
+        )
 
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``, without lists.
@@ -98,7 +92,7 @@ class Campaign:
         """A row for each case: its values, ``error`` (empty if none), its result."""
         rows = []
         for case in self.cases:
-            record = read_result(self.path(case)) or {"error": "not run"}
+            record = work.read_result(self.path(case)) or {"error": "not run"}
             error = (record["error"].strip().splitlines() or [""])[-1]
             rows.append({**case, "error": error, **(record.get("result") or {})})
         return pd.DataFrame(rows)
@@ -107,7 +101,7 @@ class Campaign:
         """How many stored results are of another version or no longer asked for, by version."""
         wanted = {self.path(case) for case in self.cases}
         others = set((self.folder / "cases").glob("*.json")) - wanted
-        return Counter(str(stored(path).get("version", "unknown")) for path in sorted(others))
+        return Counter(str(work.stored(path).get("version", "unknown")) for path in sorted(others))
 
     def _settled(self, cases: Sequence[Case], workers: Workers) -> Iterator[Case]:
         """The cases as they get done, or fail for certain.
@@ -159,7 +153,7 @@ class Campaign:
         for suspect in killed:
             for case, outcome in self._submitted(client, [suspect]):
                 if outcome is _Outcome.KILLED:
-                    store(self.path(case), case, None, _KILLED)
+                    work.store(self.path(case), case, None, _KILLED)
                 yield case, outcome
 
     def _submitted(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
@@ -168,7 +162,9 @@ class Campaign:
 
         folder = str(self.folder.resolve())  # workers elsewhere have another current one
         futures = {
-            client.submit(run_case, self.function, case, folder, source_digest(), pure=False): case
+            client.submit(
+                work.run_case, self.function, case, folder, source_digest(), pure=False
+            ): case
             for case in cases
         }
         completed = as_completed(list(futures))  # type: ignore[no-untyped-call]
@@ -185,7 +181,7 @@ class Campaign:
             elif isinstance(failure := future.exception(), KilledWorker):
                 yield case, _Outcome.KILLED
             else:
-                store(self.path(case), case, None, f"{type(failure).__name__}: {failure}")
+                work.store(self.path(case), case, None, f"{type(failure).__name__}: {failure}")
                 yield case, _Outcome.SETTLED
 
 
@@ -197,7 +193,7 @@ class _Outcome(Enum):
     CUT_OFF = auto()  # the connection to the scheduler broke
 
 
-def grid(base: Case, **axes: Sequence[Any]) -> tuple[Case, ...]:
+def grid(base: Case, **axes: Sequence[Any]) -> Cases:
     """All combinations of some values, each on top of a base case.
 
     ``axes``: the values that keys of the base run through, the last fastest; InputError if one is

@@ -98,17 +98,11 @@ class SnapshotSummary:
     iterations_all_levels: int = quantity("iterations on all levels", "–")
     condition_number: float = quantity("condition number", "–")
     residual_correlation: float = quantity("autocorrelation of the residual, 4 to 12 px", "–")
-    noise_sd: float | None = quantity(
-        "noise of the camera images, rms, as a fraction of full scale", "–"
-    )
-    chi_square: float | None = quantity(
-        "χ² of the residual: 1 if it is that noise and no more", "–"
-    )
+    noise_sd: float | None = quantity("noise of the camera images, rms, share of full scale", "–")
+    chi_square: float | None = quantity("χ² of the residual: 1 if that noise and no more", "–")
     gain_min: float | None = quantity("gain between the images, smallest", "–", default=None)
     gain_max: float | None = quantity("… largest", "–", default=None)
-    offset_min: float | None = quantity(
-        "offset between the images, smallest, as a fraction of full scale", "–", default=None
-    )
+    offset_min: float | None = quantity("offset, smallest, share of full scale", "–", default=None)
     offset_max: float | None = quantity("… largest", "–", default=None)
     model_error_estimate_px: float = quantity("w, estimated from the images alone, rms", "px")
     mode_polynomial_overlap: float = quantity("overlap of the mode's part with v₀", "–")
@@ -184,17 +178,17 @@ def expectations(summary: ExperimentSummary) -> tuple[Expectation, ...]:
         at, pivots = f" at {100 * snapshot.nominal_strain:.1f} %", snapshot.negative_pivots
         is_buckled = critical is not None and snapshot.nominal_strain > critical
         rows.append(Expectation("negative pivots" + at, "-", "0", pivots, pivots == 0, "stability"))
-        rows += _of_buckled(snapshot, at) if is_buckled else [_of_stable(snapshot, at)]
+        rows += _of_buckled(snapshot, at) if is_buckled else _of_stable(snapshot, at)
     return tuple(rows)
 
 
-def _of_stable(snapshot: SnapshotSummary, at: str) -> Expectation:
+def _of_stable(snapshot: SnapshotSummary, at: str) -> list[Expectation]:
     inner, corners = snapshot.pattern_inner_px, snapshot.pattern_corners_px
-    return Expectation(
-        "pattern inside over pattern in the corners" + at, "-",
-        "below 1: v₁ near zero except at the corners", inner / corners, inner < corners,
-        PAPER + ", Fig. (virt)",
-    )  # fmt: skip
+    return [
+        Expectation("pattern inside over pattern in the corners" + at, "-",
+                    "below 1: v₁ near zero except at the corners", inner / corners,
+                    inner < corners, PAPER + ", Fig. (virt)"),
+    ]  # fmt: skip
 
 
 def _of_buckled(snapshot: SnapshotSummary, at: str) -> list[Expectation]:

@@ -31,6 +31,7 @@ from modeharvest.util.stages import digest, source_digest, stage_key
 
 Case = Mapping[str, Any]
 """Plain values, the seed among them."""
+Cases = tuple[Case, ...]
 CaseFunction = Callable[[Case, Path], Any]
 """Takes a case and the campaign's folder, returns a dataclass or a mapping of plain values: the
 row of the table."""

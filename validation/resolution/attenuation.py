@@ -85,8 +85,7 @@ class Attenuation:
             row = np.abs(field.y).min(where=field.good, initial=np.inf)
             middle = inside & (np.abs(field.y) <= row + 0.5)
         columns = Columns.of(star, field, near)
-        _require_columns(columns, star, field.source)
-        _require_wave(columns, star, field)
+        _require_star(columns, star, field)
         return cls(columns, Columns.of(star, field, middle))
 
     @cached_property
@@ -204,26 +203,22 @@ def _memory(left: FloatArray) -> float:
     return float(1.0 + 2.0 * rho[1 : ends[0] if len(ends) else None].sum())
 
 
-def _require_columns(columns: Columns, star: Star, source: str) -> None:
-    """Raise InputError unless the field covers enough of the wave."""
+def _require_star(columns: Columns, star: Star, field: LocalField) -> None:
+    """Raise InputError unless the field covers enough of the wave and its longest part is there."""
     if len(columns.period) < _FEWEST_COLUMNS:
         raise InputError(
-            f"{source}: expected displacements at {_FEWEST_COLUMNS} columns or more within half a "
-            f"period of the centre row {star.centre_row}, got {len(columns.period)}; measure "
+            f"{field.source}: expected displacements at {_FEWEST_COLUMNS} columns or more within "
+            f"half a period of the centre row {star.centre_row}, got {len(columns.period)}; measure "
             "about the centre row, all along the image"
         )
     first, last = columns.period[[0, -1]]
     if last < _SPAN * first:
         raise InputError(
-            f"{source}: expected columns over periods from {star.shortest_px:g} to "
+            f"{field.source}: expected columns over periods from {star.shortest_px:g} to "
             f"{star.longest_px:g} px, got {first:.4g} to {last:.4g} px only; measure all along "
             "the image"
         )
-
-
-def _require_wave(columns: Columns, star: Star, field: LocalField) -> None:
-    """Raise InputError if the longest waves are not there: a field of something else."""
-    long = columns.period >= np.sqrt(columns.period[0] * columns.period[-1])
+    long = columns.period >= np.sqrt(first * last)
     share = float(np.average(columns.share[long], weights=columns.weight[long]))
     if 0.5 < share < 1.5:
         return

@@ -258,22 +258,19 @@ def _images(spec: StarSpec, f: FloatImage, g: FloatImage) -> Iterator[tuple[str,
 
 def star_readme(info: Mapping[str, Any]) -> str:
     """The README of a set, Markdown, from the content of its ``star.json``."""
-    star = info["spec"]["star"]
+    star, bits, rows = info["spec"]["star"], info["spec"]["bits"], []
+    for name in info["files"]:
+        role, _, level = name.removesuffix(".tif").partition("_")
+        percent = level.removesuffix("pct").replace("p", ".")
+        kind = f"{bits} bit, noise {percent} % of full scale" if level else "exact, float"
+        rows.append(f"| `{name}` | {_ROLES[role]}; {kind} |")
     derived = {
-        "files": "\n".join(_readme_row(name, info["spec"]["bits"]) for name in info["files"]),
+        "files": "\n".join(rows),
         "range": star["longest_px"] - star["shortest_px"],
         "last": star["cols"] - 1,
         "centre": star["rows"] // 2,
     }
     return _README.format_map({**info, **info["law"], **star, **derived})
-
-
-def _readme_row(name: str, bits: int) -> str:
-    """A row of the table of files."""
-    role, _, level = name.removesuffix(".tif").partition("_")
-    percent = level.removesuffix("pct").replace("p", ".")
-    kind = f"{bits} bit, noise {percent} % of full scale" if level else "exact, float"
-    return f"| `{name}` | {_ROLES[role]}; {kind} |"
 
 
 def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[str, Any]:

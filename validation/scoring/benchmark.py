@@ -59,31 +59,24 @@ _README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
 
 def readme(info: Mapping[str, Any]) -> str:
     """The README of a set, Markdown, from the content of its ``benchmark.json``."""
-    first = info["first_pixel_mm"]
-    derived = {
-        "mask": info["reference"]["mask"],
-        "files": "\n".join(_files(info)),
-        "strain": info["deformed"][-1]["nominal_strain"],
-        "x0": first["x"],
-        "y0": first["y_up"],
-    }
-    return _README.format_map({**info, **derived})
-
-
-def _files(info: Mapping[str, Any]) -> list[str]:
-    """A row of the table for each file."""
-    reference, bits = info["reference"], info["bits"]
-    size = f"{info['rows']} × {info['cols']} px"
+    first, reference, camera = info["first_pixel_mm"], info["reference"], f"{info['bits']} bit"
     rows = [
-        f"| `{reference['image']}` | undeformed, float, {size} |",
-        f"| `{reference['camera_image']}` | undeformed, {bits} bit |",
+        f"| `{reference['image']}` | undeformed, float, {info['rows']} × {info['cols']} px |",
+        f"| `{reference['camera_image']}` | undeformed, {camera} |",
         f"| `{reference['mask']}` | material of the undeformed image |",
     ]
     for entry in info["deformed"]:
         strain = f"nominal strain {100 * entry['nominal_strain']:g} %"
         rows += [f"| `{entry['image']}` | {strain}, float |",
-                 f"| `{entry['camera_image']}` | {strain}, {bits} bit |"]  # fmt: skip
-    return rows
+                 f"| `{entry['camera_image']}` | {strain}, {camera} |"]  # fmt: skip
+    derived = {
+        "mask": reference["mask"],
+        "files": "\n".join(rows),
+        "strain": info["deformed"][-1]["nominal_strain"],
+        "x0": first["x"],
+        "y0": first["y_up"],
+    }
+    return _README.format_map({**info, **derived})
 
 
 FORMAT, TRUTH_FORMAT = "modeharvest-benchmark-1", "modeharvest-benchmark-truth-1"

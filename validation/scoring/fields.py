@@ -59,7 +59,14 @@ def read_measured(
     """
     path, how = Path(path), asdict(declared or Declared())
     name = how.pop("name") or path.stem
-    _require_file(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"expected a displacement field in {path}, found {found}")
+    if path.suffix.lower() not in _KINDS:
+        raise InputError(
+            f"{path}: expected one of {', '.join(sorted(_KINDS))}, got {path.suffix!r}; "
+            "save the field as CSV"
+        )
     claimed = claimed_benchmark(path)
     if claimed not in (None, benchmark):
         raise InputError(
@@ -74,18 +81,6 @@ def read_measured(
         for argument, option in _OPTIONS.items():
             message = message.replace(argument, option)
         raise InputError(message) from error
-
-
-def _require_file(path: Path) -> None:
-    """Raise InputError if there is no file of a known kind."""
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"expected a displacement field in {path}, found {found}")
-    if path.suffix.lower() not in _KINDS:
-        raise InputError(
-            f"{path}: expected one of {', '.join(sorted(_KINDS))}, got {path.suffix!r}; "
-            "save the field as CSV"
-        )
 
 
 def claimed_benchmark(path: Path) -> str | None:
@@ -117,18 +112,6 @@ def _claim(path: Path) -> str | None:
 
 def _read_vtk(path: Path, grid: PixelGrid, **how: Any) -> LocalField:
     """By way of a table of columns, so that units and axes are declared as for any file."""
-    x, y, u, v = _points_of_vtk(path)
-    with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / f"{path.stem}.npz"
-        np.savez(table, x=x, y=y, u=u, v=v)
-        try:
-            return read_field(table, grid, **how)
-        except InputError as error:
-            raise InputError(str(error).replace(str(table), str(path))) from error
-
-
-def _points_of_vtk(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(4, n) x, y, u, v."""
     with reading(path, f"a displacement field ({path.suffix})", "save it as CSV"):
         mesh = read_any_mesh(path)
         vectors = {
@@ -142,4 +125,11 @@ def _points_of_vtk(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
             f"{path}: expected one vector at the points, named u or displacement, got "
             f"{', '.join(map(repr, mesh.point_data)) or 'none'}"
         )
-    return np.column_stack([mesh.points[:, :2], vectors[named[0]][:, :2]]).T
+    (x, y), (u, v) = mesh.points[:, :2].T, vectors[named[0]][:, :2].T
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / f"{path.stem}.npz"
+        np.savez(table, x=x, y=y, u=u, v=v)
+        try:
+            return read_field(table, grid, **how)
+        except InputError as error:
+            raise InputError(str(error).replace(str(table), str(path))) from error

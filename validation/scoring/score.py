@@ -282,14 +282,14 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     if not len(graded.x):
         return None
     try:
-        u, points, mask = gridded(_averaged(graded, grid))
-        unit = 10.0 * points.pixel_size  # any: wavelengths are in px
-        spectrum = spectral_density(u, points, mask, unit, bins_per_cell=10, padding=1)
+        u, regular, mask = gridded(_averaged(graded, grid))
+        unit = 10.0 * regular.pixel_size  # any: wavelengths are in px
+        spectrum = spectral_density(u, regular, mask, unit, bins_per_cell=10, padding=1)
     except InputError:
         return None
     density = (spectrum.S_xx + spectrum.S_yy).ravel()
     cell = (spectrum.xi1[1] - spectrum.xi1[0]) * (spectrum.xi2[1] - spectrum.xi2[0]) / unit**2
-    area = mask.sum() * points.pixel_size**2
+    area = mask.sum() * regular.pixel_size**2
     frequency = np.hypot(spectrum.xi1[None, :], spectrum.xi2[:, None]).ravel() / unit
     waves = frequency > 0
     wavelength = 1.0 / (frequency[waves] * grid.pixel_size)
@@ -298,8 +298,10 @@ def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:
     square_mm = np.bincount(band - low, density[waves] * cell) / (2.0 * area)
     middle = 2.0 ** ((low + np.arange(square_mm.size)) / BANDS_AN_OCTAVE)
     there = np.bincount(band - low) > 0
-    rms, affine = np.sqrt(square_mm), _affine_rms(graded, spectrum.affine)
-    return ErrorSpectrum(middle[there], rms[there] / grid.pixel_size, affine / grid.pixel_size)
+    points = np.stack([np.ones_like(graded.x), graded.x, graded.y])
+    affine_rms = float(np.sqrt(np.mean((spectrum.affine @ points) ** 2)))
+    rms = np.sqrt(square_mm) / grid.pixel_size
+    return ErrorSpectrum(middle[there], rms[there], affine_rms / grid.pixel_size)
 
 
 def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
@@ -319,9 +321,3 @@ def _averaged(graded: Score, grid: PixelGrid) -> LocalField:
         x = left + side * (there % cols + 0.5)
         y = low + side * (there // cols + 0.5)
     return LocalField(x, y, error, source=graded.source)
-
-
-def _affine_rms(graded: Score, affine: FloatArray) -> float:
-    """Rms of an affine field at the points, per component [mm]."""
-    points = np.stack([np.ones_like(graded.x), graded.x, graded.y])
-    return float(np.sqrt(np.mean((affine @ points) ** 2)))

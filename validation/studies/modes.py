@@ -30,7 +30,7 @@ from modeharvest.validation.studies.lattice_pattern import STUDIED_MATERIALS
 from modeharvest.validation.studies.modes_specimen import LatticeMode, SpecimenSpec, buckle
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.truth import Comparison
-from modeharvest.validation.workers import Case
+from modeharvest.validation.workers import Case, Cases
 
 PARAMETERS = tuple(f"a{k}" for k in range(1, 8))
 WAVE_VECTORS = list(PARAMETERS[1:5])
@@ -306,9 +306,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         fewer = replace(self, ratios=self.ratios[2::3], gradings_y=self.gradings_y[:1])
         return replace(fewer, pitches=(), materials=(), gradings_x=())
 
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Describe the specimens; they are simulated and imaged case by case.
 
         InputError if the base has no critical point below the strain, or a specimen can't be.

@@ -44,7 +44,7 @@ from modeharvest.validation.studies.noise_statistics import (
     NoiseAnalysis,
 )
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair, noisy
-from modeharvest.validation.workers import Case
+from modeharvest.validation.workers import Case, Cases
 
 EXAMPLES = 24
 """Of the noise, for V; each counts as many times as there are unit cells."""
@@ -80,11 +80,14 @@ def covariances_by_cause(
     at = np.ix_(~lost, ~lost)
     inverse, hessian = result.inverse[at], matched.inverse_hessian[at]
     M = np.linalg.inv(inverse)
-    # Noise in f perturbs the gradient by s²M, noise in g by what its examples do.
-    V0, V = (
-        M + M @ _by_noise_of_g(images, cell, seed)[at] @ M
-        for images in (zero_residual(matched), matched)
-    )
+
+    def perturbed(images: MatchedImages) -> FloatArray:
+        """The gradient's covariance: s²M by noise in f, and what examples of that in g do."""
+        examples = _noise_of_g(images.reference, seed)
+        by_g = images.noise_covariance(examples, cell, images.result.inverse) / _WEAK_NOISE**2
+        return np.asarray(M + M @ by_g[at] @ M)
+
+    V0, V = perturbed(zero_residual(matched)), perturbed(matched)
     known = {
         "bound": 2.0 * inverse,
         "det F": inverse @ V0 @ inverse,
@@ -99,14 +102,8 @@ def covariances_by_cause(
     return found
 
 
-def _by_noise_of_g(images: MatchedImages, cell: float, seed: int) -> FloatArray:
-    """(n, n) M⁻¹V_gM⁻¹ / s²: V_g by noise s in g alone, independent from cell to cell."""
-    examples = _noise_examples(images.reference, seed)
-    found = images.noise_covariance(examples, cell, images.result.inverse)
-    return np.asarray(found / _WEAK_NOISE**2, dtype=np.float64)
-
-
-def _noise_examples(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, FloatImage]]:
+def _noise_of_g(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, FloatImage]]:
+    """Examples of noise in g alone."""
     rng = np.random.default_rng([seed, EXAMPLES])
     none = np.zeros_like(like)
     for _ in range(EXAMPLES):
@@ -172,11 +169,6 @@ class NoiseStudy(Study[NoiseAnalysis]):
             )
         self.require_different("levels", self.levels)
 
-    @property
-    def seeds(self) -> str:
-        """Of the noise."""
-        return f"seed {self.seed} of the noise"
-
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Noise is added to exact images, not to rounded ones."""
         if correlation.camera:
@@ -189,9 +181,7 @@ class NoiseStudy(Study[NoiseAnalysis]):
         """A fifth of the realisations."""
         return replace(self, pairs=max(2, -(-self.pairs // 5)))
 
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Make the images; the cases are level, number and sign of the noise, the first without."""
         name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)

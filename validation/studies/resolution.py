@@ -36,7 +36,7 @@ from modeharvest.validation.resolution.transfer import (
     wave_share,
 )
 from modeharvest.validation.studies.study import ImagePairSpec, Study, noisy
-from modeharvest.validation.workers import Case
+from modeharvest.validation.workers import Case, Cases
 
 Row = dict[str, Any]
 """Of the table: quantities by their names, with the degree behind an underscore."""
@@ -233,11 +233,6 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
                 f"seed of 0 or more, got {self.pattern}, {self.realisations} and {self.seed}"
             )
 
-    @property
-    def seeds(self) -> str:
-        """Of the noise."""
-        return f"seed {self.seed} of the noise"
-
     def require(self, correlation: SquareLatticeOptions) -> None:
         """The mode is measured, in exact images, and brightness is none of the question."""
         super().require(correlation)
@@ -252,9 +247,7 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
         middle = self.measured[len(self.measured) // 2]
         return replace(self, measured=(middle,), realisations=max(2, self.realisations // 2))
 
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Say what is measured; the cases are waves, noise, and the floors of exact images."""
         specimen, how, imaging = spec.experiment.specimen, spec.correlation, spec.imaging
         buckled = BuckledMotion(

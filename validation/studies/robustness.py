@@ -16,7 +16,7 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
-from modeharvest.validation.workers import Case
+from modeharvest.validation.workers import Case, Cases
 
 SAME_PX = 0.01
 """Solutions nearer than this, rms, are the same minimum [px]."""
@@ -82,15 +82,13 @@ class GuessStatistics:
         epsilon = guesses["epsilon_percent"].dropna()
         outliers = epsilon > OUTLIER_PERCENT
         others = guesses[~same & (guesses["error"] == "")]
-        largest = (
-            float(distances.max())
-            for distances in (guesses["distance_px"], guesses.loc[same, "distance_px"],
-                              guesses["start_distance_px"])
-        )  # fmt: skip
+        distance = guesses["distance_px"]
         return cls(
             success.count, radius, success.good, success.value, success.interval,
             float(epsilon.mean()), float(epsilon.max()), float(epsilon[~outliers].mean()),
-            int(outliers.sum()), *largest, int((others["outcome"] == "converged").sum()),
+            int(outliers.sum()), float(distance.max()), float(distance[same].max()),
+            float(guesses["start_distance_px"].max()),
+            int((others["outcome"] == "converged").sum()),
             int((guesses["error"] != "").sum()), PUBLISHED,
         )  # fmt: skip
 
@@ -146,6 +144,7 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
     )
     function: ClassVar[str] = f"{__name__}:one_start"
     measures_mode: ClassVar[bool] = True
+    seeded: ClassVar[str] = "perturbations"
 
     strain: float = 0.128
     initial_guesses: int = 100
@@ -175,20 +174,13 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
         self.require_different("radii", self.radii)
         self.require_different("strain_errors", self.strain_errors)
 
-    @property
-    def seeds(self) -> str:
-        """Of the perturbations."""
-        return f"seed {self.seed} of the perturbations"
-
     def quick(self) -> Self:
         """A fifth of the initial guesses."""
         return replace(
             self, initial_guesses=-(-self.initial_guesses // 5), per_radius=-(-self.per_radius // 5)
         )
 
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Make the images; the cases are radius, number of the guess and seed."""
         name = spec.describe(folder, self.strain)
         VirtualImagePair.open(folder, name, progress)

@@ -36,7 +36,7 @@ from modeharvest.util.files import read_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.truth import Comparison, compare
-from modeharvest.validation.workers import Case, leave
+from modeharvest.validation.workers import Cases, leave
 
 
 @dataclass(frozen=True)
@@ -223,13 +223,16 @@ class Study(ABC, Generic[A]):
     """Of what is repeated in a study; each is a case and its file."""
     measures_mode: ClassVar[bool] = False
     """Whether the mode's parameters have to be free."""
+    seeded: ClassVar[str] = "noise"
+    """What is random, from ``seed``."""
     strain: float
     """Of the deformed image [-]."""
+    seed: int
 
     @property
-    @abstractmethod
     def seeds(self) -> str:
         """The seeds of all that is random, as text for the report."""
+        return f"seed {self.seed} of the {self.seeded}"
 
     def require(self, correlation: SquareLatticeOptions) -> None:
         """Raise InputError if the correlation contradicts the study."""
@@ -250,9 +253,7 @@ class Study(ABC, Generic[A]):
         """The same question with fewer cases: a first look."""
 
     @abstractmethod
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Make what the cases share (images) in ``folder``; returns the cases.
 
         The random choices of a case follow from a seed that it holds.

@@ -21,9 +21,10 @@ from modeharvest.validation.studies.study import (
     StudySetting,
     VirtualImagePair,
 )
-from modeharvest.validation.workers import Case
+from modeharvest.validation.workers import Case, Cases
 
 T = TypeVar("T")
+_DEGREES = (2, 3, 4, 5, 6, 7, 8)
 
 
 def changed(thing: T, options: str, **values: Any) -> T:
@@ -124,13 +125,10 @@ def _camera(setting: StudySetting, level: float) -> float | None:
     return level if setting.correlation.camera else None
 
 
+_option, _choice = VariedFactor.option, VariedFactor.choice
 FACTORS: dict[str, VariedFactor] = {
-    "order": VariedFactor.option(
-        "order of the spline [-]", "correlation.order", (3, 5, 11), whole=True
-    ),
-    "gradient": VariedFactor.choice(
-        "gradient that weighs the residual", "gradient", ("deformed", "reference")
-    ),
+    "order": _option("order of the spline [-]", "correlation.order", (3, 5, 11), whole=True),
+    "gradient": _choice("gradient that weighs the residual", "gradient", ("deformed", "reference")),
     "speckle_size": VariedFactor(
         "size of the speckle [times the base's]", (0.5, 0.7, 1.0, 1.4, 2.0), _speckle_size,
         lambda s: 1.0,
@@ -139,30 +137,20 @@ FACTORS: dict[str, VariedFactor] = {
         "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
         _contrast, lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
     ),
-    "blur": VariedFactor.option(
-        "blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3.0, 4.0, 6.0)
-    ),
+    "blur": _option("blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2, 3, 4, 6)),
     "bits": VariedFactor(
         "bits of camera images [-]", (4, 6, 8, 10, 12),
         lambda s, v: _by_camera(changed(s, "imaging", bits=v)),
         lambda s: _camera(s, s.imaging.bits), whole=True,
     ),
-    "fill_factor": VariedFactor.option(
+    "fill_factor": _option(
         "fill factor of the sensor [-]", "imaging.sensor.fill_factor", (0.0, 0.25, 0.5, 0.75, 1.0)
     ),
-    "pixel_size": VariedFactor.option(
-        "pixel [mm]", "imaging.pixel_size", (0.01, 0.014, 0.02, 0.028, 0.04)
-    ),
-    "v0_degree": VariedFactor.option(
-        "degree of v0 [-]", "correlation.v0_degree", (2, 3, 4, 5, 6, 7, 8), whole=True
-    ),
-    "v_degree": VariedFactor.option(
-        "degree of v1 [-]", "correlation.v_degree", (2, 3, 4, 5, 6, 7, 8), whole=True
-    ),
-    "taper": VariedFactor.option(
-        "width of the mode's taper [unit cells]", "taper", (0.125, 0.25, 0.5, 0.75, 1.0)
-    ),
-    "edge_px": VariedFactor.option(
+    "pixel_size": _option("pixel [mm]", "imaging.pixel_size", (0.01, 0.014, 0.02, 0.028, 0.04)),
+    "v0_degree": _option("degree of v0 [-]", "correlation.v0_degree", _DEGREES, whole=True),
+    "v_degree": _option("degree of v1 [-]", "correlation.v_degree", _DEGREES, whole=True),
+    "taper": _option("width of the mode's taper [unit cells]", "taper", (0.125, 0.25, 0.5, 0.75, 1)),
+    "edge_px": _option(
         "pixels left out at edges [px]", "correlation.edge_px", (0, 1, 2, 3, 5, 8), whole=True
     ),
 }  # fmt: skip
@@ -268,9 +256,7 @@ class SystematicStudy(Study[SystematicAnalysis]):
             levels[name] = tuple(own[k] for k in sorted({0, len(own) // 2, len(own) - 1}))
         return replace(self, levels=levels, seeds_of_speckle=self.seeds_of_speckle[:1])
 
-    def prepare(
-        self, spec: ImagePairSpec, folder: Path, progress: Progress = silent
-    ) -> tuple[Case, ...]:
+    def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
         """Make the base's images, which many cases share; the others are made case by case."""
         cases = []
         for seed in self.seeds_of_speckle:
