@@ -15,8 +15,14 @@ from modeharvest.fem.bloch.dispersion import ZONES, Dispersion, ZoneMap
 from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.field import Mesh
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
-from modeharvest.validation.studies.lattice import FirstModeLimit, LatticeModeStudy
-from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
+from modeharvest.validation.studies.lattice import (
+    EQ_MODE,
+    FirstModeLimit,
+    LatticeModeStudy,
+    ModeRow,
+    PatternMode,
+    wave_sum,
+)
 
 FloatArray = NDArray[np.float64]
 

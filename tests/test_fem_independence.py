@@ -15,9 +15,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from modeharvest.util.errors import InputError
-from modeharvest.validation.studies.lattice import ModeTable, study_likeness
-from modeharvest.validation.studies.lattice_pattern import (
+from modeharvest.validation.studies.lattice import (
     LOADINGS,
+    ModeTable,
     PatternMode,
     StudiedLattice,
     mode_likeness,
@@ -25,6 +25,7 @@ from modeharvest.validation.studies.lattice_pattern import (
     overlap_of_fields,
     pattern_mode,
     pattern_row,
+    study_likeness,
 )
 
 BASE = StudiedLattice(ratio=0.8, loading=LOADINGS["equibiaxial"], divisions=6)

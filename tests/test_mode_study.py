@@ -20,12 +20,13 @@ from modeharvest.fem.lattice.options import simple_shear
 from modeharvest.fem.materials import Ogden
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies import lattice as mode_study
-from modeharvest.validation.studies.lattice import ModeTable, first_mode_limit
-from modeharvest.validation.studies.lattice_pattern import (
+from modeharvest.validation.studies.lattice import (
     LOADINGS,
     STUDIED_MATERIALS,
     ModeRow,
+    ModeTable,
     StudiedLattice,
+    first_mode_limit,
     name_of,
     ogden,
     ratio_lattices,

@@ -24,7 +24,7 @@ from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies import modes as modes_specimen
-from modeharvest.validation.studies.lattice_pattern import EQ_MODE, ModeRow, PatternMode, wave_sum
+from modeharvest.validation.studies.lattice import EQ_MODE, ModeRow, PatternMode, wave_sum
 from modeharvest.validation.studies.modes import (
     MeasuredModesStudy,
     ModesAnalysis,

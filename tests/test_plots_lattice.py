@@ -37,7 +37,7 @@ from modeharvest.report.figures.lattice import (
 from modeharvest.report.figures.outlines import LatticePatch
 from modeharvest.report.figures.style import INK
 from modeharvest.runs.lattice.results import combination_name
-from modeharvest.validation.studies.lattice_pattern import EQ_MODE, wave_sum
+from modeharvest.validation.studies.lattice import EQ_MODE, wave_sum
 
 L = made_up.PITCH
 HEXAGONAL = L * np.array([[1.0, 0.0], [0.5, 0.75**0.5]])

@@ -208,8 +208,8 @@ def _require_star(columns: Columns, star: Star, field: LocalField) -> None:
     if len(columns.period) < _FEWEST_COLUMNS:
         raise InputError(
             f"{field.source}: expected displacements at {_FEWEST_COLUMNS} columns or more within "
-            f"half a period of the centre row {star.centre_row}, got {len(columns.period)}; measure "
-            "about the centre row, all along the image"
+            f"half a period of the centre row {star.centre_row}, got {len(columns.period)}; "
+            "measure about the centre row, all along the image"
         )
     first, last = columns.period[[0, -1]]
     if last < _SPAN * first:

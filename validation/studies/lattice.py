@@ -1,31 +1,304 @@
-"""Study of lattice modes: on what the pattern of a square lattice depends."""
+"""Study of lattice modes: on what the pattern of a square lattice depends.
+
+The paper says that modes are independent of the size l of the unit cell, of d/l for moderate
+variations, and of the material (Section "Graded Microstructures and Size Independence of the
+Modes"). Here that is measured: a lattice's numerical mode at (π, π) against Eq. (mode) by their
+normalised overlap.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+from pydantic import TypeAdapter
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial, uniaxial_strain
+from modeharvest.fem.materials import Material, Ogden, TwoTermI1
+from modeharvest.idic.modes import square_family
+from modeharvest.idic.spectra.lattice_spectrum import MeshQuadrature
+from modeharvest.idic.spectra.mode_family import best_amplitude, mode_family, overlap
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
+from modeharvest.util.files import atomic
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.lattice_pattern import (
-    LOADINGS,
-    RATIOS,
-    STUDIED_MATERIALS,
-    ModeRow,
-    PatternMode,
-    StudiedLattice,
-    mode_likeness,
-    pattern_mode,
-    pattern_row,
-    ratio_lattices,
-    read_rows,
-    write_rows,
-)
+from modeharvest.util.typed import quantities, quantity
 
+if TYPE_CHECKING:
+    from modeharvest.fem.bloch.critical import LatticeCritical
+    from modeharvest.fem.lattice.cell import CellPath
+
+Key = tuple[str, str, float, float, int]
+
+
+@dataclass(frozen=True)
+class ModeRow:
+    """The pattern of one lattice under one loading; labels and units head the table's columns.
+
+    ``kind``, what is critical first: "pattern" for (π, π) alone, "long waves", "other waves";
+    "none" up to the largest load asked for; "path ends" where no equilibrium was found beyond.
+    ``pattern``: first load at which (π, π) is critical, whatever else is; NaN if none in the
+    range. ``state``: load of the state that the mode belongs to, the first critical one or the
+    last. ``overlap``: |<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both
+    of unit norm over the material. ``captured``: share of its energy that the automatically found
+    family holds. ``likeness``: |<mode, mode of the reference>| of unit norm, on the same mesh but
+    for its size; NaN where it wasn't compared.
+    """
+
+    material: str = quantity("material")
+    loading: str = quantity("loading")
+    pitch: float = quantity("l", "mm")
+    ratio: float = quantity("d/l", "-")
+    divisions: int = quantity("elements per l", "-")
+    found: bool = quantity("critical point found")
+    first: float = quantity("first critical or largest strain", "-")
+    kind: str = quantity("first critical waves")
+    pattern: float = quantity("critical strain of (pi, pi)", "-")
+    state: float = quantity("strain of the mode's state", "-")
+    eigenvalue: float = quantity("eigenvalue at (pi, pi)", "N/mm^4")
+    overlap: float = quantity("overlap with Eq. (mode)", "-")
+    captured: float = quantity("energy captured by the automatic family", "-")
+    waves: int = quantity("its waves", "-")
+    likeness: float = quantity("overlap with the reference's mode", "-", default=math.nan)
+
+    @property
+    def key(self) -> Key:
+        """What was computed, apart from what came out."""
+        return (self.material, self.loading, self.pitch, self.ratio, self.divisions)
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the pattern is what buckles first."""
+        return self.kind == "pattern"
+
+
+_HEADS = {name: f"{label} [{unit}]" if unit else label for label, unit, name in quantities(ModeRow)}
+_ROWS = TypeAdapter(tuple[ModeRow, ...])
+
+
+def write_rows(path: Path | str, rows: Iterable[ModeRow]) -> None:
+    """Write the table, atomically; numbers with all their digits."""
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_HEADS.values())
+        writer.writerows([getattr(row, name) for name in _HEADS] for row in rows)
+
+
+def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
+    """Read what :func:`write_rows` wrote; empty without a file, InputError if it is another."""
+    path = Path(path)
+    if not path.exists():
+        return ()
+    with path.open(newline="", encoding="utf-8") as file:
+        table = list(csv.reader(file))
+    if not table or table[0] != list(_HEADS.values()):
+        raise InputError(
+            f"mode study: expected a table with the heads of this version at {path}, got "
+            f"{table[0] if table else 'nothing'}; remove it to begin anew"
+        )
+    try:
+        return _ROWS.validate_python([dict(zip(_HEADS, row, strict=True)) for row in table[1:]])
+    except ValueError as error:
+        raise InputError(
+            f"mode study: expected {len(_HEADS)} values in each row of {path}, got: "
+            f"{str(error).splitlines()[0]}; remove it to begin anew"
+        ) from error
+
+
+PATTERN = (math.pi, math.pi)
+"""The wave of the paper's pattern, as phases from cell to cell [rad]."""
+EQ_MODE = square_family("hole")
+"""The analytic mode, Eq. (mode) of the paper; a hole's centre is the origin."""
+RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
+"""Of d/l [-]: 0.7895 is the paper's; 0.8696 and 0.95 have independent values, too."""
 SHOWN = (0.95, 0.7895, 0.25)
 """Of d/l in the paper's Fig. "graded", from left to right."""
+_STEP, _CLOSE = 0.02, 0.002  # of the load [-]
+LOADINGS: dict[str, MacroLoading] = {
+    "uniaxial": uniaxial(),
+    "uniaxial strain": uniaxial_strain(),
+    "equibiaxial": equibiaxial(),
+}
+
+
+def ogden(exponent: float, poisson: float, shear: float = 0.6) -> Ogden:
+    """One Ogden term with a Poisson's ratio [-] and a shear modulus [MPa]."""
+    kappa = round(2.0 * poisson * shear / (1.0 - 2.0 * poisson), 9)
+    return Ogden((2.0 * shear,), (exponent,), kappa)
+
+
+STUDIED_MATERIALS: dict[str, Material] = {
+    "two-term I1": TwoTermI1(),
+    **{f"Ogden m={m:g}, nu={nu:.2f}": ogden(m, nu)
+       for m, nu in ((3, 0.45), (2, 0.45), (4, 0.45), (6, 0.45), (-2, 0.45), (3, 0.40), (3, 0.49))},
+}  # fmt: skip
+"""By name. The first is the reference; exponents and Poisson's ratios vary about (3, 0.45)."""
+
+
+@dataclass(frozen=True)
+class StudiedLattice:
+    """One lattice of the study: everything that its pattern may depend on.
+
+    ``ratio``: hole diameter over cell size d/l [-]; ``pitch``: unit cell size l [mm];
+    ``divisions``: elements along l; ``largest``: load up to which to look for critical points [-].
+    """
+
+    ratio: float = 0.7895
+    loading: MacroLoading = LOADINGS["uniaxial"]
+    material: Material = STUDIED_MATERIALS["two-term I1"]
+    pitch: float = 1.9
+    divisions: int = 13
+    largest: float = 0.28
+
+    def __post_init__(self) -> None:
+        if not (0 < self.ratio < 1 and self.pitch > 0 and self.divisions > 0 and self.largest > 0):
+            raise InputError(
+                "mode study: expected 0 < d/l < 1 and a positive pitch, number of elements and "
+                f"load, got {self}"
+            )
+
+    @property
+    def key(self) -> Key:
+        """As :attr:`ModeRow.key`."""
+        names = name_of(self.material, STUDIED_MATERIALS), name_of(self.loading, LOADINGS)
+        return (*names, self.pitch, self.ratio, self.divisions)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternMode:
+    """The numerical pattern of a lattice beside the analytic one.
+
+    ``mesh``: the primitive cell, about a hole, a quarter of the pattern's own [mm]. ``shape``,
+    ``analytic``: (n, 2) both modes at its nodes [-]; the mean of their squared length over the
+    material is 1, their product is positive.
+    """
+
+    row: ModeRow
+    mesh: Mesh
+    shape: FloatArray
+    analytic: FloatArray
+
+
+def name_of(thing: object, names: Mapping[str, object]) -> str:
+    """Its name among these; all its values where it has none."""
+    return next((name for name, known in names.items() if known == thing), repr(thing))
+
+
+def overlap_of_fields(mesh: Mesh, first: FloatArray, second: FloatArray) -> float:
+    """Normalised overlap of two nodal fields (n, 2) over the material [-]."""
+    rule = MeshQuadrature(mesh)
+    return math.sqrt(best_amplitude(rule, rule.values(first), rule.values(second))[1])
+
+
+def mode_likeness(reference: PatternMode, other: PatternMode) -> float:
+    """Overlap of two lattices' modes [-]; InputError unless the meshes differ by a factor only."""
+    nodes = other.mesh.nodes / other.row.pitch, reference.mesh.nodes / reference.row.pitch
+    if nodes[0].shape != nodes[1].shape or not np.allclose(*nodes, rtol=0, atol=1e-9):
+        raise InputError(
+            "mode study: expected two lattices of the same d/l and divisions, got "
+            f"{reference.row.key} and {other.row.key}"
+        )
+    return overlap_of_fields(reference.mesh, reference.shape, other.shape)
+
+
+def pattern_row(lattice: StudiedLattice) -> ModeRow:
+    """Find a lattice's first critical point, and what its lowest mode at (π, π) is like.
+
+    The mode belongs to the first critical state, or without one to the last that was looked at.
+    Where (π, π) is not what is critical there, its eigenvalue says how far off it is.
+    """
+    from modeharvest.fem.bloch.critical import critical_at, first_critical
+    from modeharvest.fem.bloch.real_modes import real_modes
+    from modeharvest.fem.lattice.options import CriticalSearch
+
+    path, search = _path(lattice), CriticalSearch(largest=lattice.largest)
+    found = first_critical(path, search)
+    if not found.found and found.load < lattice.largest:
+        # The path ends within the next step, perhaps behind a critical point: look closely.
+        search = CriticalSearch(largest=lattice.largest, largest_step=_CLOSE)
+        found = first_critical(path, search)
+    kind = kind_of(found, lattice.largest)
+    alone = found if kind == "pattern" else critical_at(path, PATTERN, search)
+    modes = real_modes(path.cell, found.state, (PATTERN,))
+    pitch, shape = lattice.pitch, modes.shapes[0]
+    automatic = mode_family(modes.mesh, modes.lattice, shape, pitch)
+    return ModeRow(
+        *lattice.key, found.found, found.load, kind, alone.load if alone.found else math.nan,
+        found.load, float(modes.eigenvalues[0]), overlap(modes.mesh, shape, EQ_MODE, pitch),
+        automatic.captured, automatic.family.wave_count,
+    )  # fmt: skip
+
+
+def pattern_mode(lattice: StudiedLattice, row: ModeRow | None = None) -> PatternMode:
+    """The mode that a lattice's row is about; without a row, that is found first.
+
+    InputError if there is no equilibrium at the row's state: it is another lattice's.
+    """
+    from modeharvest.fem.bloch.real_modes import real_modes
+
+    row, path = row or pattern_row(lattice), _path(lattice)
+    for load in np.linspace(0.0, row.state, 2 + int(row.state / _STEP)):
+        state = path.at(float(load))
+    if state is None:
+        raise InputError(
+            f"mode study: expected an equilibrium at the load {row.state} of {lattice}, got none; "
+            "remove the table that this row is from"
+        )
+    modes, mesh = real_modes(path.cell, state, (PATTERN,)), path.cell.cell.mesh
+    quarter = cKDTree(modes.mesh.nodes).query(mesh.nodes)[1]
+    analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, lattice.pitch)
+    return PatternMode(row, mesh, *_normalised_pair(mesh, modes.shapes[0][quarter], analytic))
+
+
+def _path(lattice: StudiedLattice) -> CellPath:
+    from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
+    from modeharvest.fem.lattice.cells import UnitCell, square
+
+    # Meshed for l = 1 mm and scaled: gmsh's tolerances are lengths, its meshes of other l others.
+    one = square(1.0, lattice.ratio, 1.0 / lattice.divisions)
+    mesh = Mesh(lattice.pitch * one.mesh.nodes, one.mesh.cells, one.mesh.element)
+    unit = UnitCell(mesh, lattice.pitch * one.lattice)
+    return CellPath(PeriodicCell(unit, lattice.material), lattice.loading)
+
+
+def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArray:
+    """(n, 2) sum of waves (w, 5) at positions (n, 2) [mm], without scale and support [-]."""
+    phases = math.pi / pitch * (positions @ waves[:, 2:4].T + waves[:, 4])
+    return np.asarray(np.sin(phases) @ waves[:, :2])
+
+
+def _normalised_pair(
+    mesh: Mesh, shape: FloatArray, analytic: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Both with a mean square length of 1 over the material, the first with the second's sign."""
+    rule = MeshQuadrature(mesh)
+    a, b = rule.values(shape), rule.values(analytic)
+    sizes = [math.sqrt(rule.product(v, v) / rule.area) for v in (a, b)]
+    sign = math.copysign(1.0, rule.product(a, b))
+    return np.asarray(sign / sizes[0] * shape), np.asarray(analytic / sizes[1])
+
+
+def kind_of(found: LatticeCritical, largest: float) -> str:
+    """What is critical first up to the largest load, as in :class:`ModeRow`."""
+    from modeharvest.fem.bloch.zone import is_same
+
+    if not found.found:
+        return "none" if found.load >= largest else "path ends"
+    if found.least_stable.angle is not None:
+        return "long waves"
+    alone = len(found.waves) == 1 and is_same(found.waves[0], PATTERN)
+    return "pattern" if alone else "other waves"
+
+
 Work = Callable[[StudiedLattice], ModeRow]
 
 
@@ -142,6 +415,13 @@ def first_mode_limit(
     return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
 
 
+def ratio_lattices(
+    ratios: Iterable[float], loadings: Iterable[str], base: StudiedLattice = StudiedLattice()
+) -> list[StudiedLattice]:
+    """Every hole size under every loading, all else as the base has it."""
+    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]
+
+
 def run_lattice_study(
     base: StudiedLattice,
     table: Path | str | None = None,
@@ -161,7 +441,8 @@ def run_lattice_study(
     ``STUDIED_MATERIALS``; ``shown``: d/l of the overlays [-], under the reference's loading.
     """
     kept = ModeTable(table)
-    rows = kept.rows(ratio_lattices(ratios, loadings, base), pattern_row, progress)
+    lattices = ratio_lattices(ratios, loadings, base)
+    rows = kept.rows(lattices, pattern_row, progress)
     limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
     scaled = [replace(base, pitch=pitch) for pitch in pitches]
     others = [replace(base, material=STUDIED_MATERIALS[name]) for name in materials]

@@ -26,7 +26,7 @@ from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
-from modeharvest.validation.studies.lattice_pattern import STUDIED_MATERIALS
+from modeharvest.validation.studies.lattice import STUDIED_MATERIALS
 from modeharvest.validation.studies.modes_specimen import LatticeMode, SpecimenSpec, buckle
 from modeharvest.validation.studies.study import ImagePairSpec, Study, VirtualImagePair
 from modeharvest.validation.truth import Comparison
@@ -124,7 +124,7 @@ class SpecimenRow:
     ``first``: what it buckles into, "pattern", "other" or "none"; ``pattern_share``: the pattern's
     share of that mode. ``critical_strain``, ``strain``: where it buckles and where it is measured,
     with ``unstable_pivots`` negative pivots. ``lattice_...``: ``kind``, ``pattern``, ``overlap`` of
-    the lattice's :class:`~modeharvest.validation.studies.lattice_pattern.ModeRow`, and its a₁.
+    the lattice's :class:`~modeharvest.validation.studies.lattice.ModeRow`, and its a₁.
     """
 
     ratio: float

@@ -30,7 +30,7 @@ from modeharvest.util.errors import InputError, MissingDependencyError
 from modeharvest.util.files import read_json
 from modeharvest.util.stages import digest
 from modeharvest.util.typed import made, to_plain
-from modeharvest.validation.studies.lattice_pattern import PatternMode, StudiedLattice, pattern_mode
+from modeharvest.validation.studies.lattice import PatternMode, StudiedLattice, pattern_mode
 from modeharvest.validation.studies.study import ImagePairSpec
 from modeharvest.validation.workers import leave
 

@@ -137,7 +137,7 @@ FACTORS: dict[str, VariedFactor] = {
         "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
         _contrast, lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
     ),
-    "blur": _option("blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2, 3, 4, 6)),
+    "blur": _option("blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3, 4, 6)),
     "bits": VariedFactor(
         "bits of camera images [-]", (4, 6, 8, 10, 12),
         lambda s, v: _by_camera(changed(s, "imaging", bits=v)),
@@ -149,7 +149,9 @@ FACTORS: dict[str, VariedFactor] = {
     "pixel_size": _option("pixel [mm]", "imaging.pixel_size", (0.01, 0.014, 0.02, 0.028, 0.04)),
     "v0_degree": _option("degree of v0 [-]", "correlation.v0_degree", _DEGREES, whole=True),
     "v_degree": _option("degree of v1 [-]", "correlation.v_degree", _DEGREES, whole=True),
-    "taper": _option("width of the mode's taper [unit cells]", "taper", (0.125, 0.25, 0.5, 0.75, 1)),
+    "taper": _option(
+        "width of the mode's taper [unit cells]", "taper", (0.125, 0.25, 0.5, 0.75, 1.0)
+    ),
     "edge_px": _option(
         "pixels left out at edges [px]", "correlation.edge_px", (0, 1, 2, 3, 5, 8), whole=True
     ),

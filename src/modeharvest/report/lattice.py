@@ -35,8 +35,7 @@ from modeharvest.runs.lattice.results import (
     LatticeRun,
     combination_name,
 )
-from modeharvest.validation.studies.lattice import LatticeModeStudy
-from modeharvest.validation.studies.lattice_pattern import ModeRow, PatternMode
+from modeharvest.validation.studies.lattice import LatticeModeStudy, ModeRow, PatternMode
 
 Summary = Mapping[str, Any]
 

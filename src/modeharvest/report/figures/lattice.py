@@ -39,7 +39,7 @@ from modeharvest.report.figures.style import (
 )
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.studies.lattice_pattern import ModeRow
+from modeharvest.validation.studies.lattice import ModeRow
 
 WINDOW_WIDTH = 2.35  # of a window [in]
 _MARGIN = 0.24  # below it, for the scale bar [in]

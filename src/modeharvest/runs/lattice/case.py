@@ -37,12 +37,14 @@ from modeharvest.util.files import sha256_of
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import digest, stage_key
 from modeharvest.util.typed import nearest
-from modeharvest.validation.studies.lattice import SHOWN, LatticeModeStudy, run_lattice_study
-from modeharvest.validation.studies.lattice_pattern import (
+from modeharvest.validation.studies.lattice import (
     LOADINGS,
     RATIOS,
+    SHOWN,
     STUDIED_MATERIALS,
+    LatticeModeStudy,
     StudiedLattice,
+    run_lattice_study,
 )
 
 if TYPE_CHECKING:
