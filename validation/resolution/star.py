@@ -69,15 +69,14 @@ class Star:
     longest_px: float = 300.0
 
     def __post_init__(self) -> None:
+        size = f"{self.rows} x {self.cols} px"
         if self.rows < 31 or self.rows % 2 == 0 or self.cols < 100:
             raise InputError(
                 "star: expected an odd number of rows, at least 31, and at least 100 columns, got "
-                f"{self.rows} x {self.cols} px"
+                + size
             )
-        require_memory(
-            _BYTES_PER_PIXEL * self.rows * self.cols, f"a star of {self.rows} x {self.cols} px",
-            "take fewer --rows or --cols",
-        )  # fmt: skip
+        needed = _BYTES_PER_PIXEL * self.rows * self.cols
+        require_memory(needed, f"a star of {size}", "take fewer --rows or --cols")
         steepest = 2.0 * np.pi * self.amplitude_px / self.shortest_px
         if not (0.0 < steepest <= _STEEPEST and 0.0 < self.shortest_px < self.longest_px < np.inf):
             raise InputError(
@@ -117,10 +116,10 @@ class Star:
         return np.stack([np.zeros_like(v), -v], axis=-1)
 
     def came_from(self) -> tuple[FloatArray, float]:
-        """(rows, cols) row X of the point that each deformed pixel shows, and max |X + v(X) - x|.
+        """(rows, cols) row X that each deformed pixel shows, and max |X + v(X) - x|, both in px.
 
         The fixed point of X = x - v(X), which each step brings nearer by 2 pi A / p at least, then
-        Newton's steps down to rounding; columns stay what they are. Both in px.
+        Newton's steps down to rounding; columns stay what they are.
         """
         row = np.arange(self.rows, dtype=np.float64)[:, None]
         wave = 2.0 * np.pi / self.period(np.arange(self.cols))
@@ -189,10 +188,8 @@ class StarSpec:
                 f"{', '.join(f'{n:g}' for n in self.noise)}"
             )
         if not 1 <= self.bits <= 16 or self.seed < 0:
-            raise InputError(
-                f"star: expected 1 to 16 bits and a seed of 0 or more, got {self.bits} and "
-                f"{self.seed}"
-            )
+            got = f"{self.bits} and {self.seed}"
+            raise InputError(f"star: expected 1 to 16 bits and a seed of 0 or more, got {got}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,20 +273,21 @@ def star_readme(info: Mapping[str, Any]) -> str:
 def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[str, Any]:
     """The content of ``star.json``."""
     star = spec.star
+    longer = star.longest_px - star.shortest_px
+    law = {
+        "v_down_px": f"{star.amplitude_px:g} cos(2 pi (row - {star.centre_row}) / period)",
+        "period_px": f"{star.shortest_px:g} + {longer:g} col / {star.cols - 1}",
+        "u_px": 0,
+        "of": "points of the reference image; the centre of the upper left pixel is (0, 0)",
+        "residual_of_inversion_px": residual_px,
+    }
     return {
         "format": FORMAT,
         "id": set_id(files),
         "key": stage_key(asdict(spec)),
         "licence": "CC-BY-4.0",
         "made_with": f"modeharvest {__version__}",
-        "law": {
-            "v_down_px": f"{star.amplitude_px:g} cos(2 pi (row - {star.centre_row}) / period)",
-            "period_px": f"{star.shortest_px:g} + {star.longest_px - star.shortest_px:g} "
-            f"col / {star.cols - 1}",
-            "u_px": 0,
-            "of": "points of the reference image; the centre of the upper left pixel is (0, 0)",
-            "residual_of_inversion_px": residual_px,
-        },
+        "law": law,
         "spec": asdict(spec),
         "returned": RETURNED,
         "files": dict(files),

@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +46,10 @@ _KEEP = np.eye(2)
 _TURN = np.diag([1.0, -1.0])
 _EXCHANGE_UP = np.array([[0.0, 1.0], [1.0, 0.0]])
 _EXCHANGE_DOWN = -_EXCHANGE_UP
+_OTHER_SIGN = "u and v had the other sign"
 _COMPONENTS = (
     (_KEEP, 0, ""),
-    (-_KEEP, 1, "u and v had the other sign"),
+    (-_KEEP, 1, _OTHER_SIGN),
     (_TURN, 1, "v had the other sign"),
     (-_TURN, 1, "u had the other sign"),
     (_EXCHANGE_UP, 1, "u and v (up) were exchanged"),
@@ -78,17 +80,23 @@ class Reading:
     changes: int = 0
     text: tuple[str, ...] = ()
 
-    def with_change(self, count: int = 1, text: str = "", **values: object) -> Reading:
+    def with_change(self, count: int, text: str, **values: Any) -> Reading:
         """The same with another change, or several that go together."""
-        changed: Reading = replace(self, **values)  # type: ignore[arg-type]
-        text_of_all = (*self.text, text) if text else self.text
-        return replace(changed, changes=self.changes + count, text=text_of_all)
+        changed = replace(self, **values)
+        known = (*self.text, text) if text else self.text
+        return replace(changed, changes=self.changes + count, text=known)
 
     @property
     def orientation(self) -> tuple[float, ...]:
         """All numbers but the origin's."""
-        return (*self.turn.ravel(), *self.shift, *self.components.ravel(), self.scale,
-                self.deformed)  # fmt: skip
+        how = (*self.components.ravel(), self.scale, self.deformed)
+        return (*self.turn.ravel(), *self.shift, *how)
+
+    @property
+    def place(self) -> tuple[float, ...]:
+        """What its positions depend on."""
+        moved = (*self.turn.ravel(), *(self.shift + self.origin))
+        return (*moved, *self.components.ravel(), self.scale) if self.deformed else moved
 
     def applied(
         self, x: FloatArray, y: FloatArray, u: FloatArray
@@ -112,7 +120,9 @@ def check_conventions(
     sentence about it; none if it is the declared one, or points are too few. InputError if the
     displacements are in pixels and were declared as millimetres, or the reverse.
     """
-    sample = _FieldSample.of(field, truth, grid)
+    every = field.valid_points()
+    some = np.linspace(0, len(every[0]) - 1, min(len(every[0]), _POINTS)).astype(int)
+    sample = _FieldSample([values[some] for values in every], truth, grid.pixel_size)
     if len(sample.x) < 4 * _FEWEST_BLOCKS or not np.isfinite(sample.cap):
         return DECLARED, ()
     candidates = [DECLARED, *_promising(sample, grid)]
@@ -212,9 +222,8 @@ def _promising(sample: _FieldSample, grid: PixelGrid) -> list[Reading]:
 def _in_deformed_positions(reading: Reading) -> Reading:
     """The same at positions in the deformed image; there, the other sign leads back."""
     back = "u led from the deformed image back to the reference"
-    sign = next(text for matrix, _, text in _COMPONENTS if (matrix == -_KEEP).all())
-    if sign in reading.text:
-        rest = tuple(text for text in reading.text if text != sign)
+    if _OTHER_SIGN in reading.text:
+        rest = tuple(text for text in reading.text if text != _OTHER_SIGN)
         return replace(reading, deformed=True, text=(*rest, back))
     return reading.with_change(1, "the positions were those of the deformed image", deformed=True)
 
@@ -222,34 +231,26 @@ def _in_deformed_positions(reading: Reading) -> Reading:
 class _FieldSample:
     """Some of a field's points, with the errors of readings of them.
 
-    ``x``, ``y`` (n,) and ``u`` (n, 2) as declared [mm]; ``truth``: the true displacement anywhere;
-    ``unit``: a pixel [mm].
+    ``points``: x, y (n,) and u (n, 2) as declared [mm]; ``unit``: a pixel [mm].
     """
 
-    def __init__(
-        self, x: FloatArray, y: FloatArray, u: FloatArray, truth: Truth, unit: float
-    ) -> None:
-        self.x, self.y, self.u, self.truth, self.unit = x, y, u, truth, unit
-        self.block = _blocks(x, y)
-        self._known: dict[tuple[object, ...], FloatArray] = {}
+    def __init__(self, points: Sequence[FloatArray], truth: Truth, unit: float) -> None:
+        self.truth, self.unit = truth, unit
+        self.x, self.y, self.u = points
+        self.block = _blocks(self.x, self.y)
+        self._known: dict[tuple[float, ...], FloatArray] = {}
         length = _length(self.errors(DECLARED))
         self.cap = 3.0 * float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
 
-    @classmethod
-    def of(cls, field: LocalField, truth: Truth, grid: PixelGrid) -> _FieldSample:
-        """Some of a field's valid points."""
-        x, y, u = field.valid_points()
-        some = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int)
-        return cls(x[some], y[some], u[some], truth, grid.pixel_size)
-
     def every(self, step: int) -> _FieldSample:
         """One of so many points."""
-        some = slice(None, None, step if len(self.x) > _POINTS // step else 1)
-        return _FieldSample(self.x[some], self.y[some], self.u[some], self.truth, self.unit)
+        step = step if len(self.x) > _POINTS // step else 1
+        points = [values[::step] for values in (self.x, self.y, self.u)]
+        return _FieldSample(points, self.truth, self.unit)
 
     def look_up(self, readings: Sequence[Reading]) -> None:
         """Find the truth for many readings at once, which is quicker than for one after another."""
-        by_place = {_place(reading): reading for reading in readings}
+        by_place = {reading.place: reading for reading in readings}
         new = {place: r for place, r in by_place.items() if place not in self._known}
         if new:
             places = [reading.applied(self.x, self.y, self.u)[:2] for reading in new.values()]
@@ -263,7 +264,7 @@ class _FieldSample:
         where a point would be off the material.
         """
         self.look_up([reading])
-        written = self._known[_place(reading)] @ reading.components / reading.scale
+        written = self._known[reading.place] @ reading.components / reading.scale
         return np.asarray((self.u - written) / self.unit)
 
     def cost(self, reading: Reading) -> float:
@@ -335,12 +336,6 @@ def _less(error: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatAr
     """(n, 2) what a weighted fit by columns (n, m) leaves of errors."""
     root = np.sqrt(weight)[:, None]
     return error - columns @ np.linalg.lstsq(root * columns, root * error, rcond=None)[0]
-
-
-def _place(reading: Reading) -> tuple[object, ...]:
-    """What a reading's positions depend on."""
-    moved = (*reading.turn.ravel(), *(reading.shift + reading.origin))
-    return (*moved, *reading.components.ravel(), reading.scale) if reading.deformed else moved
 
 
 def _blocks(x: FloatArray, y: FloatArray) -> NDArray[np.intp]:

@@ -231,12 +231,8 @@ class ModesAnalysis:
     def of(cls, table: pd.DataFrame) -> ModesAnalysis:
         """From the table of all specimens."""
         ran = table[table["error"] == ""]
-        is_measured = (
-            (ran["first"] == "pattern") & (ran["outcome"] == "converged")
-            if "outcome" in ran
-            else np.zeros(len(ran), dtype=np.bool_)
-        )
-        measured = ran[is_measured]
+        is_converged = ran["outcome"] == "converged" if "outcome" in ran else False
+        measured = ran[(ran["first"] == "pattern") & is_converged]
         sizes = measured[measured["varied"].isin([BASE, "d/l"])].sort_values("ratio")
         return cls(ran, measured, sizes)
 
