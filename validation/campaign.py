@@ -15,9 +15,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from enum import Enum, auto
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 
@@ -28,6 +28,8 @@ from modeharvest.util.stages import exclusive, source_digest
 from modeharvest.validation import workers as work
 from modeharvest.validation.workers import Case, Cases, Workers
 
+_Outcome = Literal["stored", "killed", "cut off"]
+"""Of a case handed to dask: result or failure stored, worker died twice, connection broke."""
 _KILLED = "KilledWorker: its workers died; it may need more memory than they are given"
 _ATTEMPTS = 3
 """Connections in a row that may break before a case is done."""
@@ -63,9 +65,8 @@ class Campaign:
 
     def missing(self) -> Cases:
         """The cases that have no result yet, or failed."""
-        return tuple(
-            case for case in self.cases if work.read_result(self.path(case)).get("error") != ""
-        )
+        done = (work.read_result(self.path(case)).get("error") == "" for case in self.cases)
+        return tuple(case for case, is_done in zip(self.cases, done, strict=True) if not is_done)
 
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``, without lists.
@@ -120,7 +121,7 @@ class Campaign:
                         raise
                     raise InputError(self._gone(error)) from error
                 for case, outcome in self._tried(client, left):
-                    if outcome is _Outcome.CUT_OFF:
+                    if outcome == "cut off":
                         cut_off.append(case)
                     else:
                         yield case
@@ -139,20 +140,20 @@ class Campaign:
         )
 
     def _tried(self, client: Any, cases: Sequence[Case]) -> Iterator[tuple[Case, _Outcome]]:
-        """Each case with what became of it, in the end never KILLED.
+        """Each case with what became of it in the end.
 
         A worker may have died of what it ran beside a case: those whose worker died are tried
         again, each alone, and only then stored as failed.
         """
         killed = []
         for case, outcome in self._submitted(client, cases):
-            if outcome is _Outcome.KILLED:
+            if outcome == "killed":
                 killed.append(case)
             else:
                 yield case, outcome
         for suspect in killed:
             for case, outcome in self._submitted(client, [suspect]):
-                if outcome is _Outcome.KILLED:
+                if outcome == "killed":
                     work.store(self.path(case), case, None, _KILLED)
                 yield case, outcome
 
@@ -161,12 +162,8 @@ class Campaign:
         from distributed import KilledWorker, as_completed
 
         folder = str(self.folder.resolve())  # workers elsewhere have another current one
-        futures = {
-            client.submit(
-                work.run_case, self.function, case, folder, source_digest(), pure=False
-            ): case
-            for case in cases
-        }
+        submit = partial(client.submit, work.run_case, self.function, pure=False)
+        futures = {submit(case, folder, source_digest()): case for case in cases}
         completed = as_completed(list(futures))  # type: ignore[no-untyped-call]
         for future in completed:
             if future.status not in ("finished", "error", "cancelled"):
@@ -175,22 +172,14 @@ class Campaign:
                 continue
             case = futures.pop(future)  # and dask may forget its result
             if future.status == "cancelled":
-                yield case, _Outcome.CUT_OFF
+                yield case, "cut off"
             elif future.status == "finished":
-                yield case, _Outcome.SETTLED
+                yield case, "stored"
             elif isinstance(failure := future.exception(), KilledWorker):
-                yield case, _Outcome.KILLED
+                yield case, "killed"
             else:
                 work.store(self.path(case), case, None, f"{type(failure).__name__}: {failure}")
-                yield case, _Outcome.SETTLED
-
-
-class _Outcome(Enum):
-    """What becomes of a case that was handed to dask."""
-
-    SETTLED = auto()  # its result, or its failure, is stored
-    KILLED = auto()  # its worker died, more than once
-    CUT_OFF = auto()  # the connection to the scheduler broke
+                yield case, "stored"
 
 
 def grid(base: Case, **axes: Sequence[Any]) -> Cases:

@@ -19,8 +19,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, is_dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
-from uuid import uuid4
 
 import numba
 
@@ -113,8 +113,7 @@ _ATTEMPTS = 5
 """To begin an event loop."""
 _PATIENCE_S = 30.0
 """How long to wait for a scheduler that does not answer: it may be on a busy machine."""
-_LIBRARIES = ("OMP", "MKL", "OPENBLAS")
-_ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
+_ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS")}
 """A worker has one thread: cores are shared out by cases. numba has it set in each case, because
 this stands in the parent's own environment for a while, where numba must not change its mind."""
 _FORKS = "forkserver" in multiprocessing.get_all_start_methods()
@@ -246,8 +245,7 @@ def _processes(count: int, memory: str) -> Iterator[Any]:
 def _begun(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """Make a cluster or a client; again if its event loop is slow to begin.
 
-    Dask asserts that the loop's thread runs within 10 s, before anything else is begun; on a
-    machine that is busy enough it does not.
+    Dask asserts that the loop's thread runs within 10 s, which it does not on a busy machine.
     """
     for _ in range(_ATTEMPTS - 1):
         try:
@@ -278,12 +276,9 @@ def _client_of(scheduler: str) -> Iterator[Any]:
 def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> None:
     """Recognise workers without the function, with another modeharvest, or without the folder."""
     require_writable(folder)
-    mark = folder.resolve() / f".seen-{uuid4().hex}"
-    mark.touch()
-    try:
-        answers = client.run(handshake, function, str(mark), on_error="return")
-    finally:
-        mark.unlink(missing_ok=True)
+    folder = folder.resolve()
+    with NamedTemporaryFile(dir=folder, prefix=".seen-") as mark:
+        answers = client.run(handshake, function, mark.name, on_error="return")
     if not answers:
         raise InputError(
             f"expected workers at the dask scheduler {scheduler}, got none; start some with "
@@ -304,8 +299,8 @@ def _require_able(client: Any, scheduler: str, function: str, folder: Path) -> N
             )
         if not sees:
             raise InputError(
-                f"expected workers that can write to the folder {folder.resolve()}, but the one "
-                f"at {worker} can't; take a folder that all of them see under the same path"
+                f"expected workers that can write to the folder {folder}, but the one at {worker} "
+                "can't; take a folder that all of them see under the same path"
             )
 
 
