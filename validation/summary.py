@@ -15,12 +15,7 @@ from modeharvest.idic.modes import two_waves_near
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.idic.solver.noise import ImageNoise
-from modeharvest.idic.spectra.pattern import (
-    WavePattern,
-    mode_deviation,
-    mode_equivalent,
-    read_pattern,
-)
+from modeharvest.idic.spectra import pattern as mode_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, spectral_density
 from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
@@ -233,18 +228,14 @@ def experiment_summary(
     info, images = measured.solution.info, measured.images
     critical = info.get("critical")
     summary = ExperimentSummary(
-        title=case.get("title", ""),
-        case=case,
+        title=case.get("title", ""), case=case, critical=critical,
         critical_strain=None if critical is None else critical["strain"],
-        critical=critical,
-        energy_below_unstable=_energies(measured.solution),
-        snapshots=tuple(snapshots),
+        energy_below_unstable=_energies(measured.solution), snapshots=tuple(snapshots),
         inverse_map_max_residual_px=images.max_residual_px,
-        factorisations=info.get("factorisations"),
-        simulation_outcome=info.get("outcome"),
+        factorisations=info.get("factorisations"), simulation_outcome=info.get("outcome"),
         warnings=tuple(info.get("warnings", [])),
         versions={**info.get("versions", {}), **images.info.get("versions", {})},
-    )
+    )  # fmt: skip
     # What is expected is known for the paper's experiment at its resolution, and no other.
     is_known = measured.experiment == Experiment() and images.spec.pixel_size == 0.01
     return replace(summary, expected=expectations(summary)) if is_known else summary
@@ -252,11 +243,11 @@ def experiment_summary(
 
 def displacement_spectrum(
     comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
-) -> tuple[Spectrum, WavePattern]:
+) -> tuple[Spectrum, mode_pattern.WavePattern]:
     """Spectral densities of the k-th true displacement, and the pattern read from them."""
     at, pitch = comparisons[k], measured.specimen.pitch
     spectrum = spectral_density(at.displacement, at.grid, at.mask, pitch)
-    return spectrum, read_pattern(spectrum)
+    return spectrum, mode_pattern.read_pattern(spectrum)
 
 
 def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
@@ -268,7 +259,7 @@ def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
 
 def snapshot_summary(
     comparisons: Sequence[Comparison],
-    spectra: Sequence[tuple[Spectrum, WavePattern]],
+    spectra: Sequence[tuple[Spectrum, mode_pattern.WavePattern]],
     k: int,
     measured: MeasuredExperiment,
 ) -> SnapshotSummary:
@@ -279,39 +270,27 @@ def snapshot_summary(
     found = identifiability(result, comparison.mask)
     noise = _snapshot_noise(measured, comparison.strain)
     test = result.residual_test(noise)
+    rms = {name: statistics.rms_per_component for name, statistics in px.items()}
     return SnapshotSummary(
-        nominal_strain=comparison.strain,
-        branch=state.branch,
-        negative_pivots=state.negative_pivots,
-        pattern_amplitude_px=size.anywhere,
-        pattern_inner_px=size.inner,
-        pattern_corners_px=size.corners,
-        rms_w_px=px["w"].rms_per_component,
-        rms_best_fit_px=px["best_fit"].rms_per_component,
-        rms_idic_to_best_fit_px=px["idic_to_best_fit"].rms_per_component,
-        rms_residual=result.residual_rms,
-        **_mode_numbers(comparison, measured, found),
-        **_brightness(comparison),
-        mode_observable=not found.unobservable,
-        model_error_estimate_px=found.model_error_px,
+        nominal_strain=comparison.strain, branch=state.branch,
+        negative_pivots=state.negative_pivots, pattern_amplitude_px=size.anywhere,
+        pattern_inner_px=size.inner, pattern_corners_px=size.corners,
+        rms_w_px=rms["w"], rms_best_fit_px=rms["best_fit"],
+        rms_idic_to_best_fit_px=rms["idic_to_best_fit"], rms_residual=result.residual_rms,
+        **_mode_numbers(comparison, measured, found), **_brightness(comparison),
+        mode_observable=not found.unobservable, model_error_estimate_px=found.model_error_px,
         mode_polynomial_overlap=max(found.overlap),
         worst_determined=tuple(str(combination) for combination in found.worst),
         residual_correlation=result.residual_correlation,
         noise_sd=None if noise is None else float(np.hypot(*astuple(noise)) / np.sqrt(2.0)),
         chi_square=None if noise is None else test.chi_square,
-        identifiability_warnings=tuple(found.warnings),
-        residual_verdict=test.sentence,
-        weighting=result.weighting.sentence,
-        iterations=result.iterations,
-        iterations_all_levels=len(result.history),
-        outcome=result.outcome.name.lower(),
-        outcome_why=result.outcome.explanation,
-        condition_number=result.condition_number,
-        undetermined=tuple(result.undetermined),
-        pixels=result.pixels,
-        details_px=px,
+        identifiability_warnings=tuple(found.warnings), residual_verdict=test.sentence,
+        weighting=result.weighting.sentence, iterations=result.iterations,
+        iterations_all_levels=len(result.history), outcome=result.outcome.name.lower(),
+        outcome_why=result.outcome.explanation, condition_number=result.condition_number,
+        undetermined=tuple(result.undetermined), pixels=result.pixels, details_px=px,
         pattern_reading=tuple(pattern.text),
-    )
+    )  # fmt: skip
 
 
 def _snapshot_noise(measured: MeasuredExperiment, strain: float) -> ImageNoise | None:
@@ -370,12 +349,14 @@ def _mode_numbers(
         return {"modes": tuple(modes)}
     parameters, ideal = result.mode_parameters(), start[parts[0]]
     return {
-        "mode": tuple(mode_equivalent(parameters, pitch, ideal)[0]),
+        "mode": tuple(mode_pattern.mode_equivalent(parameters, pitch, ideal)[0]),
         "mode_ideal": tuple(ideal),
         "mode_standard_error": tuple(noise[parts[0]]),
         "mode_model_error": model[parts[0]] if not found.unobservable else (),
-        "mode_deviation_percent": tuple(mode_deviation(parameters, pitch, ideal)),
-        "mode_best_fit": tuple(mode_equivalent(best.mode_parameters(), pitch, ideal)[0]),
+        "mode_deviation_percent": tuple(mode_pattern.mode_deviation(parameters, pitch, ideal)),
+        "mode_best_fit": tuple(
+            mode_pattern.mode_equivalent(best.mode_parameters(), pitch, ideal)[0]
+        ),
     }
 
 

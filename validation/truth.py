@@ -157,8 +157,7 @@ def compare(
 class PatternSize:
     """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px].
 
-    ``anywhere`` in the cellular part; ``inner``, without its outermost ring of unit cells; in its
-    four ``corners`` cells.
+    Of the cellular part ``anywhere``, without its outermost ring of cells, in its corner cells.
     """
 
     anywhere: float
@@ -174,8 +173,7 @@ def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:
 
 def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
     """Measure the identified pattern by regions of the specimen."""
-    grid = comparison.grid
-    a, b = specimen.cellular_half_size
+    grid, (a, b) = comparison.grid, specimen.cellular_half_size
     x, y = np.abs(grid.x)[None, :], np.abs(grid.y)[:, None]
     length = lengths(pattern_field(comparison.result)) / grid.pixel_size
     outermost = 0.5 * specimen.row_distance + specimen.cell_heights[1]
@@ -185,8 +183,5 @@ def pattern_size(comparison: Comparison, specimen: Specimen) -> PatternSize:
         return float(np.max(length, initial=0.0, where=where))
 
     cellular = comparison.cellular(specimen)
-    return PatternSize(
-        largest(cellular),
-        largest(cellular & ~outer_x & ~outer_y),
-        largest(cellular & outer_x & outer_y),
-    )
+    parts = cellular, cellular & ~outer_x & ~outer_y, cellular & outer_x & outer_y
+    return PatternSize(*map(largest, parts))

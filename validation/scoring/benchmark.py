@@ -30,17 +30,9 @@ from modeharvest.imaging.mapping.isoparametric import interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util import __version__
+from modeharvest.util import files as disk
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import (
-    atomic,
-    copy_whole,
-    read_json,
-    read_record,
-    reading,
-    sha256_of,
-    write_json,
-)
 from modeharvest.util.stages import digest
 from modeharvest.util.typed import made
 
@@ -110,11 +102,11 @@ class BenchmarkTruth:
             "'modeharvest benchmark make' leaves it beside the public folder, which has a "
             f"{SIDECAR} without truth"
         )
-        with reading(folder / SIDECAR, what, remedy):
-            info = read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy)
+        with disk.reading(folder / SIDECAR, what, remedy):
+            info = disk.read_record(folder / SIDECAR, TRUTH_FORMAT, what, remedy)
             grid, specimen = made(PixelGrid, info["grid"]), made(Specimen, info["specimen"])
             strains = tuple(map(float, info["strains"]))
-            if sha256_of(folder / SOLUTION) != info["solution_sha256"]:
+            if disk.sha256_of(folder / SOLUTION) != info["solution_sha256"]:
                 raise InputError(
                     f"expected in {folder / SOLUTION} the solution that benchmark {info['id']} was "
                     "made of, got another one or none; make the benchmark again"
@@ -164,7 +156,7 @@ def set_id(files: Mapping[str, Any]) -> str:
 
 def are_whole(folder: Path, digests: Mapping[str, str]) -> bool:
     """Whether a folder holds files with these SHA-256 by their names."""
-    return all(sha256_of(folder / name) == expected for name, expected in digests.items())
+    return all(disk.sha256_of(folder / name) == expected for name, expected in digests.items())
 
 
 def publish(
@@ -185,7 +177,7 @@ def publish(
         for part in (public / SIDECAR, truth / SIDECAR):
             part.unlink(missing_ok=True)
         info = _write_public(images, specimen, public)
-        write_json(public / SIDECAR, info)
+        disk.write_json(public / SIDECAR, info)
         hidden = {
             "format": TRUTH_FORMAT,
             "id": info["id"],
@@ -193,11 +185,11 @@ def publish(
             "strains": list(images.strains),
             "grid": asdict(images.grid),
             "specimen": specimen.plain(),
-            "solution_sha256": sha256_of(truth / SOLUTION),
-            "public_sha256": {name: sha256_of(public / name) for name in (SIDECAR, README)},
+            "solution_sha256": disk.sha256_of(truth / SOLUTION),
+            "public_sha256": {name: disk.sha256_of(public / name) for name in (SIDECAR, README)},
         }
-        write_json(truth / SIDECAR, hidden)  # last: it says that all is there
-    content: dict[str, Any] = read_json(public / SIDECAR)
+        disk.write_json(truth / SIDECAR, hidden)  # last: it says that all is there
+    content: dict[str, Any] = disk.read_json(public / SIDECAR)
     return content
 
 
@@ -236,8 +228,8 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
     kept = [*reference.values(), *(d[k] for d in deformed for k in ("image", "camera_image"))]
     files = {name: dict(images.info["files"][name]) for name in kept}
     for name, entry in files.items():
-        copy_whole(images.folder / name, public / name)
-        if sha256_of(public / name) != entry["sha256"]:
+        disk.copy_whole(images.folder / name, public / name)
+        if disk.sha256_of(public / name) != entry["sha256"]:
             (public / name).unlink()
             raise InputError(
                 f"expected the image that was rendered in {images.folder / name}, got another one; "
@@ -261,7 +253,7 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
         "returned": RETURNED,
         "files": files,
     }
-    with atomic(public / README) as part:
+    with disk.atomic(public / README) as part:
         part.write_text(readme(info), "utf-8")
     return info
 
@@ -269,12 +261,12 @@ def _write_public(images: ImageSet, specimen: Specimen, public: Path) -> dict[st
 def _is_whole(public: Path, truth: Path, images: ImageSet) -> bool:
     """Whether both folders hold these images and their truth, nothing missing or changed."""
     try:
-        info, hidden = read_json(public / SIDECAR), read_json(truth / SIDECAR)
+        info, hidden = disk.read_json(public / SIDECAR), disk.read_json(truth / SIDECAR)
         digests = {name: entry["sha256"] for name, entry in info["files"].items()}
         return bool(
             info["id"] == hidden["id"]
             and hidden["key"] == images.info["key"]
-            and hidden["solution_sha256"] == sha256_of(truth / SOLUTION)
+            and hidden["solution_sha256"] == disk.sha256_of(truth / SOLUTION)
             and are_whole(public, digests | hidden["public_sha256"])
         )
     except (InputError, KeyError, TypeError):

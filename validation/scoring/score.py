@@ -168,19 +168,12 @@ def score(
     def over(part: BoolArray) -> RegionScore:
         return RegionScore.of(error[part], field.good[part])
 
+    by_region = {name: over(on_material & (here == k)) for k, name in enumerate(REGIONS)}
+    covered, off_material = float(near.sum() / (labels >= 0).sum()), int((~on_material).sum())
     return Score(
-        source=field.source,
-        everywhere=over(on_material),
-        by_region={name: over(on_material & (here == k)) for k, name in enumerate(REGIONS)},
-        off_material=int((~on_material).sum()),
-        spacing_px=spacing_px,
-        reach_px=reach_px,
-        near=near,
-        covered=float(near.sum() / (labels >= 0).sum()),
-        x=field.x[used],
-        y=field.y[used],
-        error_px=error[used],
-    )
+        field.source, over(on_material), by_region, off_material, spacing_px, reach_px, near,
+        covered, field.x[used], field.y[used], error[used],
+    )  # fmt: skip
 
 
 def _labels_at(

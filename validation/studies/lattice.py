@@ -447,10 +447,7 @@ def run_lattice_study(
     scaled = [replace(base, pitch=pitch) for pitch in pitches]
     others = [replace(base, material=STUDIED_MATERIALS[name]) for name in materials]
     overlaid = [replace(base, ratio=ratio) for ratio in shown]
-    return LatticeModeStudy(
-        rows,
-        study_likeness(base, scaled, kept, progress),
-        study_likeness(base, others, kept, progress),
-        tuple(limit for limit in limits if limit is not None),
-        tuple(pattern_mode(it, kept.row(it, pattern_row)) for it in overlaid),
-    )
+    scales, other = (study_likeness(base, some, kept, progress) for some in (scaled, others))
+    overlays = tuple(pattern_mode(it, kept.row(it, pattern_row)) for it in overlaid)
+    known = tuple(limit for limit in limits if limit is not None)
+    return LatticeModeStudy(rows, scales, other, known, overlays)

@@ -26,7 +26,7 @@ from modeharvest.idic.spectra.mode_family import overlap
 from modeharvest.imaging.imageset import image_key
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError, MissingDependencyError
+from modeharvest.util.errors import InputError, dolfinx_missing
 from modeharvest.util.files import read_json
 from modeharvest.util.stages import digest
 from modeharvest.util.typed import made, to_plain
@@ -34,10 +34,6 @@ from modeharvest.validation.studies.lattice import PatternMode, StudiedLattice, 
 from modeharvest.validation.studies.study import ImagePairSpec
 from modeharvest.validation.workers import leave
 
-NO_DOLFINX = (
-    "simulating specimens needs dolfinx >= 0.9, which is not on PyPI; with conda-forge: 'conda "
-    "install fenics-dolfinx=0.11 petsc=*=real* python-gmsh', or use 'scripts/env' of the repository"
-)
 _QUADRATURE = 4
 """Points per direction: the pattern's waves are long against the elements."""
 
@@ -53,7 +49,7 @@ def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
         from modeharvest.fem.meshing import mesh_specimen
         from modeharvest.fem.simulate import simulate_pattern
     except ModuleNotFoundError as error:
-        raise MissingDependencyError(NO_DOLFINX) from error
+        raise dolfinx_missing("simulating specimens needs") from error
     mesh = mesh_specimen(experiment.specimen, experiment.mesh_size)
     pattern = PatternCells(mesh, experiment.specimen)
     return simulate_pattern(experiment, mesh, pattern, wanted, largest)
@@ -230,12 +226,11 @@ class LatticeMode:
         MissingDependencyError without dolfinx.
         """
         ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
+        lattice = StudiedLattice(ratio, material=material, pitch=pitch, divisions=divisions)
         try:
-            return cls(pattern_mode(StudiedLattice(
-                ratio, material=material, pitch=pitch, divisions=divisions
-            )))  # fmt: skip
+            return cls(pattern_mode(lattice))
         except ModuleNotFoundError as error:
-            raise MissingDependencyError(NO_DOLFINX) from error
+            raise dolfinx_missing("the mode of an infinite lattice needs") from error
 
     @property
     def aspect(self) -> float:
@@ -252,10 +247,12 @@ class LatticeMode:
         )
         return float(along / across)
 
-    def over(self, specimen: Specimen) -> tuple[Mesh, FloatArray]:
-        """The mode on copies of its cell about all holes: mesh [mm] and (n, 2) nodal field [-].
+    def overlap(self, specimen: Specimen, family: ModeFamily, parameters: ArrayLike) -> float:
+        """Normalised overlap with a family's mode over all unit cells of a specimen [-].
 
-        Neighbours have opposite signs.
+        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude: 1 if they differ by a
+        factor only. u is the mode on copies of its cell about all holes, neighbours of opposite
+        signs.
         """
         mesh, shape = self.mode.mesh, self.mode.shape
         centres = specimen.hole_centres
@@ -263,13 +260,6 @@ class LatticeMode:
         nodes = (centres[:, None, :] + mesh.nodes).reshape(-1, 2)
         first = len(mesh.nodes) * np.arange(len(centres))
         cells = (first[:, None, None] + mesh.cells).reshape(-1, mesh.cells.shape[1])
-        field = ((-1.0) ** steps)[:, None, None] * shape
-        return Mesh(nodes, cells, mesh.element), field.reshape(-1, 2)
-
-    def overlap(self, specimen: Specimen, family: ModeFamily, parameters: ArrayLike) -> float:
-        """Normalised overlap with a family's mode over all unit cells of a specimen [-].
-
-        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude: 1 if they differ by a
-        factor only.
-        """
-        return overlap(*self.over(specimen), family, specimen.pitch, parameters)
+        field = (((-1.0) ** steps)[:, None, None] * shape).reshape(-1, 2)
+        copies = Mesh(nodes, cells, mesh.element)
+        return overlap(copies, field, family, specimen.pitch, parameters)

@@ -70,10 +70,10 @@ class ImagePairSpec:
     load: Callable[[], Solution]
 
     def __post_init__(self) -> None:
-        if self.experiment.specimen.is_staggered:
+        if (specimen := self.experiment.specimen).is_staggered:
             raise InputError(
                 "study: expected a specimen in square or rectangular stacking, which one mode "
-                f"measures, got {self.experiment.specimen.stacking} stacking"
+                f"measures, got {specimen.stacking} stacking"
             )
 
     @cached_property
@@ -127,8 +127,7 @@ class VirtualImagePair:
         """
         described = _description(folder, name)
         strain, specimen = float(described["strain"]), made(Specimen, described["specimen"])
-        setting = made(StudySetting, described["setting"])
-        own = folder / "images" / described["images"]
+        setting, own = made(StudySetting, described["setting"]), cls.images_folder(folder, name)
         try:
             images = ImageSet.read(own)
             if images.is_whole():
@@ -136,7 +135,7 @@ class VirtualImagePair:
         except InputError:
             pass
         solution = Solution.read(folder / "solution.h5")
-        if image_key(solution, setting.imaging, (strain,))[:16] != described["images"]:
+        if image_key(solution, setting.imaging, (strain,))[:16] != own.name:
             raise InputError(
                 f"expected the solution of this study in {folder / 'solution.h5'}, found another; "
                 "take another folder for another experiment"

@@ -322,15 +322,12 @@ def one_level(case: Case, folder: Path) -> LevelResult:
         result = pair.correlate()
         comparison = pair.compare(result)
         return LevelResult(
-            **asdict(comparison.error_parts()),
-            v1_percent=comparison.v1_percent(specimen),
-            outcome=result.outcome.value,
-            iterations=result.iterations,
-            residual=result.residual_rms,
-            pixels=result.pixels,
+            **asdict(comparison.error_parts()), v1_percent=comparison.v1_percent(specimen),
+            outcome=result.outcome.value, iterations=result.iterations,
+            residual=result.residual_rms, pixels=result.pixels,
             pixels_per_ligament=ligament / pair.images.grid.pixel_size,
             at_junctions_mm=_at_junctions(pair, result).ravel().tolist(),
-        )
+        )  # fmt: skip
     finally:
         if not case["keep"]:
             pair.discard()
@@ -338,10 +335,9 @@ def one_level(case: Case, folder: Path) -> LevelResult:
 
 def _at_junctions(pair: VirtualImagePair, result: Result) -> FloatArray:
     """(junctions, 2) displacement between four holes each [mm]."""
-    specimen = pair.specimen
+    s = pair.specimen
     x, y = (
         distance * (np.arange(count + 1, dtype=np.float64) - 0.5 * count)
-        for distance, count in ((specimen.pitch, specimen.holes_x),
-                                (specimen.row_distance, specimen.holes_y))
-    )  # fmt: skip
+        for distance, count in ((s.pitch, s.holes_x), (s.row_distance, s.holes_y))
+    )
     return pair.ansatz.displacement(result.unknowns, x, y).reshape(-1, 2)
