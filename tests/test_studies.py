@@ -216,7 +216,7 @@ def test_without_a_residual_the_cost_is_as_stiff_as_gauss_and_newton_say(
     """And softer with one, if only a little where w is short against a speckle."""
     scene = VirtualImagePair.open(folder, subject.describe(folder, 0.128))
     result = scene.correlate()
-    seen = noise_causes.matched_images(scene, result)
+    seen = scene.matched(result)
     # Chosen at the end itself, not a step before it.
     assert seen.used.sum() == pytest.approx(result.pixels, rel=0.01)
     without_residual = noise_causes.zero_residual(seen)

@@ -81,20 +81,18 @@ def find_buckling(moments: Sequence[ImageAmplitude]) -> Buckling:
     shown = [m for m in loading if m.has_pattern]
     if not shown:
         return Buckling(nan, nan, nan, "No image shows a pattern that stands out of its noise.")
-    first = shown[0]
+    first, estimate = shown[0], _pitchfork(shown)
+    at_first = f"{100 * first.strain:.2f} %"
     plain = [m for m in loading if not m.has_pattern and m.strain < first.strain]
     if not plain:
-        text = f"Every image shows the pattern, from a strain of {100 * first.strain:.2f} % on."
-        return Buckling(nan, first.strain, _pitchfork(shown), text)
-    before = plain[-1].strain
-    estimate = _pitchfork(shown)
-    text = (
-        f"The pattern appears between strains of {100 * before:.2f} % ({plain[-1].name}) and "
-        f"{100 * first.strain:.2f} % ({first.name})."
-    )
+        text = f"Every image shows the pattern, from a strain of {at_first} on."
+        return Buckling(nan, first.strain, estimate, text)
+    before = plain[-1]
+    between = f"{100 * before.strain:.2f} % ({before.name}) and {at_first} ({first.name})"
+    text = f"The pattern appears between strains of {between}."
     if np.isfinite(estimate):
         text += f" Its growth points back to {100 * estimate:.2f} %."
-    return Buckling(before, first.strain, estimate, text)
+    return Buckling(before.strain, first.strain, estimate, text)
 
 
 def _pitchfork(shown: Sequence[ImageAmplitude]) -> float:

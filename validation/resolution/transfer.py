@@ -178,8 +178,8 @@ class TransferCurves:
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
                 for found, among in ((own, getattr(fit, part)), (whole, fit.whole)):
-                    share = _over_phases(among[..., here], waves[..., here])
-                    found[part, axis, degree] = share
+                    shares = _over_phases(among[..., here], waves[..., here])
+                    found[part, axis, degree] = shares
         progress(len(degrees), len(degrees), "resolution: best fits")
         return cls(periods, own, whole)
 

@@ -22,7 +22,6 @@ from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import mode_equivalent
-from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -182,11 +181,9 @@ def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> di
         nearest, _ = mode_equivalent(a, specimen.pitch, family.start)
         row |= _columns(nearest / units, prefix + "{}")
         row[prefix + "overlap_lattice"] = lattice.overlap(specimen, family, a)
-    matched = MatchedImages.of(result, pair.pair, pair.options.edge_px)
-    for cause, covariance in (
-        ("model_error", matched.sandwich_covariance(specimen.pitch)),
-        ("noise", result.covariance(NOISE)),
-    ):
+    covariances = {"model_error": pair.matched(result).sandwich_covariance(specimen.pitch),
+                   "noise": result.covariance(NOISE)}  # fmt: skip
+    for cause, covariance in covariances.items():
         sd = np.sqrt(np.diag(covariance)[result.ansatz.phi_slice(0)]) / units
         row |= _columns(sd, "{}_sd_" + cause)
     return row | asdict(found.error_parts()) | _patterns(found, specimen)

@@ -52,13 +52,6 @@ _WEAK_NOISE = 0.01
 """Noise of the examples [fraction of full scale]; only its linear effect is taken."""
 
 
-def matched_images(
-    virtual: VirtualImagePair, result: Result, pair: ImagePair | None = None
-) -> MatchedImages:
-    """What a correlation of a pair, or of a noisy one, compared at its solution."""
-    return MatchedImages.of(result, pair or virtual.pair, virtual.options.edge_px)
-
-
 def zero_residual(images: MatchedImages) -> MatchedImages:
     """The same without a residual: f is what g says that it is."""
     pair = ImagePair(images.reference, images.deformed, images.result.grid)
@@ -75,7 +68,7 @@ def covariances_by_cause(
     ``result``: of a pair of exact images; ``seed``: of the examples of noise. Infinite on the
     diagonal where the images say nothing.
     """
-    matched, cell = matched_images(pair, result), pair.specimen.pitch
+    matched, cell = pair.matched(result), pair.specimen.pitch
     lost = np.isinf(np.diag(result.inverse))
     at = np.ix_(~lost, ~lost)
     inverse, hessian = result.inverse[at], matched.inverse_hessian[at]
@@ -203,19 +196,15 @@ def one_realisation(case: Case, folder: Path) -> Realisation:
     result = virtual.correlate(pair=pair)
     curvature_sd = None
     if not level or (case["pair"] == 0 and case["sign"] == 1):
-        hessian = matched_images(virtual, result, pair).inverse_hessian
+        hessian = virtual.matched(result, pair).inverse_hessian
         sd = points.predicted(result, hessian)[:, PARTS["u"]]
         curvature_sd = float(np.sqrt((sd**2).mean()))
+    unknowns = list(map(float, result.unknowns))
     found = Realisation(
-        result.outcome.value,
-        result.iterations,
-        result.residual_rms,
-        list(map(float, result.unknowns)),
-        _predicted(points, result, result.covariance(level)) if level else [],
-        curvature_sd,
+        result.outcome.value, result.iterations, result.residual_rms, unknowns, [], curvature_sd
     )
     if level:
-        return found
+        return replace(found, predicted=_predicted(points, result, result.covariance(level)))
     by_cause = covariances_by_cause(virtual, result, case["seed"])
     comparison = virtual.compare(result)
     return replace(
@@ -227,10 +216,7 @@ def one_realisation(case: Case, folder: Path) -> Realisation:
 
 
 def _predicted(points: FieldPoints, result: Result, covariance: FloatArray) -> list[float]:
-    """Standard deviations of the unknowns, and of the fields at the points.
-
-    Five digits are enough, and a third of the file.
-    """
+    """Standard deviations of the unknowns, and of the fields at the points, to five digits."""
     fields = points.predicted(result, covariance)
     both = np.concatenate([np.sqrt(np.diag(covariance)), fields.ravel()])
     return [float(f"{value:.5g}") for value in both]

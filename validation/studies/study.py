@@ -27,6 +27,7 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import SquareLatticeOptions
+from modeharvest.idic.uncertainty.covariance import MatchedImages
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spec import ImagingSpec
@@ -184,6 +185,10 @@ class VirtualImagePair:
         guess = self.initial_guess() if start is None else start
         options = self.options.options()
         return correlate(pair or self.pair, self.ansatz, guess=guess, options=options)
+
+    def matched(self, result: Result, pair: ImagePair | None = None) -> MatchedImages:
+        """What a correlation of the pair, or of a noisy one, compared at its solution."""
+        return MatchedImages.of(result, pair or self.pair, self.options.edge_px)
 
     def compare(self, result: Result) -> Comparison:
         """Set a result against the truth and the best fit of its ansatz."""
