@@ -26,7 +26,6 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
-from modeharvest.util.progress import Progress, silent
 
 
 def lengths(field: FloatArray) -> FloatArray:
@@ -136,9 +135,8 @@ def _difference(minuend: FloatArray, subtrahend: FloatArray) -> FloatArray:
 
 
 def compare(
-    images: ImageSet, strain: float, result: Result, start: FloatArray, camera: bool = False,
-    progress: Progress = silent,
-) -> Comparison:  # fmt: skip
+    images: ImageSet, strain: float, result: Result, start: FloatArray, camera: bool = False
+) -> Comparison:
     """Set a result against the truth of its image set.
 
     ``start``: (n,) unknowns that the measurement started from; the best fit is searched from there
@@ -146,7 +144,7 @@ def compare(
     images were measured.
     """
     grid, mask, truth = images.grid, images.mask(), images.truth(strain)
-    best = best_fit(truth, result, guesses=(start,), progress=progress)
+    best = best_fit(truth, result, guesses=(start,))
     f, g = images.reference(camera=camera), images.deformed(strain, camera=camera)
     left = residual(Assembly(result.ansatz, grid, mask), result.unknowns, f, SplineImage.of(g))
     displacement = truth.displacement

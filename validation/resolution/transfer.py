@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -157,9 +158,7 @@ class TransferCurves:
     whole: dict[Kind, FloatArray]
 
     @classmethod
-    def of(
-        cls, spec: ResolutionSpec, degrees: Sequence[int], progress: Progress = silent
-    ) -> TransferCurves:
+    def of(cls, spec: ResolutionSpec, degrees: Sequence[int], progress: Progress = silent) -> Self:
         """Fit waves of v0 and v1 along both axes at all degrees."""
         buckled, points = spec.buckled, spec.points
         pitch, longer = buckled.specimen.pitch, 2.0 * max(buckled.specimen.half_size)

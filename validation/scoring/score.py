@@ -22,13 +22,12 @@ from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 
 EDGES, LIGAMENTS, JUNCTIONS, BULK = REGIONS = ("edges", "ligaments", "junctions", "bulk")
+Labels = NDArray[np.int8]
 EDGE_PX = 10
 """Material closer than this to a hole or to the outside counts as edge [px]."""
 
 
-def regions(
-    mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int = EDGE_PX
-) -> NDArray[np.int8]:
+def regions(mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int = EDGE_PX) -> Labels:
     """(rows, cols) index of every pixel into :data:`REGIONS`, -1 where there is no material.
 
     Edges come first, then what lies outside the cellular part (bulk); the rest belongs to the
@@ -49,7 +48,7 @@ def regions(
     return labels
 
 
-def _nearest(specimen: Specimen, points: FloatArray) -> NDArray[np.int8]:
+def _nearest(specimen: Specimen, points: FloatArray) -> Labels:
     """Whether the middle of a ligament or of a junction is nearest to points (n, 2) [mm]."""
     # From the nearest hole's centre, in the quarter of its cell where both are positive.
     quarter = np.abs(points - specimen.hole_centres[specimen.nearest_hole(points)])
@@ -145,7 +144,7 @@ def ranked(scores: Sequence[Score]) -> list[Score]:
 def score(
     field: LocalField,
     truth: FloatArray,
-    labels: NDArray[np.int8],
+    labels: Labels,
     grid: PixelGrid,
     reach_px: float = float("inf"),
 ) -> Score:
@@ -176,9 +175,7 @@ def score(
     )  # fmt: skip
 
 
-def _labels_at(
-    x: FloatArray, y: FloatArray, labels: NDArray[np.int8], grid: PixelGrid
-) -> NDArray[np.int8]:
+def _labels_at(x: FloatArray, y: FloatArray, labels: Labels, grid: PixelGrid) -> Labels:
     """(n,) labels of the pixels nearest to positions [mm]; -1 off the image."""
     row, col = grid.to_px(x, y)
     inside = np.ones(x.shape, dtype=np.bool_)
@@ -189,7 +186,7 @@ def _labels_at(
     return found
 
 
-def _require_on_specimen(field: LocalField, labels: NDArray[np.int8], grid: PixelGrid) -> None:
+def _require_on_specimen(field: LocalField, labels: Labels, grid: PixelGrid) -> None:
     """Recognise positions in another unit, or beside the specimen."""
     some = slice(None, None, -(-field.x.size // _ENOUGH_POINTS))
     own_x, own_y = field.x[some], field.y[some]

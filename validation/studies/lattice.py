@@ -255,8 +255,12 @@ def pattern_mode(lattice: StudiedLattice, row: ModeRow | None = None) -> Pattern
         )
     modes, mesh = real_modes(path.cell, state, (PATTERN,)), path.cell.cell.mesh
     quarter = cKDTree(modes.mesh.nodes).query(mesh.nodes)[1]
+    shape, rule = modes.shapes[0][quarter], MeshQuadrature(mesh)
     analytic = wave_sum(EQ_MODE.waves(EQ_MODE.start), mesh.nodes, lattice.pitch)
-    return PatternMode(row, mesh, *_normalised_pair(mesh, modes.shapes[0][quarter], analytic))
+    a, b = rule.values(shape), rule.values(analytic)
+    sizes = [math.sqrt(rule.product(v, v) / rule.area) for v in (a, b)]
+    sign = math.copysign(1.0, rule.product(a, b))
+    return PatternMode(row, mesh, sign / sizes[0] * shape, np.asarray(analytic / sizes[1]))
 
 
 def _path(lattice: StudiedLattice) -> CellPath:
@@ -274,17 +278,6 @@ def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArr
     """(n, 2) sum of waves (w, 5) at positions (n, 2) [mm], without scale and support [-]."""
     phases = math.pi / pitch * (positions @ waves[:, 2:4].T + waves[:, 4])
     return np.asarray(np.sin(phases) @ waves[:, :2])
-
-
-def _normalised_pair(
-    mesh: Mesh, shape: FloatArray, analytic: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Both with a mean square length of 1 over the material, the first with the second's sign."""
-    rule = MeshQuadrature(mesh)
-    a, b = rule.values(shape), rule.values(analytic)
-    sizes = [math.sqrt(rule.product(v, v) / rule.area) for v in (a, b)]
-    sign = math.copysign(1.0, rule.product(a, b))
-    return np.asarray(sign / sizes[0] * shape), np.asarray(analytic / sizes[1])
 
 
 def kind_of(found: LatticeCritical, largest: float) -> str:

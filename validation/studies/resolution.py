@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -53,17 +52,14 @@ def _exact_pair(folder: Path, name: str, motion: str) -> ImagePair:
 @lru_cache(maxsize=32)
 def _noise_free(folder: Path, name: str, motion: str, degree: int) -> Result:
     """What is measured in them."""
-    return ResolutionSpec.read(folder, name).correlate(
-        _exact_pair(folder, name, motion), degree, motion
-    )
+    pair = _exact_pair(folder, name, motion)
+    return ResolutionSpec.read(folder, name).correlate(pair, degree, motion)
 
 
 def one_case(case: Case, folder: Path) -> Row:
     """Run a case of :meth:`ResolutionStudy.prepare`; its ``task`` says what: wave, noise, floor."""
-    run: Callable[[Case, Path], Row] = {"wave": _wave, "noise": _noise, "floor": _floor}[
-        case["task"]
-    ]
-    return run(case, folder)
+    tasks = {"wave": _wave, "noise": _noise, "floor": _floor}
+    return tasks[case["task"]](case, folder)
 
 
 def _wave(case: Case, folder: Path) -> Row:
@@ -140,10 +136,7 @@ def _errors(spec: ResolutionSpec, found: Result, quiet: Result) -> Row:
 def _rms_px(
     spec: ResolutionSpec, v0: FloatArray, v1: FloatArray, v1phi1: FloatArray, u: FloatArray
 ) -> Row:
-    """Rms of fields (k, ...) [mm] at ``spec.sparse`` in px; v1 is scaled to its largest v1 phi1.
-
-    v1 and v1 phi1 count in the cellular part only.
-    """
+    """Rms [px] of fields [mm] at ``spec.sparse``, v1's as the largest v1 phi1 that it makes."""
     _, cellular = spec.sparse
     rms = {"v0": _rms(v0), "v1": LARGEST * _rms(v1[cellular]), "v1phi1": _rms(v1phi1[cellular]),
            "u": _rms(u)}  # fmt: skip
@@ -172,9 +165,7 @@ class ResolutionAnalysis:
     subset_px2: float
 
     @classmethod
-    def of(
-        cls, table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves
-    ) -> ResolutionAnalysis:
+    def of(cls, table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves) -> Self:
         """From the table of all cases, and the best fits of waves at all degrees."""
         rows = table[table["error"] == ""]
         degrees = degrees_of(rows, spec, curves)
@@ -258,10 +249,9 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
             "images": measured.write(folder), "task": "floor", "motion": "buckled", "part": "",
             "axis": 0, "period": 0.0, "phase": 0.0, "degree": 0, "number": 0, "seed": self.seed,
         }  # fmt: skip
-        floors = grid(base, motion=tuple(MOTIONS), degree=self.degrees)
-        noise = grid(
-            {**base, "task": "noise"}, motion=tuple(MOTIONS), number=range(self.realisations)
-        )
+        motions, numbers = tuple(MOTIONS), range(self.realisations)
+        floors = grid(base, motion=motions, degree=self.degrees)
+        noise = grid({**base, "task": "noise"}, motion=motions, number=numbers)
         curves = TransferCurves.of(measured, self.measured, progress)
         waves = [
             {**base, "task": "wave", "part": part, "axis": axis, "phase": phase,

@@ -54,14 +54,10 @@ class VariedFactor:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def option(
-        cls, label: str, path: str, levels: tuple[float, ...], whole: bool = False
-    ) -> VariedFactor:
+    def option(cls, label: str, path: str, levels: tuple[float, ...], whole: bool = False) -> Self:
         """The option at a dotted path of a :class:`StudySetting`."""
-        options, _, name = path.rpartition(".")
-        return cls(
-            label, levels, lambda s, v: changed(s, options, **{name: v}), attrgetter(path), whole
-        )
+        at, _, name = path.rpartition(".")
+        return cls(label, levels, lambda s, v: changed(s, at, **{name: v}), attrgetter(path), whole)
 
     @classmethod
     def choice(cls, label: str, option: str, names: tuple[str, ...]) -> VariedFactor:
