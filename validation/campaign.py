@@ -1,11 +1,10 @@
 """Campaigns: one function for a grid of cases, run by workers, each case stored when it is done.
 
-A case is a mapping of plain values, its seed among them. Its outcome is written, whole or
-not at all, by the worker that ran it, to ``cases/KEY.json`` with KEY the digest of the function's
-name, the case and modeharvest's code: a campaign that is killed goes on where it was, an
-option that is changed makes anew what it touches and nothing else, and results of other
-code are never mixed with this one's. A case that fails is stored with its traceback, and the
-rest goes on.
+A case is a mapping of plain values, its seed among them. Its outcome is written, whole or not at
+all, by the worker that ran it, to ``cases/KEY.json`` with KEY the digest of the function's name,
+the case and modeharvest's code: a campaign that is killed goes on where it was, an option that is
+changed makes anew what it touches and nothing else, and results of other code are never mixed with
+this one's. A case that fails is stored with its traceback, and the rest goes on.
 """
 
 from __future__ import annotations
@@ -71,9 +70,8 @@ class Campaign:
     def run(self, workers: Workers | None = None, progress: Progress = silent) -> pd.DataFrame:
         """Run what is missing and return the table; also left as ``table.csv``, without lists.
 
-        By default two processes of this machine do the work. InputError if the folder can't be
-        written to or another process works in it, the scheduler is not there or goes away, or its
-        workers can't do the work.
+        By default by two processes of this machine. InputError if the folder can't be written to or
+        is in use, the scheduler is not there or goes away, or its workers can't do the work.
         """
         require_writable(self.folder)
         with exclusive(self.folder):

@@ -139,9 +139,8 @@ def compare(
 ) -> Comparison:
     """Set a result against the truth of its image set.
 
-    ``start``: (n,) unknowns that the measurement started from; the best fit is searched from there
-    and from the result, and the better of the two is taken. ``camera``: whether the quantised
-    images were measured.
+    ``start``: (n,) initial guess of the measurement; the best fit is searched from there and from
+    the result, and the better of the two is taken. ``camera``: whether of quantised images.
     """
     grid, mask, truth = images.grid, images.mask(), images.truth(strain)
     best = best_fit(truth, result, guesses=(start,))

@@ -69,8 +69,7 @@ def run_case(function: str, case: Case, folder: str, code: str) -> None:
     Dask has a case run again whose worker dies before the campaign has heard that it is done.
 
     ``folder``: the campaign's, absolute, as a worker elsewhere has another current one; ``code``:
-    digest of modeharvest's where the campaign was begun, an InputError if this worker, which came
-    later, has another.
+    digest of the campaign's modeharvest, an InputError if this worker, which came later, differs.
     """
     if code != source_digest():
         raise InputError(
@@ -146,9 +145,8 @@ class Workers:
     """Who does the work.
 
     ``count``: of processes on this machine; ``memory``: most that each may take, e.g. "4GiB", one
-    that takes more is stopped and its case fails; ``scheduler``: instead, address of a running dask
-    scheduler, e.g. "tcp://host:8786", whose workers must see the campaign's folder and have this
-    version of modeharvest.
+    that takes more is stopped and its case fails; ``scheduler``: instead, address of a dask
+    scheduler, "tcp://host:8786", whose workers must see the folder and have this modeharvest.
     """
 
     count: int = 2

@@ -69,9 +69,8 @@ def subset_transfer(width: int, degree: int, period: ArrayLike) -> FloatArray:
 def subset_noise(width: int, degree: int) -> float:
     """Noise floor of a square subset's centre on even speckle, over sqrt(2) s / G [1/px].
 
-    s is the noise in each image [grey levels], G the rms gradient of the speckle along the
-    displacement [grey levels/px]: the root of the summed squares of the fit's weights, 1/width for
-    affine shape functions. Real speckle isn't even, and n is larger.
+    s is the noise in each image, G the rms gradient of the speckle along the displacement [1/px]:
+    the root of the summed squares of the fit's weights, 1/width for affine shape functions.
     """
     offsets, _ = savitzky_golay(width, degree)
     x, y = (a.ravel() / offsets[-1] for a in np.meshgrid(offsets, offsets))
@@ -148,9 +147,8 @@ def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
 class TransferCurves:
     """Transfers T over the period.
 
-    ``periods``: (n,) [mm], ascending. ``own``, ``whole``: for each (part, axis, degree) the share
-    (n,) of a wave that is found in its own part, and in the whole displacement, over both phases
-    [-].
+    ``periods``: (n,) [mm], ascending. ``own``, ``whole``: by (part, axis, degree) the share (n,) of
+    a wave that is found in its own part, and in the whole displacement, over both phases [-].
     """
 
     periods: FloatArray
@@ -218,8 +216,7 @@ class Passband:
 
     (n,) each [-]: ``stretch``, its wave numbers over the mode's; the shares that are found of a
     small one ``added`` to the mode, a filter, and of the pattern ``itself`` where it is that long,
-    by a fit that starts from the mode; ``wavelength_error``, the relative error of the wavelength
-    that fit finds.
+    by a fit that starts from the mode; ``wavelength_error``, relative, of that fit.
     """
 
     stretch: FloatArray
@@ -285,9 +282,8 @@ class DegreeResolution:
     """A degree of v0 and v1, and what it costs.
 
     ``finest_px``: l10 of waves by part and axis, as "v0 x" [px]. ``floor_px``: n by quantity,
-    :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]. ``indicator_px2``: n l10 by part;
-    l10 is the geometric mean of both axes' [px^2]. ``fixed_px2``: that of v1 phi1 without motion,
-    its phi1 fixed [px^2].
+    :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]. ``indicator_px2``: n l10 by part,
+    l10 the geometric mean of both axes'; ``fixed_px2``: that of v1 phi1 without motion [px^2].
     """
 
     degree: int

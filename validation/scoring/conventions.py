@@ -4,8 +4,7 @@ What a DIC code writes can be misread in many ways, several at once: y up for y 
 or rows and columns exchanged, a sign, deformed positions for reference ones, another origin, px for
 mm. All combinations are tried against the truth. One is reported only if the errors with it are
 smaller than as declared by more than chance explains, and if it leaves nothing of what it was to
-explain: an error of any other kind (noise, bias, too small a strain) is not mistaken for a
-convention.
+explain: an error of another kind (noise, bias, too small a strain) is not taken for a convention.
 """
 
 from __future__ import annotations

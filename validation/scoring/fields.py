@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -85,27 +86,19 @@ def read_measured(
 
 def claimed_benchmark(path: Path) -> str | None:
     """The id that a file itself says it belongs to; None if it says none or can't be read."""
-    try:
-        with reading(path, "a displacement field"):
-            return _claim(path)
-    except InputError:
-        return None  # whoever reads the field itself says what is wrong
-
-
-def _claim(path: Path) -> str | None:
-    suffix, text = path.suffix.lower(), ""
-    if suffix in _TEXT:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            text = "".join(line for line in islice(file, 50) if line[0] in "#%")
-    elif suffix == ".npz":
-        with path.open("rb") as stream:
-            file = np.load(stream, allow_pickle=False)
-            text = f"benchmark {file['benchmark']}"
-    elif h5py.is_hdf5(path):
-        with open_hdf5(path, "a displacement field") as file:
-            text = f"benchmark {file.attrs['benchmark']}"
-    elif suffix == ".mat":
-        text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
+    suffix, text, what = path.suffix.lower(), "", "a displacement field"
+    with suppress(InputError), reading(path, what):  # who reads the field says what is wrong
+        if suffix in _TEXT:
+            with path.open(encoding="utf-8", errors="replace") as file:
+                text = "".join(line for line in islice(file, 50) if line[0] in "#%")
+        elif suffix == ".npz":
+            with path.open("rb") as stream:
+                text = f"benchmark {np.load(stream, allow_pickle=False)['benchmark']}"
+        elif h5py.is_hdf5(path):
+            with open_hdf5(path, what) as file:
+                text = f"benchmark {file.attrs['benchmark']}"
+        elif suffix == ".mat":
+            text = f"benchmark {read_mat(path)['benchmark'].ravel()[0]}"
     found = _ID.search(text)
     return found.group(1).lower() if found else None
 

@@ -32,8 +32,7 @@ def regions(mask: BoolArray, grid: PixelGrid, specimen: Specimen, edge_px: int =
 
     Edges come first, then what lies outside the cellular part (bulk); the rest belongs to the
     ligament or junction whose middle is nearest. ``mask``: (rows, cols) True on material of the
-    undeformed ``specimen``, whose scatter, if any, is small against the ligaments; ``edge_px``:
-    width of the edges [px].
+    undeformed ``specimen``, of small scatter; ``edge_px``: width of the edges [px].
     """
     labels = np.full(grid.shape, -1, dtype=np.int8)
     # A pixel on the boundary belongs to the cellular part, however its position was rounded.
@@ -74,8 +73,7 @@ class RegionScore:
     """The error over one region.
 
     Of its ``points`` the share ``returned`` has a displacement [-]; ``bias_px``: (x, y) mean error;
-    ``rms_px`` is per component; ``percentiles_px``, at :data:`PERCENTILES`, and ``max_px`` are of
-    the error's length [px].
+    ``rms_px`` is per component, ``percentiles_px`` at :data:`PERCENTILES` and ``max_px`` of length.
     """
 
     points: int
@@ -106,12 +104,11 @@ class Score:
     """A graded field.
 
     ``everywhere``: over all points on material; ``by_region``: for each of :data:`REGIONS`.
-    ``off_material``: points in holes or outside the specimen, not graded. ``spacing_px`` of the
-    points on material; of those at the same place, one counts [px]. ``reach_px``: how far from a
-    point its displacement stands for others, one spacing if that is within the reach given [px].
-    ``near``: (rows, cols) True on material within reach of a valid point; ``covered``: share of the
-    material that is near [-]. ``x``, ``y`` (m,) [mm] and ``error_px`` (m, 2) of the valid points on
-    material.
+    ``off_material``: points beside it, not graded. ``spacing_px`` of the points on material; of
+    those at the same place, one counts [px]. ``reach_px``: how far from a point its displacement
+    stands for others, one spacing if that is within the reach given [px]. ``near``: (rows, cols)
+    True on material within reach of a valid point; ``covered``: share of the material that is near
+    [-]. ``x``, ``y`` (m,) [mm] and ``error_px`` (m, 2) of the valid points on material.
     """
 
     source: str
@@ -152,8 +149,7 @@ def score(
 
     ``truth``: (n, 2) true displacements at these points [mm], NaN off the material; ``labels``:
     (rows, cols) of :func:`regions`; ``grid``: the reference image's pixels; ``reach_px``: farthest
-    from a point that its displacement can stand for [px]. InputError if no point lies on the
-    material.
+    from a point that its displacement can stand for [px]. InputError if none is on the material.
     """
     here = _labels_at(field.x, field.y, labels, grid)
     _require_on_specimen(field, labels, grid)
@@ -253,9 +249,8 @@ class ErrorSpectrum:
     """The error by wavelength, in thirds of an octave.
 
     ``wavelength_px``: (m,) middle of each band, ascending. ``rms_px``: (m,) rms error per component
-    in it; the squares of all and of ``affine_px`` add up to that of the whole error, but for what
-    bins of a fine field average out. ``affine_px``: rms of the error's affine part: translation,
-    rotation, strain.
+    in it; the squares of all and of ``affine_px``, the rms of the error's affine part, add up to
+    that of the whole error, but for what bins of a fine field average out.
     """
 
     wavelength_px: FloatArray

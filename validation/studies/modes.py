@@ -91,8 +91,12 @@ def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
     """Buckle, image, measure and compare: a :class:`SpecimenRow`, and :func:`_measured_row`."""
     own = folder / "specimens" / case["specimen"]
     described = SpecimenSpec.read(own / "specimen.json")
-    solution = _solution(described, folder)
-    experiment = described.experiment
+    experiment, path = described.experiment, described.solution_path(folder)
+    if not path.is_file():  # simulating costs most, and knows nothing of images
+        if described.given:
+            raise InputError(f"expected the base's solution at {path}, found none; run it again")
+        buckle(experiment, described.amplitude, described.largest).write(path)
+    solution = Solution.read(path)
     lattice = LatticeMode.of(experiment.specimen, experiment.material, described.divisions)
     row = asdict(SpecimenRow.of(described, solution, lattice))
     if row["first"] == "none":
@@ -103,16 +107,6 @@ def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
         return row | _measured_row(pair, lattice, own)
     finally:
         pair.discard()
-
-
-def _solution(described: SpecimenSpec, folder: Path) -> Solution:
-    """The one that is there, or a new one: simulating costs most, and knows nothing of images."""
-    path = described.solution_path(folder)
-    if not path.is_file():
-        if described.given:
-            raise InputError(f"expected the base's solution at {path}, found none; run it again")
-        buckle(described.experiment, described.amplitude, described.largest).write(path)
-    return Solution.read(path)
 
 
 @dataclass(frozen=True)
@@ -167,8 +161,7 @@ def _measured_row(pair: VirtualImagePair, lattice: LatticeMode, own: Path) -> di
     deviations by model error, and by noise of :data:`NOISE`. ``overlap_lattice``: of the mode, of
     constant amplitude, with the infinite lattice's over all cells; ``overlap_truth``: of v₁φ₁ with
     the truth less the best fit's v₀ over the cellular material; ``best_...`` the same of the best
-    fit. ``amplitude``: rms length of v₁φ₁ over the cellular material, in shares of l. And the
-    fields of :class:`~modeharvest.validation.truth.ErrorParts`.
+    fit. ``amplitude``: rms length of v₁φ₁ over the cellular material, in shares of l.
     """
     result = pair.correlate()
     found, specimen = pair.compare(result), pair.specimen
@@ -250,12 +243,11 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
     """
 
     question: ClassVar[str] = (
-        "The paper argues that the pattern of a square stacking of holes is one mode, "
-        "whatever the size of its cells, nearly whatever that of its holes, and the material. "
-        "Here it is measured: specimens are buckled, imaged and correlated with the mode’s "
-        "parameters free, and what is found is set against the mode of the infinite lattice, "
-        "against Eq. (mode) of the paper, and against the best fit to the specimen’s own "
-        "displacement."
+        "The paper argues that the pattern of a square stacking of holes is one mode, whatever "
+        "the size of its cells, nearly whatever that of its holes, and the material. Here it is "
+        "measured: specimens are buckled, imaged and correlated with the mode’s parameters free, "
+        "and what is found is set against the mode of the infinite lattice, against Eq. (mode) of "
+        "the paper, and against the best fit to the specimen’s own displacement."
     )
     function: ClassVar[str] = f"{__name__}:one_specimen"
     measures_mode: ClassVar[bool] = True

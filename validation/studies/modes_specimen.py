@@ -103,9 +103,8 @@ class SpecimenSpec:
 
     ``experiment``: the compression test, its strains still to be found; ``amplitude``: of the
     pattern that it is compressed to [mm]; ``largest``: strain up to which to look for where it
-    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell; ``imaging``,
-    ``correlation``: how it is imaged and correlated; ``given``: the digest of a solution that is
-    there already, "" to simulate.
+    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell; ``given``: the
+    digest of a solution that is there already, "" to simulate.
     """
 
     experiment: Experiment
@@ -250,9 +249,8 @@ class LatticeMode:
     def overlap(self, specimen: Specimen, family: ModeFamily, parameters: ArrayLike) -> float:
         """Normalised overlap with a family's mode over all unit cells of a specimen [-].
 
-        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude: 1 if they differ by a
-        factor only. u is the mode on copies of its cell about all holes, neighbours of opposite
-        signs.
+        |∫ u·φ| / (‖u‖ ‖φ‖), both without mean and of constant amplitude; u is the mode on copies
+        of its cell about all holes, neighbours of opposite signs.
         """
         mesh, shape = self.mode.mesh, self.mode.shape
         centres = specimen.hole_centres

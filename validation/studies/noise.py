@@ -139,9 +139,9 @@ class NoiseStudy(Study[NoiseAnalysis]):
 
     question: ClassVar[str] = (
         "A camera adds noise. What does it do to what is measured? The same pair of virtual "
-        "images is correlated under many realisations of white noise; bias and scatter are "
-        "set against the Cramér–Rao bound, and the error bars that each result predicts "
-        "against its errors."
+        "images is correlated under many realisations of white noise; bias and scatter are set "
+        "against the Cramér–Rao bound, and the error bars that each result predicts against its "
+        "errors."
     )
     function: ClassVar[str] = f"{__name__}:one_realisation"
 

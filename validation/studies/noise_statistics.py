@@ -106,10 +106,9 @@ class Estimate:
 class PairedErrors:
     """Errors under noise.
 
-    ``errors``: (pairs, 2, ...) of the realisations n and -n, in any unit; ``predicted``, of the
-    same shape: the standard deviations that each result predicts; ``bound``: (...) the least
-    standard deviations there can be, 0 for what no noise moves (a mode outside its support), which
-    does not count.
+    ``errors``, ``predicted``: (pairs, 2, ...) of the realisations n and -n, in any unit, and the
+    standard deviations that each result predicts; ``bound``: (...) the least there can be, 0 for
+    what no noise moves (a mode outside its support), which does not count.
     """
 
     errors: FloatArray
@@ -286,8 +285,7 @@ class NoiseAnalysis:
 
     ``by_bound``, ``by_least``, ``by_hessian``: errors against the Cramér–Rao bound, the least of
     least squares and the Hessian-corrected covariance. ``curvature_sd_ratio``: by level, u's
-    standard deviation by noisy images' own curvature over that of exact ones. ``not_converged``: a
-    number.
+    standard deviation by noisy images' own curvature over that of exact ones.
     """
 
     points: FieldPoints

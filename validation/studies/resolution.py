@@ -180,17 +180,15 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
 
     ``strain``: nominal compression of the base motion [-]; ``pattern``: its v1, the same everywhere
     [mm]; ``degrees``: of v0 and v1 alike; ``measured``: those of them that images are measured
-    with, too; ``amplitude_px``: of a wave [px]; ``noise``: standard deviation in each image
-    [fraction of full scale], with so many ``realisations``, from ``seed``. InputError if a value is
-    out of its range.
+    with, too; ``amplitude_px``: of a wave [px]; ``noise``: standard deviation in each image, of
+    full scale, with so many ``realisations``, from ``seed``. InputError for values out of range.
     """
 
     question: ClassVar[str] = (
-        "How fine a change of v0 and v1 does an ansatz of polynomials show, and what noise "
-        "does each degree cost? Small waves on a buckled specimen are measured; the period "
-        "at which 10 % of their amplitude is lost, times the noise floor, is the "
-        "metrological efficiency indicator of DIC Challenge 2.0, carried over to "
-        "parametrised fields."
+        "How fine a change of v0 and v1 does an ansatz of polynomials show, and what noise does "
+        "each degree cost? Small waves on a buckled specimen are measured; the period at which 10 "
+        "% of their amplitude is lost, times the noise floor, is the metrological efficiency "
+        "indicator of DIC Challenge 2.0, carried over to parametrised fields."
     )
     function: ClassVar[str] = f"{__name__}:one_case"
     measures_mode: ClassVar[bool] = True

@@ -205,9 +205,9 @@ class SystematicStudy(Study[SystematicAnalysis]):
     """
 
     question: ClassVar[str] = (
-        "Without noise a measurement is still wrong. What makes it so? One option of the "
-        "images or of the correlation is changed at a time, and the error is split into what "
-        "the ansatz can’t describe and what the measurement adds."
+        "Without noise a measurement is still wrong. What makes it so? One option of the images "
+        "or of the correlation is changed at a time, and the error is split into what the ansatz "
+        "can’t describe and what the measurement adds."
     )
     function: ClassVar[str] = f"{__name__}:one_level"
 
@@ -281,19 +281,15 @@ class SystematicStudy(Study[SystematicAnalysis]):
         setting = VirtualImagePair.open(folder, table["images"].iloc[0]).setting
         done = table[table["error"] == ""]
         base = done[done["factor"] == BASE]
-        rows = _in_base_pixels(done).assign(moved=_moved(done) / setting.imaging.pixel_size)
+        # A ligament shows how large a level's own pixels are.
+        in_base = base["pixels_per_ligament"].mean() / done["pixels_per_ligament"]
+        pixels = {key: done[key] * in_base for key in ERRORS if key.endswith("_px")}
+        rows = done.assign(**pixels, moved=_moved(done) / setting.imaging.pixel_size)
         return SystematicAnalysis(
             rows,
             {name: float(base[name].mean()) for name in ERRORS},
             {name: FACTORS[name].base(setting) for name in self.factors},
         )
-
-
-def _in_base_pixels(done: pd.DataFrame) -> pd.DataFrame:
-    """Errors in pixels of one size: a ligament shows how large a level's own are."""
-    at_base = done.loc[done["factor"] == BASE, "pixels_per_ligament"].mean()
-    factor = at_base / done["pixels_per_ligament"]
-    return done.assign(**{key: done[key] * factor for key in ERRORS if key.endswith("_px")})
 
 
 def _moved(done: pd.DataFrame) -> pd.Series:
