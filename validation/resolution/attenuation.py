@@ -75,10 +75,7 @@ class Attenuation:
 
     @classmethod
     def of(cls, star: Star, field: LocalField) -> Attenuation:
-        """Read the curve off a field in px, on the star's grid.
-
-        InputError if it covers too few columns, or holds no such wave.
-        """
+        """Of a field in px on the star's grid; InputError if columns are few or have no wave."""
         with np.errstate(invalid="ignore"):
             inside = (field.x >= -0.5) & (field.x <= star.cols - 0.5)
             near = inside & (np.abs(field.y) <= 0.5 * star.period(field.x))
@@ -117,10 +114,7 @@ class Attenuation:
 
     @cached_property
     def safe_px(self) -> float:
-        """The period from which on T stays above 0.9 [px]; NaN if it doesn't.
-
-        Above :attr:`finest_px` where a curve dips again.
-        """
+        """The period from which on T stays above 0.9 [px]; NaN if there is none."""
         period, share = self._known
         below = np.flatnonzero(share < KEPT)
         if not len(below) or below[-1] == len(share) - 1:
@@ -129,9 +123,9 @@ class Attenuation:
 
     @cached_property
     def challenge_px(self) -> float:
-        """l10 as in the DIC Challenge: where a polynomial through the centre row first reaches 0.9.
+        """l10 as in the DIC Challenge: a polynomial of degree 12 through the centre row's T at 0.9.
 
-        Of degree 12 in the column; NaN if it never does, or the row has too few points.
+        NaN if it never is, or the row has too few points.
         """
         at, share = self.centre.period, self.centre.share
         if len(at) <= 4 * _CHALLENGE_DEGREE:
@@ -142,10 +136,7 @@ class Attenuation:
 
     @cached_property
     def ripple(self) -> float:
-        """Rms of the centre row's T about the smoothed curve, at periods above l10 [-].
-
-        Without noise in the images it is the pattern-induced bias.
-        """
+        """Rms of the centre row's T about the curve above l10 [-]: noise, pattern-induced bias."""
         expected = np.interp(self.centre.period, self.period, self.curve[0])
         long = self.centre.period > np.nan_to_num(self.finest_px, nan=0.0)
         left = (self.centre.share - expected)[long]

@@ -121,10 +121,8 @@ class AddedWave:
 
     def __post_init__(self) -> None:
         if self.part not in ("v0", "v1") or self.axis not in (0, 1) or not self.period > 0.0:
-            raise InputError(
-                "expected a wave of 'v0' or 'v1' along axis 0 or 1 with a period above 0, got "
-                f"{self.part!r}, {self.axis} and {self.period}"
-            )
+            wanted = "a wave of 'v0' or 'v1' along axis 0 or 1 with a period above 0"
+            raise InputError(f"expected {wanted}, got {self.part!r}, {self.axis} and {self.period}")
 
     def shape(self, points: FloatArray) -> FloatArray:
         """(...) the wave alone at points (..., 2) [mm], of amplitude 1 [-]."""

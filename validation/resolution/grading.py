@@ -138,16 +138,11 @@ class NoiseFloor:
 
     @classmethod
     def of(cls, star: Star, still: LocalField) -> NoiseFloor:
-        """From a field without motion, in px on the star's grid.
-
-        InputError if there are few points, or something moves.
-        """
+        """Of a field in px on the star's grid; InputError if points are few, or something moves."""
         x, _, u = still.valid_points()
         if len(x) < _FEWEST_POINTS:
-            raise InputError(
-                f"{still.source}: expected {_FEWEST_POINTS} points or more without motion, got "
-                f"{len(x)}"
-            )
+            few = f"{_FEWEST_POINTS} points or more without motion, got {len(x)}"
+            raise InputError(f"{still.source}: expected {few}")
         sd = u.std(axis=0)
         if sd[1] > _TOO_LOUD * star.amplitude_px / np.sqrt(2.0):
             raise InputError(

@@ -71,10 +71,8 @@ class Star:
     def __post_init__(self) -> None:
         size = f"{self.rows} x {self.cols} px"
         if self.rows < 31 or self.rows % 2 == 0 or self.cols < 100:
-            raise InputError(
-                "star: expected an odd number of rows, at least 31, and at least 100 columns, got "
-                + size
-            )
+            wanted = "an odd number of rows, at least 31, and at least 100 columns"
+            raise InputError(f"star: expected {wanted}, got {size}")
         needed = _BYTES_PER_PIXEL * self.rows * self.cols
         require_memory(needed, f"a star of {size}", "take fewer --rows or --cols")
         steepest = 2.0 * np.pi * self.amplitude_px / self.shortest_px
@@ -138,10 +136,7 @@ class Star:
 
 
 def fine_speckle(seed: int = 0) -> SpeckleSpec:
-    """A speckle for subsets from 9 px on: speckle size 5 px (autocorrelation FWHM).
-
-    Noise of a tenth of full scale is cut off at neither end.
-    """
+    """A speckle of size 5 px (autocorrelation FWHM) that noise of 10 % does not saturate."""
     return SpeckleSpec(standard_deviation=0.1, blur_px=1.0, dark=0.1, bright=0.9, seed=seed)
 
 
@@ -183,10 +178,9 @@ class StarSpec:
         object.__setattr__(self, "noise", tuple(self.noise))
         is_twice = len({image_name("", n) for n in self.noise}) < len(self.noise)
         if is_twice or not all(1e-4 <= n <= 0.1 for n in self.noise):
-            raise InputError(
-                "star: expected different levels of noise from 0.0001 to 0.1 of full scale, got "
-                f"{', '.join(f'{n:g}' for n in self.noise)}"
-            )
+            got = ", ".join(f"{n:g}" for n in self.noise)
+            wanted = "different levels of noise from 0.0001 to 0.1 of full scale"
+            raise InputError(f"star: expected {wanted}, got {got}")
         if not 1 <= self.bits <= 16 or self.seed < 0:
             got = f"{self.bits} and {self.seed}"
             raise InputError(f"star: expected 1 to 16 bits and a seed of 0 or more, got {got}")

@@ -93,10 +93,7 @@ class BenchmarkTruth:
 
     @classmethod
     def read(cls, folder: Path | str) -> BenchmarkTruth:
-        """Open a truth folder.
-
-        InputError if it is none, or its solution is not the one that the images were made of.
-        """
+        """Open a truth folder; InputError if it is none, or its solution not that of the images."""
         folder, what = Path(folder), "the truth of a benchmark"
         remedy = (
             "'modeharvest benchmark make' leaves it beside the public folder, which has a "
@@ -164,11 +161,10 @@ def publish(
 ) -> dict[str, Any]:
     """Write the public folder, and into the truth's folder what belongs to it.
 
-    ``images``: a finished set, made with a perfect lens; ``specimen``: the undeformed geometry;
-    ``public``: made if it does not exist, a finished set of the same images is left as it is;
-    ``truth``: holds ``solution.h5``, of which the images were made. Returns the content of the
-    public ``benchmark.json``. InputError if the images were made with a lens that distorts or are
-    not what was rendered, or the truth would be public.
+    ``images``: a finished set; ``specimen``: the undeformed geometry; ``public``: a finished set of
+    the same images is left as it is; ``truth``: holds ``solution.h5``, of which they were made.
+    Returns the content of the public ``benchmark.json``. InputError if a lens distorts the images,
+    they are not what was rendered, or the truth would be public.
     """
     public, truth = Path(public), Path(truth)
     require_apart(public, truth)

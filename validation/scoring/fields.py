@@ -64,10 +64,8 @@ def read_measured(
         found = "a folder" if path.is_dir() else "no such file"
         raise InputError(f"expected a displacement field in {path}, found {found}")
     if path.suffix.lower() not in _KINDS:
-        raise InputError(
-            f"{path}: expected one of {', '.join(sorted(_KINDS))}, got {path.suffix!r}; "
-            "save the field as CSV"
-        )
+        known, got = ", ".join(sorted(_KINDS)), path.suffix
+        raise InputError(f"{path}: expected one of {known}, got {got!r}; save the field as CSV")
     claimed = claimed_benchmark(path)
     if claimed not in (None, benchmark):
         raise InputError(

@@ -124,10 +124,8 @@ SHOWN = (0.95, 0.7895, 0.25)
 """Of d/l in the paper's Fig. "graded", from left to right."""
 _STEP, _CLOSE = 0.02, 0.002  # of the load [-]
 LOADINGS: dict[str, MacroLoading] = {
-    "uniaxial": uniaxial(),
-    "uniaxial strain": uniaxial_strain(),
-    "equibiaxial": equibiaxial(),
-}
+    "uniaxial": uniaxial(), "uniaxial strain": uniaxial_strain(), "equibiaxial": equibiaxial()
+}  # fmt: skip
 
 
 def ogden(exponent: float, poisson: float, shear: float = 0.6) -> Ogden:
@@ -161,10 +159,8 @@ class StudiedLattice:
 
     def __post_init__(self) -> None:
         if not (0 < self.ratio < 1 and self.pitch > 0 and self.divisions > 0 and self.largest > 0):
-            raise InputError(
-                "mode study: expected 0 < d/l < 1 and a positive pitch, number of elements and "
-                f"load, got {self}"
-            )
+            wanted = "0 < d/l < 1 and a positive pitch, number of elements and load"
+            raise InputError(f"mode study: expected {wanted}, got {self}")
 
     @property
     def key(self) -> Key:
@@ -396,11 +392,9 @@ def first_mode_limit(
     known = sorted((row for row in rows if row.loading == loading), key=lambda row: row.ratio)
     below = [row for row in known if not row.is_first]
     above = [row for row in known if row.is_first and (not below or row.ratio > below[-1].ratio)]
-    if not below or not above:
+    if not below or not above or below[-1].kind == "path ends":
         return None
     low, high = below[-1], above[0]
-    if low.kind == "path ends":
-        return None
     while high.ratio - low.ratio > tolerance:
         ratio = round(0.5 * (low.ratio + high.ratio), 6)
         middle = table.row(replace(base, ratio=ratio, loading=LOADINGS[loading]), pattern_row)

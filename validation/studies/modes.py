@@ -266,18 +266,14 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
             raise InputError(f"study: expected ratios d/l between 0 and 1, got {list(self.ratios)}")
         if not all(0.0 < p < float("inf") for p in self.pitches):
             raise InputError(f"study: expected pitches above 0 mm, got {list(self.pitches)}")
-        unknown = [name for name in self.materials if name not in STUDIED_MATERIALS]
-        if unknown:
-            raise InputError(
-                f"study: expected materials among {list(STUDIED_MATERIALS)}, got {unknown}"
-            )
+        if unknown := set(self.materials) - set(STUDIED_MATERIALS):
+            known = list(STUDIED_MATERIALS)
+            raise InputError(f"study: expected materials among {known}, got {sorted(unknown)}")
         if 0.0 in (*self.gradings_x, *self.gradings_y):
             raise InputError("study: expected gradings other than 0, which the base has, got 0")
         if not (0.0 < self.largest < 0.5 and 4 <= self.divisions <= 200):
-            raise InputError(
-                "study: expected largest between 0 and 0.5 and 4 to 200 divisions, got "
-                f"{self.largest} and {self.divisions}"
-            )
+            wanted = "largest between 0 and 0.5 and 4 to 200 divisions"
+            raise InputError(f"study: expected {wanted}, got {self.largest} and {self.divisions}")
         for name in ("ratios", "pitches", "materials", "gradings_x", "gradings_y"):
             self.require_different(name, getattr(self, name))
 

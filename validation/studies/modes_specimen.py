@@ -89,8 +89,7 @@ class PatternCells:
     def amplitude(self, displacement: FloatArray) -> float:
         """The pattern's amplitude in a nodal displacement (n, 2), where it is largest [mm].
 
-        In each 2 x 2 cells the projection on the pattern: what has the lattice's own period, and
-        what is linear, has none there.
+        Of 2 x 2 cells each: what has the lattice's period, or is linear, has no projection there.
         """
         cells = self._products(self._rule.values(displacement)) / self._own
         blocks = sliding_window_view(cells, tuple(min(2, n) for n in self._shape))

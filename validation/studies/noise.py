@@ -152,14 +152,11 @@ class NoiseStudy(Study[NoiseAnalysis]):
 
     def __post_init__(self) -> None:
         if not self.levels or not all(0.0 < level < 1.0 for level in self.levels):
-            raise InputError(
-                f"study: expected levels above 0 and below 1 of full scale, got {list(self.levels)}"
-            )
+            wanted, levels = "levels above 0 and below 1 of full scale", list(self.levels)
+            raise InputError(f"study: expected {wanted}, got {levels}")
         if not 2 <= self.pairs <= self.most or self.seed < 0:
-            raise InputError(
-                f"study: expected 2 to {self.most} pairs and a seed of 0 or more, got "
-                f"{self.pairs} and {self.seed}"
-            )
+            wanted, got = f"2 to {self.most} pairs", f"{self.pairs} and {self.seed}"
+            raise InputError(f"study: expected {wanted} and a seed of 0 or more, got {got}")
         self.require_different("levels", self.levels)
 
     def require(self, correlation: SquareLatticeOptions) -> None:

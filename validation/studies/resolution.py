@@ -207,10 +207,8 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
         if not self.degrees or not all(1 <= d <= 12 for d in self.degrees):
             raise InputError(f"study: expected degrees from 1 to 12, got {list(self.degrees)}")
         if not self.measured or not set(self.measured) <= set(self.degrees):
-            raise InputError(
-                f"study: expected measured degrees among {list(self.degrees)}, got "
-                f"{list(self.measured)}"
-            )
+            known, got = list(self.degrees), list(self.measured)
+            raise InputError(f"study: expected measured degrees among {known}, got {got}")
         if not (0.0 < self.amplitude_px <= 2.0 and 0.0 < self.noise < 0.1):
             raise InputError(
                 "study: expected an amplitude above 0 and up to 2 px and noise above 0 and below "

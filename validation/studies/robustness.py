@@ -22,11 +22,8 @@ SAME_PX = 0.01
 """Solutions nearer than this, rms, are the same minimum [px]."""
 OUTLIER_PERCENT = 1.5
 """Above this epsilon the paper calls a result erroneous."""
-PUBLISHED = {
-    "success": 0.98,
-    "mean_epsilon_percent": 0.86,
-    "mean_epsilon_without_outliers_percent": 0.45,
-}
+PUBLISHED = {"success": 0.98, "mean_epsilon_percent": 0.86,
+             "mean_epsilon_without_outliers_percent": 0.45}  # fmt: skip
 """Section "Virtual Experiments" of the paper: 100 initial guesses, parameters up to 10 % off."""
 EVERY = 4
 """Displacements are compared at every fourth pixel: they are smooth."""
@@ -162,15 +159,11 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
                 f"got {self.initial_guesses}, {self.per_radius} and {self.seed}"
             )
         if not all(0 < r <= 1 for r in (self.radius, *self.radii)):
-            raise InputError(
-                f"study: expected radii above 0 and at most 1, got {self.radius} and "
-                f"{list(self.radii)}"
-            )
+            got = f"{self.radius} and {list(self.radii)}"
+            raise InputError(f"study: expected radii above 0 and at most 1, got {got}")
         if self.radius in self.radii:
-            raise InputError(
-                f"study: expected radii other than radius = {self.radius}, which has its own "
-                f"initial guesses, got {list(self.radii)}"
-            )
+            own = f"radius = {self.radius}, which has its own initial guesses"
+            raise InputError(f"study: expected radii other than {own}, got {list(self.radii)}")
         self.require_different("radii", self.radii)
         self.require_different("strain_errors", self.strain_errors)
 

@@ -123,8 +123,8 @@ class VirtualImagePair:
     def open(cls, folder: Path, name: str, progress: Progress = silent) -> VirtualImagePair:
         """The pair that :meth:`ImagePairSpec.describe` described; its images are made if need be.
 
-        Where several workers open the same pair, it is to be opened once before. InputError if
-        there is no such pair, or the folder's solution is not the one it is of.
+        To be opened once before workers do. InputError if there is no such pair, or the folder's
+        solution is not the one it is of.
         """
         described = _description(folder, name)
         strain, specimen = float(described["strain"]), made(Specimen, described["specimen"])
@@ -258,10 +258,7 @@ class Study(ABC, Generic[A]):
 
     @abstractmethod
     def prepare(self, spec: ImagePairSpec, folder: Path, progress: Progress = silent) -> Cases:
-        """Make what the cases share (images) in ``folder``; returns the cases.
-
-        The random choices of a case follow from a seed that it holds.
-        """
+        """Make what the cases share (images) in ``folder``; returns them, each with its seed."""
 
     @abstractmethod
     def analyse(self, table: pd.DataFrame, folder: Path) -> A:

@@ -219,20 +219,14 @@ class SystematicStudy(Study[SystematicAnalysis]):
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.factors, *self.levels) if name not in FACTORS]
         if unknown or not self.factors:
-            raise InputError(
-                f"study: expected factors among {list(FACTORS)}, got {unknown or 'none'}"
-            )
-        without = [name for name in self.levels if name not in self.factors]
-        if without:
-            raise InputError(
-                f"study: expected levels of the factors {list(self.factors)} only, got some of "
-                f"{without}"
-            )
+            known = list(FACTORS)
+            raise InputError(f"study: expected factors among {known}, got {unknown or 'none'}")
+        if without := [name for name in self.levels if name not in self.factors]:
+            wanted = f"levels of the factors {list(self.factors)} only"
+            raise InputError(f"study: expected {wanted}, got some of {without}")
         if not self.seeds_of_speckle or min(self.seeds_of_speckle) < 0:
-            raise InputError(
-                "study: expected at least one seed of a speckle, of 0 or more, got "
-                f"{list(self.seeds_of_speckle)}"
-            )
+            got = list(self.seeds_of_speckle)
+            raise InputError(f"study: expected a seed of a speckle at least, from 0 on, got {got}")
         self.require_different("factors", self.factors)
         self.require_different("seeds_of_speckle", self.seeds_of_speckle)
         for name, levels in self.levels.items():
