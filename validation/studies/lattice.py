@@ -95,8 +95,7 @@ def write_rows(path: Path | str, rows: Iterable[ModeRow]) -> None:
 
 def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
     """Read what :func:`write_rows` wrote; empty without a file, InputError if it is another."""
-    path = Path(path)
-    if not path.exists():
+    if not (path := Path(path)).exists():
         return ()
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.reader(file))

@@ -293,8 +293,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
         InputError if the base has no critical point below the strain, or a specimen can't be.
         """
         base = SpecimenSpec.of(spec, self.strain, self.largest, self.divisions)
-        snapshot = spec.solution.at(self.strain)
-        own = Solution(spec.solution.mesh, (snapshot,), spec.solution.info)
+        own = replace(spec.solution, snapshots=(spec.solution.at(self.strain),))
         own.write(base.solution_path(folder))
         return tuple(
             {"varied": varied, "level": level, "specimen": described.leave(folder)}

@@ -90,7 +90,7 @@ class VariedFactor:
             )
         if self.whole and level != round(level):
             raise InputError(f"study: expected whole numbers for {self.label}, got {level:g}")
-        return self.change(setting, round(level) if self.whole else level)
+        return self.change(setting, round(level) if self.whole else float(level))
 
 
 def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:
@@ -133,7 +133,9 @@ FACTORS: dict[str, VariedFactor] = {
         "contrast of camera images [fraction of full scale]", (0.05, 0.1, 0.2, 0.4, 0.8),
         _contrast, lambda s: _camera(s, s.imaging.speckle.bright - s.imaging.speckle.dark),
     ),
-    "blur": _option("blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3, 4, 6)),
+    "blur": _option(
+        "blur of the speckle [px]", "imaging.speckle.blur_px", (1.5, 2.0, 3.0, 4.0, 6.0)
+    ),
     "bits": VariedFactor(
         "bits of camera images [-]", (4, 6, 8, 10, 12),
         lambda s, v: _by_camera(changed(s, "imaging", bits=v)),
