@@ -55,7 +55,8 @@ def states(data: ExperimentData) -> list[SnapshotState]:
 
 
 def colour_bar_units(drawn: Figure) -> list[str]:
-    return [axes.get_title(loc="left") for axes in drawn.axes if axes.get_label() == "colour bar"]
+    texts = [text for axes in drawn.axes for text in axes.texts]
+    return [text.get_text() for text in texts if text.get_label() == "colour bar"]
 
 
 def pixels(drawn: Figure) -> NDArray[np.uint8]:

@@ -201,6 +201,17 @@ def test_the_terminal_shows_what_the_page_does(capsys: pytest.CaptureFixture[str
     assert text.rstrip().endswith("out/report.html")
 
 
+def test_the_table_on_the_terminal_fits_80_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    print_report(experiment_report(made_up.summary(made_up.data())), Path("out"))
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert all(len(row) <= 80 and row[2] != " " for row in rows)  # a wrapped row begins blank
+    assert any(row.startswith("│ measurement error, rms [px] ") for row in rows)
+    assert len(rows) <= 10
+
+
 def test_fixed_numbers_have_no_minus_before_zero() -> None:
     assert fixed(-1e-9) == "0.00000"
     assert fixed(-0.5) == "−0.50000"

@@ -10,15 +10,14 @@ from markupsafe import Markup
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.spectra.pattern import REFERENCE_MODE
-from modeharvest.report.figures.curves import draw_convergence, draw_eigenvalues, draw_load
+from modeharvest.report.figures.curves import draw_eigenvalues, draw_load
 from modeharvest.report.figures.experiment import (
     ExperimentData,
-    SnapshotState,
     draw_hero,
     snapshot_label,
     snapshot_panels,
 )
-from modeharvest.report.figures.fits import panel_sections, shape_numbers
+from modeharvest.report.figures.fits import convergence_card, panel_sections, shape_numbers
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -29,9 +28,11 @@ from modeharvest.report.model import (
     ReportFigure,
     ReportTable,
     Section,
+    caption,
     material_text,
     number,
     percent,
+    sentence,
 )
 from modeharvest.util.typed import quantities
 from modeharvest.validation.summary import SnapshotSummary
@@ -39,12 +40,13 @@ from modeharvest.validation.summary import SnapshotSummary
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]
 
-_LEAD = (
-    "A finite-element model of a cellular elastomer is compressed until its pattern of holes "
-    "buckles. Its exact displacements make speckle images whose truth is known at every pixel; "
-    "micromorphic digital image correlation measures those images. This page gives the error of "
-    "the measurement and its parts."
-)
+_BRIEF = {
+    "branch": "branch", "pattern_amplitude_px": "pattern, largest length [px]",
+    "rms_w_px": "w = truth − IDIC, rms [px]", "rms_best_fit_px": "model error, rms [px]",
+    "rms_idic_to_best_fit_px": "measurement error, rms [px]", "chi_square": "χ² of the residual",
+    "iterations_all_levels": "iterations on all levels", "outcome": "outcome",
+}  # fmt: skip
+"""What the terminal shows of each snapshot."""
 _MODE = tuple(
     zip(("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇"), ("-",) * 5 + ("mm",) * 2, strict=True)
 )
@@ -53,12 +55,8 @@ _MODE = tuple(
 def experiment_report(summary: Summary, data: ExperimentData | None = None) -> Report:
     """The report of a virtual experiment.
 
-    Parameters
-    ----------
-    summary
-        The content of ``summary.json``.
-    data
-        What its figures show; without, the report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``data``: what its figures show; without, the
+    report has numbers only, as for the terminal.
     """
     case = summary.get("case", {})
     imperfection = case.get("experiment", {}).get("imperfection")
@@ -67,21 +65,23 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
     material = case.get("experiment", {}).get("material")
     factorisations = number(summary.get("factorisations"))
     residual = number(summary["inverse_map_max_residual_px"])
-    states = data.states if data is not None else []
+    states, snapshots = data.states if data is not None else [], summary["snapshots"]
+    steps = [convergence_card(s, snapshots[s.k]["outcome_why"]) for s in states]
     return Report(
         kind="virtual experiment",
         title=summary.get("title") or "Validation",
-        lead=_LEAD,
+        lead=caption("page-experiment")["lead"],
         findings=(
             [critical_line(summary.get("critical_strain"), material)]
             + [text for text in (_expected(summary), *_energies(summary)) if text]
         ),
         keys=key_numbers(summary),
+        brief=brief_table(summary),
         sections=[
             Section("expected", "Obtained and expected values", _expected_cards(summary)),
             *([] if data is None else _figures(data, summary)),
             Section("numbers", "Numbers", number_cards(summary)),
-            *([_convergence(states, summary["snapshots"])] if states else []),
+            Section.of("solver", steps),
         ],
         warnings=summary.get("warnings", []),
         notes=notes(summary),
@@ -182,7 +182,7 @@ def _expected_cards(summary: Summary) -> list[Card]:
     ]  # fmt: skip
     columns = ("quantity", "obtained", "unit", "expected", "", "source")
     table = ReportTable("Expected values", columns, rows, name="expected-values")
-    return [Card.tabular(table, wide=True)] if rows else []
+    return Card.tabular(table, wide=True)
 
 
 def verdict(ok: bool) -> Mark:
@@ -193,53 +193,46 @@ def verdict(ok: bool) -> Mark:
 def number_cards(summary: Summary) -> list[Card]:
     """Tables of all snapshots; rows that no snapshot has are left out."""
     snapshots, critical = summary["snapshots"], summary.get("critical_strain")
-    rows: list[list[Cell]] = []
-    for label, unit, name in quantities(SnapshotSummary):
-        values = [s.get(name) for s in snapshots]
-        if any(value is not None for value in values):
-            text = label.replace("v₁φ₁", _symbol(snapshots[0]))
-            rows.append([f"{text} [{unit}]" if unit not in ("", "–") else text, *values])
+    symbol = _symbol(snapshots[0])
+    heads = {name: f"{label} [{unit}]" if unit not in ("", "–") else label
+             for label, unit, name in quantities(SnapshotSummary)}  # fmt: skip
+    rows = _rows(snapshots, {k: label.replace("v₁φ₁", symbol) for k, label in heads.items()})
     labels = [snapshot_label(s["nominal_strain"], s["branch"], critical) for s in snapshots]
     columns = ("rms: per component, all material", *labels)
-    table = ReportTable("Results", columns, rows, name="results", on_terminal=True)
-    return [Card.tabular(table, wide=True), *_mode_cards(summary)]
+    table = ReportTable("Results", columns, rows, name="results")
+    return [*Card.tabular(table, wide=True), *_mode_cards(summary)]
+
+
+def brief_table(summary: Summary) -> ReportTable:
+    """What the terminal shows of all snapshots."""
+    snapshots = summary["snapshots"]
+    columns = ("nominal strain", *(percent(s["nominal_strain"]) for s in snapshots))
+    return ReportTable("Results", columns, _rows(snapshots, _BRIEF))
+
+
+def _rows(snapshots: Sequence[Snapshot], labels: Mapping[str, str]) -> list[list[Cell]]:
+    """A row for each quantity that a snapshot has."""
+    rows: list[list[Cell]] = [[label, *(s.get(name) for s in snapshots)]
+                              for name, label in labels.items()]  # fmt: skip
+    return [row for row in rows if any(value is not None for value in row[1:])]
 
 
 def _mode_cards(summary: Summary) -> list[Card]:
     """The modes' parameters, each with both standard errors, and the best fit's."""
-    strains, snapshots = [], []
-    for snapshot in summary["snapshots"]:
-        if modes := _modes_of(snapshot):
-            strains.append(percent(snapshot["nominal_strain"]))
-            snapshots.append(modes)
-    if not snapshots:
-        return []
-    several = len(snapshots[0]) > 1
+    found = [(percent(s["nominal_strain"]), modes)
+             for s in summary["snapshots"] if (modes := _modes_of(s))]  # fmt: skip
+    several = bool(found) and len(found[0][1]) > 1
     columns, rows = ["", "ideal"], []
-    for strain in strains:
+    for strain, _ in found:
         columns += [f"{strain}: IDIC ± noise ± model error", f"{strain}: best fit"]
-    for i, mode in enumerate(snapshots[0]):
+    for i, mode in enumerate(found[0][1] if found else ()):
         for k, (name, unit) in enumerate(zip(mode["names"], mode["units"], strict=True)):
             text = f"φ{i + 1} {name}" if several else name
             row: list[Cell] = [f"{text} [{unit}]" if unit != "-" else text, mode["ideal"][k]]
-            for modes in snapshots:
-                row += _parameter(modes[i], k)
-            rows.append(row)
-    caption = _SEVERAL_MODES if several else _ONE_MODE
+            rows.append(row + [cell for _, modes in found for cell in _parameter(modes[i], k)])
     table = ReportTable("Parameters of the modes", columns, rows, name="mode")
-    return [Card.tabular(table, caption=caption, wide=True)]
-
-
-_ONE_MODE = (
-    "Of all equivalent sets of parameters the one nearest to the ideal; Eq. (mode) of the paper "
-    "with the origin at a solid junction between four holes."
-)
-_SEVERAL_MODES = (
-    "Each mode has two waves, one towards an M point of the hole lattice and one across: L1 is the "
-    "longitudinal amplitude of the first, T2 the transverse one of the second, both relative to "
-    "the first one’s transverse amplitude; kx and ky [π/l] are the first one’s wave vector, c1 and "
-    "c2 the phases, zero at the holes’ centres."
-)
+    words = sentence("experiment-modes" if several else "experiment-mode")
+    return Card.tabular(table, caption=words, wide=True)
 
 
 def _modes_of(snapshot: Snapshot) -> Sequence[Mapping[str, Any]]:
@@ -249,16 +242,19 @@ def _modes_of(snapshot: Snapshot) -> Sequence[Mapping[str, Any]]:
     if len(snapshot.get("mode", ())) != len(_MODE):
         return []
     names, units = zip(*_MODE, strict=True)
-    mode = {"names": names, "units": units, "found": snapshot["mode"]}
-    mode["ideal"] = snapshot.get("mode_ideal", REFERENCE_MODE)
     keys = ("standard_error", "model_error", "best_fit")
-    return [mode | {key: snapshot.get(f"mode_{key}") for key in keys}]
+    return [{
+        "names": names, "units": units, "found": snapshot["mode"],
+        "ideal": snapshot.get("mode_ideal", REFERENCE_MODE),
+        **{key: snapshot.get(f"mode_{key}") for key in keys},
+    }]  # fmt: skip
 
 
 def _parameter(mode: Mapping[str, Any], k: int) -> list[Cell]:
     """Parameter k with its standard errors, and the best fit's."""
-    noise, best = _item(mode["standard_error"], k), _item(mode["best_fit"], k)
-    errors = float("inf") if noise is None else noise, _item(mode["model_error"], k)
+    noise, model, best = (mode[key][k] if mode[key] else None
+                          for key in ("standard_error", "model_error", "best_fit"))  # fmt: skip
+    errors = float("inf") if noise is None else noise, model
     return [Measured(mode["found"][k], errors), None if best is None else Measured(best)]
 
 
@@ -267,7 +263,7 @@ def experiment_figures(data: ExperimentData) -> list[ReportFigure]:
     panels = snapshot_panels(data.modes)
     cards = [
         *_path_cards(data.solution),
-        *(_convergence_card(state) for state in data.states),
+        *(convergence_card(state) for state in data.states),
         *(panel.card(data.states, lambda key, state: "") for panel in panels),
     ]
     return [_hero(data), *(figure for card in cards for figure in card.figures)]
@@ -278,37 +274,16 @@ def _hero(data: ExperimentData) -> ReportFigure:
     return ReportFigure("hero", "Image and pattern", drawn, late=not data.modes)
 
 
-def _heads(several: bool) -> dict[str, tuple[str, str]]:
-    """Titles and leads of the sections of panels, for one mode as in the paper, or several."""
-    pattern = "Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"
-    return {
-        "images": (
-            "The image and its pattern",
-            f"{'' if several else 'Fig. “spect_virt” of the paper. '}The family of the mode, which "
-            "the paper’s authors read off the spectral densities by eye, is read by the program "
-            "here.",
-        ),
-        "found": (
-            "Measured displacement",
-            Markup(
-                f"{'' if several else 'Fig. “virt” of the paper. '}The displacement is u = "
-                f"v<sub>0</sub> + {pattern}, a smooth field and a correlated pattern with its "
-                "amplitude. Every colour bar has its own range."
-            ),
-        ),
-        "errors": (
-            "Error analysis",
-            "The error w = truth − IDIC has two parts: the model (ansatz) error, which remains "
-            "however well the displacement is measured, and the measurement error on top of it.",
-        ),
-    }
-
-
 def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
     snapshots: Sequence[Snapshot] = summary["snapshots"]
-    images, *others = panel_sections(
-        snapshot_panels(data.modes), data.states, _heads(data.modes > 1),
+    several = data.modes > 1
+    images, found, errors = panel_sections(
+        ("images", "found", "errors"), snapshot_panels(data.modes), data.states,
         lambda key, state: panel_numbers(key, snapshots[state.k]) or shape_numbers(key, state),
+        pattern=Markup("Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"),
+        of_spectra="" if several else "Fig. “spect_virt” of the paper. ",
+        known="",
+        source="" if several else "Fig. “virt” of the paper. ",
     )  # fmt: skip
     text = {s.label: snapshots[s.k].get("pattern_reading", ()) for s in data.states}
     reading = Card("Reading of the densities", text=text, name="reading")
@@ -316,7 +291,8 @@ def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
     return [
         Section("path", "Load path", _path_cards(data.solution)),
         Section(images.name, images.title, cards, images.lead),
-        *others,
+        found,
+        errors,
     ]
 
 
@@ -341,33 +317,7 @@ def _path_cards(solution: Solution) -> list[Card]:
         return []
     load = partial(draw_load, path, None if critical is None else critical["strain"])
     eigenvalues = partial(draw_eigenvalues, path, critical)
-    return [
-        Card.single(
-            "load", "Load over strain", load,
-            "Points are computed equilibria; the lines only join them. Dashed: the primary "
-            "path where it is unstable. Ring: the critical point.",
-        ),
-        Card.single(
-            "eigenvalues", "Stability", eigenvalues,
-            "Of K x = λ M x along the primary path, M the mass matrix of unit density. "
-            "Bold: the lowest; with the states visited while the critical strain was located. "
-            "Square: the lowest on a buckled branch, above zero where it is stable.",
-        ),
-    ]  # fmt: skip
-
-
-def _convergence_card(state: SnapshotState, caption: str = "") -> Card:
-    drawn = partial(draw_convergence, state.result)
-    return Card.single(f"convergence-{state.name}", state.label, drawn, caption)
-
-
-def _convergence(states: Sequence[SnapshotState], snapshots: Sequence[Snapshot]) -> Section:
-    cards = [_convergence_card(state, snapshots[state.k]["outcome_why"]) for state in states]
-    lead = (
-        "Rms change of the displacement in each Gauss–Newton step, from the coarsest images (1/8: "
-        "pixels joined 8 × 8) to the full ones. Model error makes convergence linear."
-    )
-    return Section("solver", "Convergence", cards, lead)
+    return [Card.captioned("load", load), Card.captioned("eigenvalues", eigenvalues)]
 
 
 def notes(summary: Summary) -> list[str]:
@@ -381,17 +331,10 @@ def notes(summary: Summary) -> list[str]:
         text += _about(snapshot)
     text += [
         _standard_errors(summary),
-        "The best fit weighs all material pixels alike, IDIC weighs them by the image's "
-        "gradient and leaves out the rims of the holes: even without any noise the two differ.",
-        "rms is per component: the root of the mean square over both components of all material "
-        "pixels. The rms length of the vectors is √2 times that.",
+        sentence("experiment-weights"),
+        sentence("experiment-rms"),
+        *([sentence("experiment-material")] if summary.get("expected") else []),
     ]
-    if summary.get("expected"):
-        text.append(
-            "The paper does not give its material constants and prints fields, not numbers. The "
-            "expected values come from an independent calculation with this project's choice of "
-            "material."
-        )
     return text
 
 
@@ -399,26 +342,12 @@ def _standard_errors(summary: Summary) -> str:
     """What the standard errors mean for these images."""
     noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
     sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
+    text = sentence("experiment-noise-free")
     if noise:
-        text = (
-            "The images are single exposures of the virtual camera, with a predicted noise of "
-            f"{max(noise):.2g} of full scale (rms; rounding to whole grey levels is part of it): "
-            "where χ² is above 1, the rest of the residual is"
-        )
+        text = sentence("experiment-exposures", noise=max(noise))
     elif sensor.get("read_noise") or sensor.get("full_well"):
-        text = (
-            "The sensor makes noise, but what was measured are its noise-free averages "
-            "(“camera = true” measures the exposures): the residual is"
-        )
-    else:
-        text = "No noise was added to these images: the residual is"
-    return (
-        "Of a parameter's two standard errors the first takes the whole residual for white noise "
-        f"in both images. {text} model error, so this standard error is the sensitivity of the "
-        "images to a parameter, not its distance from the truth. The second, by model error, takes "
-        "each unit cell's share of the residual for one draw. Compare them with the best fit "
-        "beside."
-    )
+        text = sentence("experiment-averages")
+    return sentence("experiment-errors", text=text)
 
 
 def _about(snapshot: Snapshot) -> list[str]:
@@ -426,10 +355,7 @@ def _about(snapshot: Snapshot) -> list[str]:
     at = f"At {100 * snapshot['nominal_strain']:.4g} %"
     text = []
     if snapshot.get("negative_pivots"):
-        text.append(
-            f"{at} the state is unstable ({snapshot['negative_pivots']} negative pivots): a real "
-            "specimen would not be found in it."
-        )
+        text.append(sentence("experiment-unstable", at=at, pivots=snapshot["negative_pivots"]))
     if snapshot["outcome"] != "converged":
         text.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
                     f"{snapshot['outcome_why']}")  # fmt: skip
@@ -449,11 +375,10 @@ def _about(snapshot: Snapshot) -> list[str]:
             if _is_free(snapshot)
             else "Fixed at the ideal pattern, the mode describes"
         )
-        text.append(
-            f"{at} no pattern is observable: {_symbol(snapshot)} is at most {inner:.2g} px inside. "
-            f"{describes} the edge effect in the corner cells ({corners:.2g} px), as in the "
-            "paper; the best fit to the truth does the same."
-        )
+        text.append(sentence(
+            "experiment-no-pattern", at=at, symbol=_symbol(snapshot), inner=inner, corners=corners,
+            describes=describes,
+        ))  # fmt: skip
     return text
 
 
@@ -469,7 +394,3 @@ def _is_free(snapshot: Snapshot) -> bool:
 def _largest_deviation(snapshot: Snapshot) -> float:
     """Largest deviation of a mode parameter from the ideal [%]; NaN without a mode."""
     return max((abs(v) for v in snapshot.get("mode_deviation_percent", ())), default=float("nan"))
-
-
-def _item(values: Sequence[float | None] | None, k: int) -> float | None:
-    return values[k] if values else None

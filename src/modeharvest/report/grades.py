@@ -8,18 +8,13 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
-from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from modeharvest.fem.field import Mesh
-from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures import maps, style
 from modeharvest.report.figures.curves import curve, legend_above, plain_ticks
-from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
 from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.report.figures.style import BLUE, MUTED, SIGNED, SIZE, colour, figure
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -28,6 +23,7 @@ from modeharvest.report.model import (
     ReportFigure,
     ReportTable,
     Section,
+    caption,
     number,
     write_page,
 )
@@ -60,112 +56,65 @@ from modeharvest.validation.scoring.score import (
 
 _CELLS = 300
 _SHARES = np.logspace(-4, 0, 200)
+_CELL_PX = 10
+"""Edge of a cell of the star's maps; the image has far more pixels than a page."""
 
 
-@dataclass(frozen=True)
-class LogScale(ColourScale):
-    """Colours for values of many orders of magnitude."""
-
-    @property
-    def normalise(self) -> Normalize:
-        """Values to 0 ... 1, by their logarithm."""
-        return LogNorm(self.low, self.high)
+def length_scale(scores: Sequence[Score]) -> maps.ColourScale:
+    """A logarithmic scale on which 98 % of every field's errors are distinguished."""
+    lengths = [_error_length(graded) for graded in scores if len(graded.error_px)]
+    ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
+    low = min((end[0] for end in ends), default=1e-3)
+    high = max((end[1] for end in ends), default=1.0)
+    low = max(low, 1e-4 * high)
+    return maps.ColourScale(style.SIZE, low, max(high, 2.0 * low), "px", "both", is_log=True)
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorMaps:
-    """What the maps of several codes share.
+    """The maps of one field's errors; blank where nothing was measured."""
 
-    Parameters
-    ----------
-    map_frame
-        Frame, outline and cells.
-    lengths
-        The scale of the error's length.
-    """
-
-    map_frame: MapFrame
-    lengths: LogScale
-
-    @classmethod
-    def of(cls, mesh: Mesh, grid: PixelGrid, scores: Sequence[Score]) -> ErrorMaps:
-        """Make a map, and a scale on which 98 % of every code's errors are distinguished."""
-        lengths = [_error_length(graded) for graded in scores if len(graded.error_px)]
-        ends = [np.quantile(one[one > 0], (0.02, 0.98)) for one in lengths if (one > 0).any()]
-        low = min((end[0] for end in ends), default=1e-3)
-        high = max((end[1] for end in ends), default=1.0)
-        low = max(low, 1e-4 * high)
-        high = max(high, 2.0 * low)
-        return cls(
-            MapFrame.of(MeshBoundary.of(mesh), grid, _CELLS),
-            LogScale(SIZE, low, high, "px", "both"),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class FieldMaps:
-    """The maps of one code's errors.
-
-    Parameters
-    ----------
-    maps
-        What they share with those of the others.
-    graded
-        The field.
-    """
-
-    maps: ErrorMaps
+    map_frame: maps.MapFrame
     graded: Score
 
     @cached_property
     def _nearest(self) -> NDArray[np.intp]:
         """(rows, cols) of the map: number of the nearest point, the count of all if too far."""
-        graded, map_frame = self.graded, self.maps.map_frame
+        graded, grid = self.graded, self.map_frame.grid
         if not len(graded.x):
-            return np.zeros(map_frame.grid.shape, dtype=np.intp)
-        reach = max(
-            graded.reach_px * map_frame.grid.pixel_size / map_frame.factor,
-            map_frame.grid.pixel_size,
-        )
+            return np.zeros(grid.shape, dtype=np.intp)
+        reach = max(graded.reach_px * grid.pixel_size / self.map_frame.factor, grid.pixel_size)
         points = np.column_stack([graded.x, graded.y])
         tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-        pixels = np.stack(np.meshgrid(map_frame.grid.x, map_frame.grid.y), axis=-1)
+        pixels = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
         return np.asarray(tree.query(pixels, distance_upper_bound=reach)[1])
 
-    def _draw(self, values: FloatArray, scale: ColourScale) -> Figure:
-        """A map; blank where nothing was measured."""
-        return draw_field(self.maps.map_frame, np.append(values, np.nan)[self._nearest], scale)
+    def _draw(self, values: FloatArray, scale: maps.ColourScale) -> Figure:
+        return maps.draw_field(self.map_frame, np.append(values, np.nan)[self._nearest], scale)
 
-    def draw_length(self) -> Figure:
-        """Draw the error's length, on the scale of all codes."""
-        scale = self.maps.lengths
-        return self._draw(
-            np.maximum(_error_length(self.graded), 1e-3 * scale.low), scale
-        )  # 0 has no log
+    def draw_length(self, scale: maps.ColourScale) -> Figure:
+        """Draw the error's length."""
+        length = np.maximum(_error_length(self.graded), 1e-3 * scale.low)  # 0 has no logarithm
+        return self._draw(length, scale)
 
     def draw_component(self, component: int) -> Figure:
         """Draw the error along x (0) or y (1), on a scale of its own."""
         error = self.graded.error_px
-        return self._draw(error[:, component], ColourScale.signed(error, "px", 0.98))
+        return self._draw(error[:, component], maps.ColourScale.signed(error, "px", 0.98))
 
 
 def draw_distribution(scores: Sequence[Score]) -> Figure:
     """Draw which share of a field's points, lost ones counted as wrong, errs by more."""
     drawn, axes = curve("length of the error [px]", "share of points that err by more [%]")
     for n, graded in enumerate(scores):
-        length = np.sort(_error_length(graded))[::-1]
-        if not len(length):
-            continue
-        points = graded.everywhere.points
-        lost = points - len(length)
-        share = (lost + np.arange(1, len(length) + 1)) / points
-        some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
-        axes.loglog(
-            np.maximum(length[some], 1e-9), 100 * share[some], color=colour(n), label=graded.source
-        )
+        length, points = np.sort(_error_length(graded))[::-1], graded.everywhere.points
+        if len(length):
+            share = (points - len(length) + np.arange(1, len(length) + 1)) / points
+            some = np.searchsorted(share, _SHARES).clip(0, len(share) - 1)
+            axes.loglog(np.maximum(length[some], 1e-9), 100 * share[some], color=style.colour(n),
+                        label=graded.source)  # fmt: skip
     axes.set(ylim=(0.01, 120))
-    legend_above(axes)
-    return drawn
+    return _finished(drawn)
 
 
 def draw_histogram(scores: Sequence[Score]) -> Figure:
@@ -173,21 +122,13 @@ def draw_histogram(scores: Sequence[Score]) -> Figure:
     drawn, axes = curve("length of the error [px]", "share of points per tenth of a decade [%]")
     for n, graded in enumerate(scores):
         length = np.maximum(_error_length(graded), 1e-9)
-        if not len(length):
-            continue
-        low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
-        edges = 10.0 ** (np.arange(low, high + 2) / 10)
-        count, _ = np.histogram(length, edges)
-        axes.stairs(
-            100 * count / graded.everywhere.points,
-            edges,
-            lw=1.5,
-            color=colour(n),
-            label=graded.source,
-        )
+        if len(length):
+            low, high = (int(np.floor(10 * np.log10(end))) for end in (length.min(), length.max()))
+            edges = 10.0 ** (np.arange(low, high + 2) / 10)
+            share = 100 * np.histogram(length, edges)[0] / graded.everywhere.points
+            axes.stairs(share, edges, lw=1.5, color=style.colour(n), label=graded.source)
     axes.set(xscale="log", ylim=(0, None))
-    legend_above(axes)
-    return drawn
+    return _finished(drawn)
 
 
 def draw_regions(scores: Sequence[Score]) -> Figure:
@@ -197,12 +138,11 @@ def draw_regions(scores: Sequence[Score]) -> Figure:
     for n, graded in enumerate(scores):
         at = np.arange(len(REGIONS)) + (n - 0.5 * (len(scores) - 1)) * width
         rms = [graded.by_region[name].rms_px for name in REGIONS]
-        axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=colour(n), label=graded.source)
+        axes.bar(at, np.nan_to_num(rms), 0.92 * width, color=style.colour(n), label=graded.source)
     axes.set_xticks(range(len(REGIONS)), REGIONS)
     if any(graded.everywhere.rms_px > 0 for graded in scores):
         axes.set_yscale("log")
-    legend_above(axes)
-    return drawn
+    return _finished(drawn)
 
 
 def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
@@ -211,7 +151,14 @@ def draw_spectra(spectra: Mapping[str, ErrorSpectrum | None]) -> Figure:
     for n, (name, spectrum) in enumerate(spectra.items()):
         if spectrum is not None and (spectrum.rms_px > 0).any():
             axes.loglog(spectrum.wavelength_px, spectrum.rms_px, marker="o", ms=2.5,
-                        color=colour(n), label=name)  # fmt: skip
+                        color=style.colour(n), label=name)  # fmt: skip
+    return _finished(drawn)
+
+
+def _finished(drawn: Figure) -> Figure:
+    """Names above the curves, and plain numbers on logarithmic axes."""
+    axes = drawn.axes[0]
+    plain_ticks(*(axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"))
     legend_above(axes)
     return drawn
 
@@ -232,8 +179,9 @@ def write_grading(folder: Path | str, grading: Grading) -> None:
 def grading_report(grading: Grading) -> Report:
     """The report of displacement fields, graded and ranked."""
     scores, best = grading.scores, grading.scores[0]
-    shared = ErrorMaps.of(grading.truth.solution.mesh, grading.truth.grid, scores)
-    maps = [FieldMaps(shared, graded) for graded in scores]
+    outline = MeshBoundary.of(grading.truth.solution.mesh)
+    frame, scale = maps.MapFrame.of(outline, grading.truth.grid, _CELLS), length_scale(scores)
+    drawn = [ErrorMaps(frame, graded) for graded in scores]
     several = len(scores) > 1
     what = f"Displacement fields of {len(scores)} codes, ranked" if several else (
         "A displacement field")  # fmt: skip
@@ -257,12 +205,7 @@ def grading_report(grading: Grading) -> Report:
         sections=[
             Section(
                 "ranking", "Ranking", _ranking(grading),
-                "By rms error per component over all points on the material; a field that covers "
-                "less than half of the material comes after those that cover more. 50 %, 95 %: of "
-                "the points have a smaller error (its length). Edges are material within "
-                f"{grading.edge_px} px of a hole or of the outside; what else there is of the "
-                "cellular part is a ligament or a junction, whichever middle is nearer; the rest "
-                f"is bulk. Points are those of the field itself{common}.",
+                caption("section-scores", edge=grading.edge_px, common=common)["lead"],
             ),
             Section(
                 "curves", "Distribution, regions, wavelengths", _score_curves(grading),
@@ -270,7 +213,8 @@ def grading_report(grading: Grading) -> Report:
                 "The spectrum is that of the error without its affine part, gaps counted as zero.",
             ),
             Section(
-                "maps", "Maps", [_score_maps(of_field, n) for n, of_field in enumerate(maps)],
+                "maps", "Maps",
+                [_score_maps(of_field, scale, n) for n, of_field in enumerate(drawn)],
                 "Lengths of errors share one logarithmic scale; components have a scale for each "
                 "field. Blank: nothing measured within one spacing.",
             ),
@@ -278,7 +222,8 @@ def grading_report(grading: Grading) -> Report:
         warnings=grading.notes,
         command=f"modeharvest score FIELD … --truth DIR --strain {grading.strain} --out DIR",
         remark="The numbers of this page are in scores.json and scores.csv beside it.",
-        hero=ReportFigure("best", "Length of the best one’s error", maps[0].draw_length),
+        hero=ReportFigure("best", "Length of the best one’s error",
+                          partial(drawn[0].draw_length, scale)),
         hero_caption=f"Length of the error of {best.source}.",
     )  # fmt: skip
 
@@ -333,12 +278,12 @@ def _score_curves(grading: Grading) -> list[Card]:
             for name, (title, drawn) in parts.items()]  # fmt: skip
 
 
-def _score_maps(maps: FieldMaps, n: int) -> Card:
-    graded = maps.graded
+def _score_maps(drawn: ErrorMaps, scale: maps.ColourScale, n: int) -> Card:
+    graded = drawn.graded
     figures = [
-        ReportFigure(f"length-{n}", "Length of the error", maps.draw_length),
-        ReportFigure(f"x-{n}", "Error along x", partial(maps.draw_component, 0)),
-        ReportFigure(f"y-{n}", "Error along y", partial(maps.draw_component, 1)),
+        ReportFigure(f"length-{n}", "Length of the error", partial(drawn.draw_length, scale)),
+        ReportFigure(f"x-{n}", "Error along x", partial(drawn.draw_component, 0)),
+        ReportFigure(f"y-{n}", "Error along y", partial(drawn.draw_component, 1)),
     ]
     text = f"a point every {number(round(graded.spacing_px, 2))} px"
     if graded.off_material:
@@ -346,26 +291,20 @@ def _score_maps(maps: FieldMaps, n: int) -> Card:
     return Card(f"{n + 1}. {graded.source}", figures, paper=text, wide=True)
 
 
-_CELL_PX = 10
-"""Edge of a cell of the maps; the image has far more pixels than a page."""
-
-
 def draw_attenuation(grades: Sequence[StarGrade]) -> Figure:
     """Draw T over the period, a band of two standard errors about it, and where it crosses 0.9."""
     drawn, axes = curve("period of the wave [px]", "measured over true amplitude [–]")
-    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+    axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
     for n, grade in enumerate(grades):
         found = grade.attenuation
         share, error = found.curve
-        axes.fill_between(found.period, share - 2 * error, share + 2 * error, color=colour(n),
+        axes.fill_between(found.period, share - 2 * error, share + 2 * error, color=style.colour(n),
                           alpha=0.2, linewidth=0)  # fmt: skip
-        axes.plot(found.period, share, color=colour(n), label=grade.name)
+        axes.plot(found.period, share, color=style.colour(n), label=grade.name)
         if np.isfinite(found.finest_px):
-            axes.plot([found.finest_px], [KEPT], "o", ms=4.5, color=colour(n))
+            axes.plot([found.finest_px], [KEPT], "o", ms=4.5, color=style.colour(n))
     axes.set(xscale="log", ylim=(-0.3, 1.15))
-    plain_ticks(axes.xaxis)
-    legend_above(axes)
-    return drawn
+    return _finished(drawn)
 
 
 def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
@@ -377,31 +316,27 @@ def draw_trade_off(grades: Sequence[StarGrade]) -> Figure:
     low, high = 0.7 * min(x), 1.5 * max(x)
     bottom, top = 0.6 * min(y), 1.7 * max(y)
     for value in _round_values(min(x) * min(y), max(x) * max(y)):
-        axes.plot([low, high], [value / low, value / high], color=MUTED, linewidth=0.6,
+        axes.plot([low, high], [value / low, value / high], color=style.MUTED, linewidth=0.6,
                   alpha=0.6)  # fmt: skip
         end = min(high, value / (1.04 * bottom))
         if low < end and value / end < top:
             axes.annotate(f"{value:g} px²", (end, value / end), (-3, 3), fontsize=6.5,
-                          textcoords="offset points", ha="right", color=MUTED)  # fmt: skip
+                          textcoords="offset points", ha="right", color=style.MUTED)  # fmt: skip
     for n, grade in enumerate(grades):
-        if grade not in known or grade.noise is None:
-            continue
-        axes.errorbar(grade.attenuation.finest_px, grade.noise.v_px,
-                      2 * grade.noise.v_se_px, 2 * grade.attenuation.finest_se_px, marker="o",
-                      ms=5, capsize=2, color=colour(n), linewidth=1,
-                      linestyle="none", label=grade.name)  # fmt: skip
+        if grade in known and grade.noise is not None:
+            axes.errorbar(grade.attenuation.finest_px, grade.noise.v_px, 2 * grade.noise.v_se_px,
+                          2 * grade.attenuation.finest_se_px, marker="o", ms=5, capsize=2,
+                          color=style.colour(n), lw=1, ls="none", label=grade.name)  # fmt: skip
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(bottom, top))
-    plain_ticks(axes.xaxis, axes.yaxis)
-    legend_above(axes)
-    return drawn
+    return _finished(drawn)
 
 
-def draw_centre_row(found: Attenuation, look: str = BLUE) -> Figure:
+def draw_centre_row(found: Attenuation, look: str = style.BLUE) -> Figure:
     """Draw the centre row's T, raw, and the smoothed curve through all rows."""
     drawn, axes = curve("period of the wave [px]", "measured over true [–]", (9.0, 2.1))
-    axes.plot(found.centre.period, found.centre.share, color=MUTED, linewidth=0.5, alpha=0.8)
+    axes.plot(found.centre.period, found.centre.share, color=style.MUTED, linewidth=0.5, alpha=0.8)
     axes.plot(found.period, found.curve[0], color=look, linewidth=1.8)
-    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+    axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
     low, high = np.quantile(found.centre.share, (0.005, 0.995))
     axes.set_ylim(min(low, 0.0) - 0.05, max(high, 1.0) + 0.05)
     return drawn
@@ -422,18 +357,17 @@ def draw_map(grade: StarGrade, values: FloatArray, end: float | None = None) -> 
     total = np.histogram2d(*at, shape, limits, weights=values[valid])[0]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     top = float(np.quantile(np.abs(values[valid]), 0.99)) if end is None else end
-    drawn = figure(9.0, 1.75)
+    drawn = style.figure(9.0, 1.75)
     axes = drawn.add_axes((0.035, 0.24, 0.88, 0.72))
-    image = axes.imshow(mean, cmap=SIGNED, vmin=-top, vmax=top, aspect="auto",
-                        extent=(*limits[1], *limits[0][::-1]),
-                        interpolation="nearest")  # fmt: skip
+    scale = maps.ColourScale(style.SIGNED, -top, top, "px")
+    axes.imshow(scale.of(mean), aspect="auto", extent=(*limits[1], *limits[0][::-1]),
+                interpolation="nearest")  # fmt: skip
     periods = [p for p in (10, 25, 50, 100, 150, 200, 250, 300)
                if star.shortest_px <= p <= star.longest_px]  # fmt: skip
     axes.set_xticks(star.column(periods), [str(p) for p in periods])
     axes.set_xlabel("period [px]")
     axes.set_yticks([])
-    bar = drawn.add_axes((0.93, 0.24, 0.011, 0.72))
-    drawn.colorbar(image, cax=bar).ax.set_title("px", fontsize=7.5)
+    maps.colour_bar(axes, scale)
     return drawn
 
 
@@ -461,13 +395,14 @@ def star_report(grading: StarGrading) -> Report:
     cells = [[f"{n}. {row['name']}", *(row[key] for key in GRADE_COLUMNS.values())]
              for n, row in enumerate(rows, start=1)]  # fmt: skip
     table = ReportTable("Ranking", ["code", *GRADE_COLUMNS], cells, on_terminal=True)
+    words = caption(
+        "page-resolution", amplitude=star.amplitude_px, shortest=number(star.shortest_px),
+        longest=number(star.longest_px), id=grading.star_set.id,
+    )  # fmt: skip
     return Report(
         kind="resolution",
         title="Displacement resolution on the star pattern",
-        lead=f"The star of DIC Challenge 2.0: a wave of {star.amplitude_px} px whose period grows "
-        f"from {number(star.shortest_px)} to {number(star.longest_px)} px along the image. The "
-        "amplitude ratio, measured over true, is the spatial resolution of a code; its result "
-        "without motion is its noise.",
+        lead=words["lead"],
         keys=[
             KeyNumber(f"{'Best: ' * several}{best['name']}", best["indicator_px2"], "px²",
                       "indicator n l₁₀ %; the less, the better"),
@@ -478,11 +413,8 @@ def star_report(grading: StarGrading) -> Report:
         ],
         sections=[
             Section(
-                "ranking", "Ranking", [Card.tabular(table, wide=True)],
-                "By the indicator. l₁₀ % is read off the curve through all rows within half a "
-                "period of the centre; “centre row” is the DIC Challenge’s own reading, a "
-                "polynomial of degree 12 through that row alone. ± is one standard error. Ripple: "
-                "rms of the centre row about the curve, at periods above l₁₀ %.",
+                "ranking", "Ranking", Card.tabular(table, wide=True),
+                caption("section-resolution")["lead"],
             ),
             Section("curves", "Curves", _star_curves(grades),
                     "Bands and bars are two standard errors. Grey lines: equal indicators."),
@@ -492,14 +424,7 @@ def star_report(grading: StarGrading) -> Report:
         ],
         warnings=grading.notes,
         command="modeharvest benchmark resolution FIELD … --still FIELD … --set DIR --out DIR",
-        remark=Markup(
-            "The numbers and curves of this page are in resolution.json and resolution.csv beside "
-            "it. Images: set {}. Method: P. L. Reu et al., Exp. Mech. 2022, "
-            '<a href="https://doi.org/10.1007/s11340-021-00806-6">doi '
-            "10.1007/s11340-021-00806-6</a>; M. Grédiac, B. Blaysat, F. Sur, Exp. Mech. 2017, "
-            '<a href="https://doi.org/10.1007/s11340-017-0279-x">doi '
-            "10.1007/s11340-017-0279-x</a>."
-        ).format(grading.star_set.id),
+        remark=words["remark"],
     )  # fmt: skip
 
 
@@ -515,7 +440,10 @@ def _star_maps(grade: StarGrade, n: int) -> Card:
     down = np.where(grade.moved.good, -grade.moved.u[:, 1], np.nan)
     end = 1.2 * grade.star.amplitude_px
     parts = {
-        "row": ("Along the centre row", partial(draw_centre_row, grade.attenuation, colour(n))),
+        "row": (
+            "Along the centre row",
+            partial(draw_centre_row, grade.attenuation, style.colour(n)),
+        ),
         "v": ("v, down", partial(draw_map, grade, down, end)),
         "error": ("Its error, down", partial(draw_map, grade, -grade.error_px[:, 1])),
     }

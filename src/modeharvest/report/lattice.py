@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -24,10 +25,12 @@ from modeharvest.report.model import (
     ReportFigure,
     ReportTable,
     Section,
+    caption,
     fixed,
     material_text,
     number,
     percent,
+    sentence,
 )
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
@@ -50,37 +53,28 @@ _KINDS = {
     "none": "none in the range",
     "path ends": "the path ends before",
 }
-_LEAD = (
-    "An infinite lattice is loaded. Where the energy of waves of some length and direction "
-    "vanishes, a pattern sets in. This page says whether it does, at which load and in which "
-    "waves, what it looks like, and with how few Fourier terms it can be written for micromorphic "
-    "homogenization."
-)
 
 
 def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
     """The report of a lattice.
 
-    Parameters
-    ----------
-    summary
-        The content of ``summary.json``.
-    run
-        What its figures show; without, the report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``run``: what its figures show; without, the
+    report has numbers only, as for the terminal.
     """
     return Report(
         kind="lattice",
         title=summary["title"],
-        lead=_LEAD,
+        lead=caption("page-lattice")["lead"],
         findings=findings(summary),
         keys=key_numbers(summary),
         sections=[
             *([_pattern_section(run)] if run else []),
-            Section("critical", "Critical point", _critical_cards(summary), _CRITICAL_LEAD),
-            Section("dispersion", "Dispersion", _dispersion_cards(summary, run), _DISPERSION_LEAD),
+            Section.of("critical", _critical_cards(summary)),
+            Section.of("dispersion", _dispersion_cards(summary, run)),
             *([_mode_section(run)] if run else []),
-            Section("branches", "Branches", _branch_cards(summary, run), _BRANCH_LEAD),
-            *([_family_section(run), _study_section(run)] if run else []),
+            Section.of("branches", _branch_cards(summary, run)),
+            *([Section.of("family", [_family_card(p) for p in run.patterns]), _study_section(run)]
+              if run else []),
         ],
         warnings=summary["notes"],
         notes=notes(summary),
@@ -146,15 +140,14 @@ def findings(summary: Summary) -> list[str]:
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
     text += [
-        f"Lowest λ/k² of the whole zone at {percent(part['load'])}: {wave_name(part['wave'])}, "
-        f"eigenvalue {part['eigenvalue']:.4g} N/mm⁴."
-        for part in summary["zone"]
-    ]
+        sentence("lattice-zone", at=percent(part["load"]), wave=wave_name(part["wave"]),
+                 eigenvalue=part["eigenvalue"]) for part in summary["zone"]
+    ]  # fmt: skip
     text += [
-        f"{family['of']}: family “{family['family']}”, {len(family['waves'])} waves, "
-        f"{family['parameters']} parameters, captures {percent(family['captured'])} of the energy."
+        sentence("lattice-family", **family | {"waves": len(family["waves"]),
+                                               "captured": percent(family["captured"])})
         for family in summary["families"]
-    ]
+    ]  # fmt: skip
     study = summary["study"]
     if study is not None:
         low, high = study["overlap"]
@@ -214,31 +207,15 @@ def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
-        text.append(
-            f"Under {point['loading']} no critical point was found up to {percent(point['load'])}. "
-            f"That is no proof beyond: {summary['outcome']}."
-        )
+        text.append(sentence("lattice-no-proof", loading=point["loading"],
+                             load=percent(point["load"]), outcome=summary["outcome"]))  # fmt: skip
     elif point is not None and point["long_wave_angle"] is not None:
-        text.append(
-            f"Under {point['loading']} waves much longer than the cell come first: a loss of "
-            "ellipticity of the effective medium, which no finite cell has as a mode."
-        )
+        text.append(sentence("lattice-long-waves", loading=point["loading"]))
     if any(branch["states"] for branch in summary["branches"]):
-        text.append(
-            "Stability of branches is assessed for fields with the period of the cell shown; "
-            "longer waves are not looked at there. Contact is not modelled."
-        )
+        text.append(sentence("lattice-branches"))
     if summary["study"] is not None:
-        text.append(
-            "The paper does not give its material constants, and its overlays show the mode that "
-            "was identified in a specimen; here the analytic mode is Eq. (mode) with its ideal "
-            "parameters."
-        )
-    text.append(
-        "The spectral densities are of a field that is zero in the holes, integrated over one cell "
-        "that repeats; they are drawn in decibels, so that small ones are visible."
-    )
-    return text
+        text.append(sentence("lattice-material"))
+    return [*text, sentence("lattice-densities")]
 
 
 def _window(run: LatticeRun, width: float = CELLS, height: float = CELLS) -> LatticePatch:
@@ -270,13 +247,9 @@ def _pattern_section(run: LatticeRun) -> Section:
                           *_densities(found, n)], paper="paper: Fig. modes", wide=True)
         for n, found in enumerate(run.patterns, start=1)
     ]  # fmt: skip
-    lead = (
-        "Fig. “modes” of the paper: reference and deformed configuration, and the energy spectral "
-        "densities of the displacement without its affine part. A periodic field has energy at the "
-        "reciprocal vectors of its cell only: dots."
-    )
     cards = cards or [Card("The lattice", [reference])]
-    return Section("lattice", "Lattice and pattern", cards, lead if run.patterns else "")
+    section = Section.of("lattice", cards)
+    return section if run.patterns else replace(section, lead="")
 
 
 def _deformed(run: LatticeRun, found: FoundPattern, n: int) -> ReportFigure:
@@ -310,14 +283,6 @@ def _densities(found: FoundPattern, n: int) -> list[ReportFigure]:
     return made
 
 
-_CRITICAL_LEAD = (
-    "The first load at which the eigenvalue of some wave is zero, searched over all wave vectors: "
-    "on a grid of the zone, by descent from its best points, and for waves much longer than the "
-    "cell by the acoustic tensor of the effective moduli. Waves are given as phases (k·a₁, k·a₂) "
-    "from cell to cell."
-)
-
-
 def _critical_cards(summary: Summary) -> list[Card]:
     point = summary["critical"]
     if point is None:
@@ -326,13 +291,7 @@ def _critical_cards(summary: Summary) -> list[Card]:
     row = (point["loading"], f"{100 * point['load']:.5g}", waves_text(point), mark, proof(point))
     columns = ("loading", "strain [%]", "critical waves", "", "proof")
     table = ReportTable("Critical point", columns, [row])
-    return [Card.tabular(table, wide=True)]
-
-
-_DISPERSION_LEAD = (
-    "Lowest eigenvalues of K x = λ M x, M the mass matrix of unit density, with both matrices "
-    "reduced by the Bloch condition. A wave with a negative λ grows."
-)
+    return Card.tabular(table, wide=True)
 
 
 def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
@@ -347,7 +306,7 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     )  # fmt: skip
     corners = Card.tabular(table)
     if run is None or run.dispersion is None:
-        return [corners]
+        return corners
     found, waves = run.dispersion, run.critical.waves if run.critical else ()
     path = partial(figures.draw_dispersion, found, waves)
     maps = [
@@ -355,16 +314,8 @@ def _dispersion_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
                      partial(figures.draw_zone_map, part, run.pitch, waves))
         for n, part in enumerate(found.zone, start=1)
     ]  # fmt: skip
-    cards = [
-        Card.single("dispersion-path", "Along a path", path,
-             "Bold: the lowest eigenvalue, at the loads named above; faint: the next ones. "
-             "Ring: a critical wave."),
-        Card("Over the zone", maps,
-             caption="Lowest eigenvalue against the wave vector ξ = k l/2π, Cartesian. Outline: "
-             "the first Brillouin zone. Rings: the critical waves and their images. At Γ it is "
-             "zero: a translation."),
-    ]  # fmt: skip
-    return [*(card for card in cards if card.figures), corners]
+    cards = [Card.captioned("dispersion-path", path), Card(figures=maps, **caption("zone"))]
+    return [*(card for card in cards if card.figures), *corners]
 
 
 def _mode_section(run: LatticeRun) -> Section:
@@ -393,12 +344,6 @@ def _mode_section(run: LatticeRun) -> Section:
     return Section("modes", "Modes", [Card("Modes", drawn, wide=True)], lead)
 
 
-_BRANCH_LEAD = (
-    "Equilibria of the cell that repeats, beyond the critical point. The lowest energy at the same "
-    "load is what a lattice at that prescribed load prefers."
-)
-
-
 def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     rows = [_branch_row(branch) for branch in summary["branches"]]
     if not rows:
@@ -406,8 +351,7 @@ def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:
     columns = ("branch", "last strain [%]", "energy − primary [kPa]", "negative eigenvalues",
                "amplitudes [mm]", "outcome")  # fmt: skip
     table = ReportTable("Branches at their last states", columns, rows, on_terminal=True)
-    card = Card.tabular(table, wide=True)
-    return [*(_branch_figures(run) if run else []), card]
+    return [*(_branch_figures(run) if run else []), *Card.tabular(table, wide=True)]
 
 
 def _branch_row(branch: Mapping[str, Any]) -> tuple[Cell, ...]:
@@ -427,32 +371,13 @@ def _branch_figures(run: LatticeRun) -> list[Card]:
     if not followed or run.modes is None:
         return []
     critical = run.modes.load
-    parts = {
-        "energies": ("Energy", partial(figures.draw_energies, followed, critical),
-                     "Stored energy per area of the lattice over that of the primary path at the "
-                     "same load. Filled: stable against all fields with the cell’s period; open "
-                     "and dashed: unstable. Ring: the critical point."),
-        "amplitudes": ("Amplitude", partial(figures.draw_amplitudes, followed, critical),
-                       "Of the critical modes together: the root of the sum of their squared "
-                       "amplitudes."),
-        "differences": ("Lowest branch", partial(figures.draw_differences, followed),
-                        "Stored energy per area over that of the lowest of these branches at the "
-                        "same load."),
-    }  # fmt: skip
-    return [
-        Card.single(name, title, drawn, caption)
-        for name, (title, drawn, caption) in parts.items()
-        if len(followed) > 1 or name != "differences"
-    ]
-
-
-def _family_section(run: LatticeRun) -> Section:
-    lead = Markup(
-        "φ(x) = Σ (A, B) sin[π/l (k<sub>x</sub> x + k<sub>y</sub> y + c)] over a few waves: what "
-        "the paper reads off the spectral densities by eye. What the waves have in common becomes "
-        "a shared parameter."
-    )
-    return Section("family", "Mode family", [_family_card(found) for found in run.patterns], lead)
+    drawn = {
+        "energies": partial(figures.draw_energies, followed, critical),
+        "amplitudes": partial(figures.draw_amplitudes, followed, critical),
+    }
+    if len(followed) > 1:
+        drawn["differences"] = partial(figures.draw_differences, followed)
+    return [Card.captioned(name, draw) for name, draw in drawn.items()]
 
 
 def _family_card(found: FoundPattern) -> Card:
@@ -484,42 +409,15 @@ def _study_section(run: LatticeRun) -> Section:
         for name, rows in (("Hole size and loading", study.ratios), ("Cell size", study.scales),
                            ("Material", study.materials)) if rows
     ]  # fmt: skip
+    drawn = {"strains": figures.draw_critical_strains, "overlaps": figures.draw_overlaps,
+             "captured": figures.draw_captured} if study.ratios else {}  # fmt: skip
     cards = [
         Card("Findings of the study", text=study_text(study), wide=True),
-        Card("A quarter of the mode’s cell", overlays, paper="paper: Fig. graded", wide=True,
-             caption="Line: the numerical mode. Grey: the analytic one, with the same rms "
-             "displacement over the material. The stated largest displacement is the numerical "
-             "one’s."),
-        *_study_figures(study.ratios),
+        Card(figures=overlays, wide=True, **caption("overlay")),
+        *(Card.captioned(name, partial(draw, study.ratios)) for name, draw in drawn.items()),
         Card("Tables", tables=tables, wide=True),
     ]  # fmt: skip
-    lead = (
-        "The paper’s Section “Graded Microstructures and Size Independence of the Modes”: the "
-        "numerical mode at (π, π) against Eq. (mode), whose two waves are the same for every "
-        "lattice."
-    )
-    return Section("study", "Parameter study",
-                   [c for c in cards if c.figures or c.tables or c.text], lead)  # fmt: skip
-
-
-def _study_figures(rows: Sequence[ModeRow]) -> list[Card]:
-    parts = {
-        "strains": ("Critical strain", figures.draw_critical_strains,
-                    "Line: what is critical first. Dashed: the wave (π, π) alone, where something "
-                    "else comes before. No point: stable in the whole range. Filled dots, here "
-                    "and beside: the pattern comes first."),
-        "overlaps": ("Overlap with Eq. (mode)", figures.draw_overlaps,
-                     "1: the same field but for a factor. Where the pattern isn’t what comes "
-                     "first, its lowest mode in the first critical state, or in the last state "
-                     "looked at."),
-        "captured": ("Energy captured", figures.draw_captured,
-                     "By the family that is found for each mode on its own; it takes more waves "
-                     "(their number beside the dots) where two are not enough."),
-    }  # fmt: skip
-    return [
-        Card.single(name, title, partial(draw, rows), caption)
-        for name, (title, draw, caption) in parts.items() if rows
-    ]  # fmt: skip
+    return Section.of("study", [c for c in cards if c.figures or c.tables or c.text])
 
 
 def _overlay(mode: PatternMode, n: int) -> ReportFigure:

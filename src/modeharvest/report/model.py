@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import csv
 import re
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import resources
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
 
 from modeharvest.fem.materials import Ogden
 from modeharvest.util.files import atomic
@@ -24,6 +28,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NBSP = "\N{NO-BREAK SPACE}"
+
+
+@cache
+def _captions() -> dict[str, dict[str, str]]:
+    source = resources.files(__package__).joinpath("captions.toml")
+    return tomllib.loads(source.read_text("utf-8"))
+
+
+def caption(name: str, **values: object) -> dict[str, Any]:
+    """Title, caption, lead … of that name in ``captions.toml``, with values filled in."""
+    return {key: Markup(text).format(**values) for key, text in _captions()[name].items()}
+
+
+def sentence(name: str, **values: object) -> str:
+    """The sentence of that name in ``captions.toml``, plain text, with values filled in."""
+    return _captions()["sentences"][name].format(**values)
 
 
 @dataclass(frozen=True)
@@ -65,12 +85,8 @@ Cell = str | float | int | None | Mark | Measured
 class KeyNumber:
     """One of the up to six numbers at the top of a page.
 
-    Parameters
-    ----------
-    name, value, unit
-        What it is, its value as a reader wants it or None, and its unit (may be empty).
-    remark
-        What to compare it with.
+    ``name``, ``value``, ``unit``: what it is, its value as a reader wants it or None, and its unit
+    (may be empty). ``remark``: what to compare it with.
     """
 
     name: str
@@ -83,22 +99,11 @@ class KeyNumber:
 class ReportFigure:
     """A figure, drawn when the page is written.
 
-    Parameters
-    ----------
-    name
-        Its anchor, unique in the page.
-    label
-        What is written above it; may be empty.
-    draw
-        Draws it, in the style of :mod:`modeharvest.report.figures.style`.
-    numbers
-        One line of numbers below it.
-    wide
-        Whether it takes the whole width of its card.
-    exact
-        Whether every pixel is kept: for fields as fine as the pixels.
-    late
-        Whether it is drawn after the others, as what it shows may still be computed.
+    ``name``: its anchor, unique in the page. ``label``: what is written above it; may be empty.
+    ``draw``: draws it, in the style of :mod:`modeharvest.report.figures.style`. ``numbers``: one
+    line of numbers below it. ``wide``: whether it takes the whole width of its card. ``exact``:
+    whether every pixel is kept: for fields as fine as the pixels. ``late``: whether it is drawn
+    after the others, as what it shows may still be computed.
     """
 
     name: str
@@ -114,22 +119,10 @@ class ReportFigure:
 class ReportTable:
     """A table.
 
-    Parameters
-    ----------
-    title
-        What it holds.
-    columns
-        Headings with their units; the first column names the rows.
-    rows
-        As many cells each as there are columns.
-    name
-        Its anchor; none if empty.
-    file
-        A CSV file beside the page that holds the same.
-    folded
-        Whether the reader has to unfold it.
-    on_terminal
-        Whether it is printed, too.
+    ``title``: what it holds. ``columns``: headings with their units; the first column names the
+    rows. ``rows``: as many cells each as there are columns. ``name``: its anchor; none if empty.
+    ``file``: a CSV file beside the page that holds the same. ``folded``: whether the reader has to
+    unfold it. ``on_terminal``: whether it is printed, too.
     """
 
     title: str
@@ -158,22 +151,11 @@ class ReportTable:
 class Card:
     """What belongs together on a page: figures side by side, tables, text.
 
-    Parameters
-    ----------
-    title
-        Its heading.
-    figures, tables
-        The same quantity at several states, for example; in this order.
-    text
-        Statements, as a list; by headings, side by side, where it is a mapping.
-    caption
-        What is shown, below.
-    name
-        Its anchor; none if empty.
-    symbol, paper
-        Beside the heading: of the quantity, and its figure in the paper.
-    wide
-        Whether it takes the whole width of the page.
+    ``title``: its heading. ``figures``, ``tables``: the same quantity at several states, for
+    example; in this order. ``text``: statements, as a list; by headings, side by side, where it is
+    a mapping. ``caption``: what is shown, below. ``name``: its anchor; none if empty. ``symbol``,
+    ``paper``: beside the heading: of the quantity, and its figure in the paper. ``wide``: whether
+    it takes the whole width of the page.
     """
 
     title: str
@@ -194,9 +176,22 @@ class Card:
         return cls(title, [ReportFigure(name, "", draw, wide=True)], caption=caption, **more)
 
     @classmethod
-    def tabular(cls, table: ReportTable, **more: Any) -> Card:
-        """One table under its own title."""
-        return cls(table.title, tables=[table], **more)
+    def captioned(
+        cls,
+        name: str,
+        draw: Callable[[], Figure],
+        text: str = "",
+        wide: bool = False,
+        **values: object,
+    ) -> Card:
+        """One figure over the whole width, with the words named ``text``, or as the figure."""
+        figure = ReportFigure(name, "", draw, wide=True)
+        return cls(**caption(text or name, **values), figures=[figure], wide=wide)
+
+    @classmethod
+    def tabular(cls, table: ReportTable, **more: Any) -> list[Card]:
+        """One table under its own title; no card where it has no rows."""
+        return [cls(table.title, tables=[table], **more)] if table.rows else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,35 +203,24 @@ class Section:
     cards: Sequence[Card]
     lead: str = ""
 
+    @classmethod
+    def of(cls, name: str, cards: Sequence[Card], **values: object) -> Section:
+        """With the title and the lead of that name."""
+        return cls(name, cards=cards, **caption(f"section-{name}", **values))
+
 
 @dataclass(frozen=True, eq=False)
 class Report:
     """All that a reader sees of a run.
 
-    Parameters
-    ----------
-    kind, title, lead
-        Of which kind of run; what it is called; a paragraph on what the page is about.
-    findings
-        What was found, in sentences, the most important first; also on the terminal.
-    keys
-        Up to six numbers to begin with.
-    sections
-        Figures and tables; empty ones are left out.
-    warnings
-        What to beware of; also on the terminal.
-    notes
-        What to know before trusting the numbers.
-    command, remark
-        What makes it again, and a word on that.
-    case
-        What was run: plain values, or TOML text.
-    files
-        What lies beside the page, and what each file holds.
-    costs, versions
-        Of the run, and of libraries.
-    hero, hero_caption
-        A figure at the top.
+    ``kind``, ``title``, ``lead``: of which kind of run; what it is called; a paragraph on what the
+    page is about. ``findings``: what was found, in sentences, the most important first; also on the
+    terminal. ``keys``: up to six numbers to begin with. ``sections``: figures and tables; empty
+    ones are left out. ``warnings``: what to beware of; also on the terminal. ``notes``: what to
+    know before trusting the numbers. ``command``, ``remark``: what makes it again, and a word on
+    that. ``case``: what was run: plain values, or TOML text. ``files``: what lies beside the page,
+    and what each file holds. ``costs``, ``versions``: of the run, and of libraries. ``hero``,
+    ``hero_caption``: a figure at the top. ``brief``: a table for the terminal alone.
     """
 
     kind: str
@@ -256,6 +240,7 @@ class Report:
     versions: Mapping[str, str] = field(default_factory=dict)
     hero: ReportFigure | None = None
     hero_caption: str = ""
+    brief: ReportTable | None = None
 
     @property
     def cards(self) -> Iterator[Card]:
@@ -279,18 +264,10 @@ class Report:
 class Findings:
     """What a study's table of cases shows.
 
-    Parameters
-    ----------
-    numbers
-        The study's results as plain values, with their units in the names.
-    sentences
-        The same in sentences, the most important first.
-    keys
-        Up to six numbers to begin with.
-    figures, tables
-        Of the page.
-    attachments
-        Tables that are files only: too long for the page, or one of its tables in numbers.
+    ``numbers``: the study's results as plain values, with their units in the names. ``sentences``:
+    the same in sentences, the most important first. ``keys``: up to six numbers to begin with.
+    ``figures``, ``tables``: of the page. ``attachments``: tables that are files only: too long for
+    the page, or one of its tables in numbers.
     """
 
     numbers: Mapping[str, Any]
@@ -308,14 +285,9 @@ def study_report(
 ) -> Report:
     """The report of a study.
 
-    Parameters
-    ----------
-    summary
-        The content of ``summary.json``.
-    findings
-        Its figures and tables; without, the report is sentences only, as for the terminal.
-    files
-        What lies beside the page, and what each file holds.
+    ``summary``: the content of ``summary.json``. ``findings``: its figures and tables; without, the
+    report is sentences only, as for the terminal. ``files``: what lies beside the page, and what
+    each file holds.
     """
     found = findings or Findings({}, ())
     made = f"{summary['command']} · {summary['seeds']}"
@@ -331,7 +303,8 @@ def study_report(
         keys=found.keys,
         sections=[
             Section("figures", "Figures", figures),
-            Section("tables", "Tables", [Card.tabular(t, wide=True) for t in found.tables],
+            Section("tables", "Tables",
+                    [card for t in found.tables for card in Card.tabular(t, wide=True)],
                     "Every case is a row of table.csv."),
         ],
         warnings=[f"case {case['file']} failed: {case['error']}" for case in summary["failed"]],
@@ -387,16 +360,8 @@ def write_page(
 ) -> None:
     """Write a report as one self-contained HTML file, atomically.
 
-    Parameters
-    ----------
-    report
-        What to write.
-    path
-        The HTML file.
-    progress
-        Listener.
-    pictures
-        What :func:`draw_figures` has made of its figures before; they are drawn without.
+    ``report``: what to write. ``path``: the HTML file. ``progress``: listener. ``pictures``: what
+    :func:`draw_figures` has made of its figures before; they are drawn without.
     """
     import jinja2
 
@@ -420,17 +385,13 @@ def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
     """Write every table that has a file as CSV, with all digits, atomically."""
     for table in tables:
         if table.file:
+            rows = [["" if cell is None or cell != cell else cell for cell in row]
+                    for row in table.rows]  # fmt: skip
             with (
-                atomic(folder / table.file) as temporary,
-                temporary.open("w", newline="", encoding="utf-8") as file,
+                atomic(folder / table.file) as part,
+                part.open("w", -1, "utf-8", newline="") as file,
             ):
-                writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(table.columns)
-                writer.writerows(list(map(_for_csv, row)) for row in table.rows)
-
-
-def _for_csv(cell: Cell) -> Any:
-    return "" if cell is None or cell != cell else cell
+                csv.writer(file, lineterminator="\n").writerows([table.columns, *rows])
 
 
 def print_report(report: Report, out: Path) -> None:
@@ -443,7 +404,8 @@ def print_report(report: Report, out: Path) -> None:
     console.print(f"[bold]{escape(report.title)}[/bold]", soft_wrap=True)
     for sentence in report.findings:
         console.print(f"- {escape(sentence)}", soft_wrap=True)
-    for table in (table for table in report.tables if table.on_terminal):
+    brief = [report.brief] if report.brief else []
+    for table in (*brief, *(table for table in report.tables if table.on_terminal)):
         printed = Table(title=escape(table.title), title_justify="left")
         heads, *rows = _upright([list(table.columns), *map(list, table.rows)])
         for n, head in enumerate(heads):
@@ -483,8 +445,12 @@ def number(value: Any, digits: int | None = None) -> str:
     if 1e-3 <= abs(value) < 1e5:
         return f"{value:.4g}".replace("-", "−")
     mantissa, power = f"{value:.1e}".split("e")
-    raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{mantissa} · 10{raised}".replace("-", "−")
+    return f"{mantissa} · {ten_to(int(power))}".replace("-", "−")
+
+
+def ten_to(power: int) -> str:
+    """A power of ten, raised."""
+    return "10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def fixed(value: float, decimals: int = 5) -> str:
@@ -502,10 +468,7 @@ def percent(value: float | None, digits: int = 4) -> str:
 def material_text(table: Mapping[str, Any]) -> str:
     """A material's kind and constants, and whether they are this project's default.
 
-    Parameters
-    ----------
-    table
-        ``kind`` and the constants, as in a case or in a solution's ``info``.
+    ``table``: ``kind`` and the constants, as in a case or in a solution's ``info``.
     """
     constants = {name: value for name, value in table.items() if name != "kind"}
     values = ", ".join(f"{name} {_plain_number(value)}" for name, value in constants.items())

@@ -3,40 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from markupsafe import Markup
 
 from modeharvest.report.experiment import verdict
-from modeharvest.report.figures.curves import draw_convergence, draw_onset, draw_waves
-from modeharvest.report.figures.fits import (
-    Panel,
-    ansatz_panels,
-    has_mode,
-    panel_sections,
-    shape_numbers,
-    spectrum_panels,
-)
-from modeharvest.report.figures.photographs import (
-    CLOSE,
-    PhotographState,
-    draw_closeup,
-    draw_deformed,
-    draw_distortion,
-    draw_distortion_error,
-    draw_distortion_sd,
-    draw_error,
-    draw_error_against_truth,
-    draw_hero,
-    draw_part_spectrum,
-    draw_reference,
-    draw_residual,
-    draw_w,
-    photograph_states,
-    shown_frames,
-)
+from modeharvest.report.figures import fits
+from modeharvest.report.figures import photographs as figures
+from modeharvest.report.figures.curves import draw_onset, draw_waves
+from modeharvest.report.figures.photographs import PhotographState
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -47,88 +24,58 @@ from modeharvest.report.model import (
     ReportFigure,
     ReportTable,
     Section,
+    caption,
     number,
     percent,
+    sentence,
 )
 from modeharvest.runs.photographs.results import Harvest
 
 Summary = Mapping[str, Any]
 Frame = Mapping[str, Any]
 
-_LEAD = Markup(
-    "Photographs of a compressed cellular specimen, measured by micromorphic digital image "
-    "correlation: a smooth field v<sub>0</sub>, a pattern φ<sub>1</sub> and its amplitude "
-    "v<sub>1</sub>, with their uncertainties."
-)
-_HEADS = {
-    "photographs": (
-        "Photographs and pattern",
-        "Fig. “spect_real” of the paper. The family of the mode, which its authors read off the "
-        "spectral densities by eye, is read by the program here.",
-    ),
-    "found": (
-        "Measured displacement",
-        Markup(
-            "Fig. “real” of the paper: the displacement as u = v<sub>0</sub> + "
-            "v<sub>1</sub>φ<sub>1</sub>, a smooth field and a correlated pattern with its "
-            "amplitude. Every colour bar has its own range."
-        ),
-    ),
-    "residual-and-model-error": (
-        "Residual and model error",
-        "The residual of the photographs once the measured displacement is taken out, and the "
-        "difference from a local DIC, which assumes little and is noisy.",
-    ),
-    "uncertainty": (
-        "Uncertainty",
-        "Two causes of error, apart: the photographs’ noise, and model error. One standard "
-        "deviation; both components of a vector together.",
-    ),
-    "errors": (
-        "Error analysis",
-        "These photographs were made by a simulation, so the truth is known. The error has two "
-        "parts: the model (ansatz) error, which remains however well the displacement is measured, "
-        "and the measurement error on top of it.",
-    ),
-}
+_PANELED = ("photographs", "found", "residual-and-model-error", "uncertainty", "errors")
+"""Sections of panels, in this order."""
 
 
 def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Report:
     """The report of measured photographs.
 
-    Parameters
-    ----------
-    summary
-        The content of ``summary.json``.
-    harvest
-        What its figures show; without, the report has numbers only, as for the terminal.
+    ``summary``: the content of ``summary.json``. ``harvest``: what its figures show; without, the
+    report has numbers only, as for the terminal.
     """
     frames = {frame["name"]: frame for frame in summary["frames"]}
-    shown = [frames[f.name] for f in shown_frames(harvest)] if harvest else summary["frames"]
+    shown = (
+        [frames[f.name] for f in figures.shown_frames(harvest)] if harvest else summary["frames"]
+    )
     names = photograph_labels(shown)
-    states = photograph_states(harvest, names) if harvest else []
+    states = figures.photograph_states(harvest, names) if harvest else []
     buckling = summary.get("buckling") or {}
-    sections = panel_sections(
-        photograph_panels(states), states, _HEADS,
-        lambda key, s: panel_numbers(key, frames[s.frame.name]) or shape_numbers(key, s),
-    ) if states else []  # fmt: skip
-    last = summary["frames"][-1]
-    hero = ReportFigure("hero", "The last photograph", partial(draw_hero, states[-1])) if (
-        states) else None  # fmt: skip
+    sections = fits.panel_sections(
+        _PANELED, photograph_panels(states), states,
+        lambda key, s: panel_numbers(key, frames[s.frame.name]) or fits.shape_numbers(key, s),
+        known="These photographs were made by a simulation, so the truth is known. ",
+        source="Fig. “real” of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
+    )  # fmt: skip
+    steps = [fits.convergence_card(s, frames[s.frame.name]["outcome_why"]) for s in states]
+    last, hero = summary["frames"][-1], None
+    if states:
+        drawn = partial(figures.draw_hero, states[-1])
+        hero = ReportFigure("hero", "The last photograph", drawn)
     return Report(
         kind="photographs",
         title=summary["title"],
-        lead=_LEAD,
+        lead=caption("page-photographs")["lead"],
         findings=[buckling["text"]] if buckling.get("text") else [],
         keys=key_numbers(summary),
         sections=[
             *([_reference(harvest, summary, states)] if harvest else []),
             *([_optics(harvest, summary)] if harvest and harvest.lens is not None else []),
-            *_with_readings(sections, shown, names),
+            *(_with_readings(sections, shown, names) if states else []),
             Section("truth", "Obtained and expected values", _truth_cards(summary)),
             *([_timeline(harvest, summary)] if harvest else []),
             Section("numbers", "Numbers", number_cards(summary, shown, names)),
-            *([_convergence(states, frames)] if states else []),
+            Section("convergence", "Convergence", steps),
         ],
         warnings=[
             *(f"not used: {row['name']}: {row['reason']}" for row in summary.get("skipped", [])),
@@ -252,116 +199,56 @@ def _residual_numbers(frame: Frame) -> str:
     return text + ("" if chi is None else f"; χ² {chi:.3g}")
 
 
-def photograph_panels(states: Sequence[PhotographState]) -> list[Panel[PhotographState]]:
+def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[PhotographState]]:
     """Every quantity that is drawn of one of these photographs."""
     modes = max((len(state.frame.modes) for state in states), default=0)
-    panels: list[Panel[PhotographState]] = [
-        *_image_panels(),
-        *spectrum_panels("photographs", "spect_real", "photographs", _has_spectrum),
-        *(p for k, part in enumerate(states[0].frame.parts) for p in _part_panels(k, part.name)),
-        *ansatz_panels("found", "real", modes),
-        *_residual_panels(),
-        *_error_panels("v0", "v<sub>0</sub>", "Smooth field"),
-    ]
+    parts = states[0].frame.parts if states else ()
+    last = "residual-and-model-error"
+    panels: list[fits.Panel[PhotographState]] = [
+        fits.Panel.of("photographs", "image", figures.draw_deformed, text="photograph"),
+        fits.Panel.of("photographs", "closeup", figures.draw_closeup, cells=figures.CLOSE),
+        *fits.spectrum_panels("photographs", "spect_real", "photographs", _has_spectrum),
+        *(fits.Panel.of("photographs", f"S{axis}{axis}-part{k + 1}",
+                   partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
+                   part=part.name)
+          for k, part in enumerate(parts) for c, axis in enumerate("xy")),
+        *fits.ansatz_panels("found", "real", modes),
+        fits.Panel.of(last, "residual", figures.draw_residual, text="photograph-residual",
+                      exact=True),
+        fits.Panel.of(last, "w", figures.draw_w, lambda state: state.frame.local is not None,
+                      "photograph-w"),
+        *_error_panels("v0", "v0"),
+    ]  # fmt: skip
     for i in range(modes):
-        n = f"<sub>{i + 1}</sub>"
-        panels += _error_panels(f"v{i + 1}", f"v{n}", "Amplitude of the mode", i)
-        panels += _error_panels(f"fluc{i + 1}", f"v{n}φ{n}", "Correlated fluctuation", i)
-    panels += _truth_panels()
-    return [panel for panel in panels if any(panel.shows(state) for state in states)]
+        panels += [*_error_panels(f"v{i + 1}", "v", i), *_error_panels(f"fluc{i + 1}", "fluc", i)]
+    for part, text in {"true_w": "true-w", "best": "best", "loss": "loss"}.items():
+        drawn = partial(figures.draw_error_against_truth, part=part)
+        panels.append(fits.Panel.of("errors", part, drawn, _has_truth, text))
+    return [panel for panel in panels if any(map(panel.shows, states))]
 
 
-def _image_panels() -> list[Panel[PhotographState]]:
-    return [
-        Panel(
-            "photographs", "image", "", "Deformed photograph", "spect_real (a)",
-            "As it was correlated, free from optical distortion. Over it, in yellow, the "
-            "material’s outline in the reference, moved by the measured displacement: it should "
-            "run along the edges.",
-            draw_deformed,
-        ),
-        Panel(
-            "photographs", "closeup", "", "A closer look", "",
-            f"{CLOSE} × {CLOSE} cells in the middle, pixel by pixel, with the outline as above.",
-            draw_closeup,
-        ),
-    ]  # fmt: skip
-
-
-def _part_panels(k: int, name: str) -> list[Panel[PhotographState]]:
-    """Spectral densities of part k (from 0)."""
-    return [
-        Panel(
-            "photographs", f"S{axis}{axis}-part{k + 1}", f"S<sub>{axis}{axis}</sub>",
-            f"Spectral density along {axis}, region “{name}”", "",
-            "Of the displacement in this region alone, which has modes of its own.",
-            partial(draw_part_spectrum, part=k, component=component),
-        )
-        for component, axis in enumerate("xy")
-    ]  # fmt: skip
-
-
-def _residual_panels() -> list[Panel[PhotographState]]:
-    return [
-        Panel(
-            "residual-and-model-error", "residual", "f − g∘φ", "Residual", "real (g) and (o)",
-            "In the deformed configuration; single pixels, not averages. The colours end at the "
-            "99th percentile. Camera noise is in it, and model error. Blank along the edges: not "
-            "compared there.",
-            draw_residual, exact=True,
-        ),
-        Panel(
-            "residual-and-model-error", "w", "‖w‖", "Microfluctuation field", "real (h) and (p)",
-            "Local DIC − IDIC in the deformed configuration, the local DIC’s own errors included; "
-            "blank where it has no point. The colours end at the 99.8th percentile.",
-            draw_w, lambda state: state.frame.local is not None,
-        ),
-    ]  # fmt: skip
-
-
-def _error_panels(
-    field: str, symbol: str, title: str, i: int | None = None
-) -> list[Panel[PhotographState]]:
+def _error_panels(field: str, text: str, i: int | None = None) -> list[fits.Panel[PhotographState]]:
     """Standard deviations of a field by both causes."""
 
     def shows(state: PhotographState) -> bool:
-        return i is None or has_mode(i)(state)
+        return i is None or fits.has_mode(i)(state)
 
+    def shows_model(state: PhotographState) -> bool:
+        return state.frame.by_model_error is not None and shows(state)
+
+    causes: dict[figures.Cause, Callable[[PhotographState], bool]]
+    causes = {"noise": shows, "model": shows_model}
     return [
-        Panel(
-            "uncertainty", f"{field}-noise", f"sd({symbol})", f"{title}, by noise", "",
-            "One standard deviation by the photographs’ noise.",
-            partial(draw_error, field=field, cause="noise"), shows,
-        ),
-        Panel(
-            "uncertainty", f"{field}-model", f"sd({symbol})", f"{title}, by model error", "",
-            "One standard deviation by the part of the displacement that the ansatz can’t "
-            "describe, which perturbs its unknowns cell by cell; noise included.",
-            partial(draw_error, field=field, cause="model"),
-            lambda state: state.frame.by_model_error is not None and shows(state),
-        ),
+        fits.Panel.of("uncertainty", f"{field}-{cause}",
+                 partial(figures.draw_error, field=field, cause=cause), shown, f"{text}-{cause}",
+                 n=(i or 0) + 1)
+        for cause, shown in causes.items()
     ]  # fmt: skip
 
 
-def _truth_panels() -> list[Panel[PhotographState]]:
-    def shows(state: PhotographState) -> bool:
-        truth = state.harvest.truth
-        return truth is not None and state.frame.name in truth.frames
-
-    parts = {
-        "true_w": ("‖w‖", "Truth − IDIC",
-                   "The whole error of the measured displacement, in the deformed configuration. "
-                   "The colours end at the 99.8th percentile, here and beside."),
-        "best": ("‖u − u<sub>best</sub>‖", "Model (ansatz) error",
-                 "Truth − best fit of the same unknowns to the true displacement."),
-        "loss": ("‖u<sub>best</sub> − u<sub>IDIC</sub>‖", "Measurement error",
-                 "Best fit − IDIC: what the measurement adds, on its own, smaller scale."),
-    }  # fmt: skip
-    return [
-        Panel("errors", key, symbol, title, "", caption,
-              partial(draw_error_against_truth, part=key), shows)
-        for key, (symbol, title, caption) in parts.items()
-    ]  # fmt: skip
+def _has_truth(state: PhotographState) -> bool:
+    truth = state.harvest.truth
+    return truth is not None and state.frame.name in truth.frames
 
 
 def _has_spectrum(state: PhotographState) -> bool:
@@ -372,8 +259,6 @@ def _with_readings(
     sections: Sequence[Section], shown: Sequence[Frame], names: Mapping[str, str]
 ) -> Sequence[Section]:
     """The first section with what is read off the densities, and the initial guesses."""
-    if not sections:
-        return sections
     first, *others = sections
     text = {names[f["name"]]: [*f["pattern_reading"], *f["start"]] for f in shown}
     card = Card("Reading of the densities, and initial guess", text=text, name="reading", wide=True)
@@ -401,19 +286,15 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
         ("pixel size", f"{number(1000 * px)} µm"),
         ("camera noise", f"{number(summary['noise']['sd'])} levels"),
     ]
-    drawn = partial(draw_reference, harvest, states[0].view.outline, states[0].levels)
+    drawn = partial(figures.draw_reference, harvest, states[0].view.outline, states[0].levels)
     figure = ReportFigure("reference", "The reference", drawn, wide=True)
     table = ReportTable("Reference", ("", ""), rows)
     title = "Material, holes, lattice and the part with holes"
     cards = [Card(title, [figure], [table], [*sentences, *summary["text"]], wide=True)]
     skipped = [(row["name"], row["reason"]) for row in summary["skipped"]]
     table = ReportTable("Photographs not used", ("photograph", "reason"), skipped, "skipped")
-    cards += [Card.tabular(table, wide=True)] if skipped else []
-    lead = (
-        "All results rest on what is drawn here. If the outline does not follow the material, or "
-        "the lattice the holes, give a mask image or a polygon and the cell size."
-    )
-    return Section("confirm", "Reference", cards, lead)
+    cards += Card.tabular(table, wide=True)
+    return Section.of("confirm", cards)
 
 
 def _optics(harvest: Harvest, summary: Summary) -> Section:
@@ -421,25 +302,15 @@ def _optics(harvest: Harvest, summary: Summary) -> Section:
     lens, grid, numbers = harvest.lens, harvest.grid, summary["optics"]
     assert lens is not None
 
-    cards = [
-        Card.single("distortion", "Distortion S", partial(draw_distortion, lens, grid),
-             f"Colour: its length, at most {number(numbers['max_px'])} px. Arrows: S itself, "
-             "enlarged."),
-    ]  # fmt: skip
+    cards = [Card.captioned("distortion", partial(figures.draw_distortion, lens, grid),
+                            largest=number(numbers["max_px"]))]  # fmt: skip
     if harvest.calibration is not None:
-        drawn = partial(draw_distortion_sd, harvest.calibration, grid)
-        cards.append(Card.single("distortion-sd", "Standard deviation of S", drawn,
-                          f"By the noise of the calibration’s photographs, "
-                          f"{number(numbers['sd_rms_px'])} px rms."))  # fmt: skip
+        drawn = partial(figures.draw_distortion_sd, harvest.calibration, grid)
+        cards.append(Card.captioned("distortion-sd", drawn, rms=number(numbers["sd_rms_px"])))
     if harvest.truth is not None and harvest.truth.distortion is not None:
-        drawn = partial(draw_distortion_error, lens, harvest.truth.distortion, grid)
-        cards.append(Card.single("distortion-error", "S − truth, affine part aside", drawn,
-                          "Known for the photographs of a simulation."))  # fmt: skip
-    lead = (
-        "Eq. (r2) of the paper: the lens shows the ideal position x at x + S(x). The photographs "
-        "are freed from S once, before anything is measured."
-    )
-    return Section("optics", "Optical distortion", [*cards, *_calibration_cards(numbers)], lead)
+        drawn = partial(figures.draw_distortion_error, lens, harvest.truth.distortion, grid)
+        cards.append(Card.captioned("distortion-error", drawn))
+    return Section.of("optics", [*cards, *_calibration_cards(numbers)])
 
 
 def _calibration_cards(numbers: Mapping[str, Any]) -> list[Card]:
@@ -475,7 +346,7 @@ def _truth_cards(summary: Summary) -> list[Card]:
     ]
     columns = ("quantity", "obtained", "unit", "expected", "")
     table = ReportTable("Against the truth", columns, rows, "obtained", on_terminal=True)
-    return [Card.tabular(table, wide=True)] if rows else []
+    return Card.tabular(table, wide=True)
 
 
 def _timeline(harvest: Harvest, summary: Summary) -> Section:
@@ -483,22 +354,11 @@ def _timeline(harvest: Harvest, summary: Summary) -> Section:
     cards = []
     if harvest.timeline:
         drawn = partial(draw_onset, harvest.timeline, harvest.buckling)
-        cards.append(Card.single(
-            "timeline-pattern", "Amplitude of the pattern", drawn,
-            "Bars: two standard deviations by noise. A pattern is observable above both "
-            "bands, of model error and of noise. Shaded: the strains between which it appears. "
-            "Dashed: growth with the square root of the strain beyond the ringed one, as after a "
-            "pitchfork bifurcation.",
-        ))  # fmt: skip
+        cards.append(Card.captioned("timeline-pattern", drawn))
     frames = [frame for frame in summary["frames"] if frame["modes"]]
     if len(frames) > 1:
-        drawn = partial(draw_waves, frames)
-        cards.append(Card.single(
-            "timeline-waves", "Wave vectors of the pattern", drawn,
-            "Bars: two standard deviations by the larger cause. Open: the mode was fixed, "
-            "or not observable.",
-        ))  # fmt: skip
-    return Section("timeline", "Time line", cards)
+        cards.append(Card.captioned("timeline-waves", partial(draw_waves, frames)))
+    return Section.of("timeline", cards)
 
 
 _FRAME_COLUMNS = (
@@ -514,7 +374,7 @@ def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, s
     frames = ReportTable("Every photograph", _FRAME_COLUMNS, frame_rows(summary), "frames",
                          on_terminal=True)  # fmt: skip
     return [
-        Card.tabular(frames, wide=True),
+        *Card.tabular(frames, wide=True),
         *_amplitude_cards(shown, names),
         *mode_cards(shown, names),
         *_wave_cards(shown, names),
@@ -551,7 +411,7 @@ def _amplitude_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[
     ]  # fmt: skip
     columns = ("", "mode", "", "largest v φ [px]", "largest v among the holes [µm]")
     table = ReportTable("Amplitudes of the modes", columns, rows, "amplitudes", on_terminal=True)
-    return [Card.tabular(table, wide=len(frames) > 2)] if rows else []
+    return Card.tabular(table, wide=len(frames) > 2)
 
 
 def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
@@ -571,9 +431,8 @@ def mode_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]:
         families = dict.fromkeys(frame["modes"][i]["family"] for frame in free)
         caption = "± standard error by noise ± by model error." + (
             f" Fixed: {'; '.join(fixed)}." if fixed else "")  # fmt: skip
-        if rows:
-            cards.append(Card.tabular(table, caption=caption,
-                              paper="; ".join(families), wide=len(free) > 2))  # fmt: skip
+        cards += Card.tabular(table, caption=caption, paper="; ".join(families),
+                              wide=len(free) > 2)  # fmt: skip
     return cards
 
 
@@ -601,21 +460,8 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                 ))  # fmt: skip
     table = ReportTable("Wave vectors", ("", "wave", "ξ₁ [1/l]", "ξ₂ [1/l]"), rows, "waves",
                         on_terminal=True)  # fmt: skip
-    caption = (
-        "± standard error by noise ± by model error. A wave of wavelength λ has |ξ| = l/λ; "
-        "(½, ½) repeats after two cells."
-    )
-    return [Card.tabular(table, caption=caption, wide=len(frames) > 2)] if rows else []
-
-
-def _convergence(states: Sequence[PhotographState], frames: Mapping[str, Frame]) -> Section:
-    cards = [
-        Card.single(f"convergence-{state.name}", state.label,
-                    partial(draw_convergence, state.result),
-                    frames[state.frame.name]["outcome_why"])
-        for state in states
-    ]  # fmt: skip
-    return Section("convergence", "Convergence", cards)
+    words = sentence("photographs-waves")
+    return Card.tabular(table, caption=words, wide=len(frames) > 2)
 
 
 def notes(summary: Summary) -> list[str]:
@@ -632,13 +478,7 @@ def notes(summary: Summary) -> list[str]:
         f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip
     text += [
         f"Camera noise: {noise['sd']:.3g} grey levels{share}, {noise['source']}.",
-        "Two standard errors are given apart. The first is by the photographs’ noise, the "
-        "Cramér–Rao bound. The second is by model error, the part of the displacement that the "
-        "ansatz can’t describe, estimated from the residual with one block for each cell; it "
-        "includes the noise, and takes cells for independent.",
-        "Neither of them is the difference between the measured field and the true displacement: "
-        "that is the microfluctuation field w.",
-        "rms is per component: the root of the mean square over both components.",
+        *map(sentence, ("photographs-errors", "photographs-w", "photographs-rms")),
     ]
     return text
 

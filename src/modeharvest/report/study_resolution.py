@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import pandas as pd
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import curve, plain_ticks
-from modeharvest.report.figures.style import BLUE, GREEN, INK, MUTED, RED, figure
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
 from modeharvest.validation.resolution.buckled import ResolutionSpec
 from modeharvest.validation.resolution.star import KEPT
 from modeharvest.validation.resolution.transfer import (
@@ -90,10 +90,10 @@ def draw_transfer(
     """Draw T over the period for waves of a part along both axes, degrees in colours."""
     pitch = spec.buckled.specimen.pitch
     degrees = sorted({key[2] for key in curves.own})
-    drawn = figure(9.4, 3.1)
+    drawn = style.figure(9.4, 3.1)
     both = drawn.subplots(1, 2, sharey=True)
     for axis, axes in enumerate(both):
-        axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
+        axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
         for degree in degrees:
             colour = _colour(degree, degrees)
             axes.plot(curves.periods / pitch, curves.own[part, axis, degree], color=colour,
@@ -102,12 +102,12 @@ def draw_transfer(
             here = waves[(waves["wave of"] == part) & (waves["along"] == AXES[axis])]
             for degree, points in here.groupby("degree"):
                 axes.plot(points["period [cells]"], points["images"], "o", ms=4,
-                          color=_colour(int(degree), degrees), mec=INK, mew=0.5)  # fmt: skip
+                          color=_colour(int(degree), degrees), mec=style.INK, mew=0.5)  # fmt: skip
         axes.set(xscale="log", xlabel=f"period along {AXES[axis]} [cells]", ylim=(-0.03, 1.04))
-        axes.grid(color=MUTED, alpha=0.18, lw=0.6)
+        axes.grid(color=style.MUTED, alpha=0.18, lw=0.6)
         plain_ticks(axes.xaxis)
     both[0].set_ylabel("amplitude ratio [–]")
-    both[1].legend(frameon=False, fontsize=7.5, title="degree", title_fontsize=7.5,
+    both[1].legend(title="degree", title_fontsize=7.5,
                    loc="lower right")  # fmt: skip
     drawn.tight_layout()
     return drawn
@@ -117,7 +117,7 @@ def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure
     """Draw noise floors over l10 for all degrees, and the line of an affine subset."""
     drawn, axes = curve("l₁₀ % [px]", "noise floor n [10⁻³ px]", _SIZE)
     ends = []
-    for part, floor, colour in (("v0", "v0", BLUE), ("v1", "v1phi1", RED)):
+    for part, floor, colour in (("v0", "v0", style.BLUE), ("v1", "v1phi1", style.RED)):
         x = [np.sqrt(d.finest_px[f"{part} x"] * d.finest_px[f"{part} y"]) for d in degrees]
         y = [1e3 * d.floor_px[floor] for d in degrees]
         ends += x
@@ -127,10 +127,10 @@ def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure
             axes.annotate(str(d.degree), (at, high), (4, 3), textcoords="offset points",
                           fontsize=6.5, color=colour)  # fmt: skip
     line = np.array([min(ends), max(ends)])
-    axes.plot(line, 1e3 * local / line, color=GREEN, linestyle="--", linewidth=1,
+    axes.plot(line, 1e3 * local / line, color=style.GREEN, linestyle="--", linewidth=1,
               label="affine subset of any size (theory)")  # fmt: skip
     axes.set(xscale="log", yscale="log")
-    axes.legend(frameon=False, fontsize=7.5)
+    axes.legend()
     plain_ticks(axes.xaxis, axes.yaxis)
     return drawn
 
@@ -138,13 +138,13 @@ def draw_indicators(degrees: Sequence[DegreeResolution], local: float) -> Figure
 def draw_passband(passband: Passband) -> Figure:
     """Draw what is found of patterns of other wavelengths, beside the mode and instead of it."""
     drawn, axes = curve("wave numbers over the mode's [–]", "amplitude ratio [–]", _SIZE)
-    axes.axhline(KEPT, color=MUTED, linestyle=":", linewidth=1)
-    axes.plot(passband.stretch, passband.added, color=BLUE, label="a small one beside it")
+    axes.axhline(KEPT, color=style.MUTED, linestyle=":", linewidth=1)
+    axes.plot(passband.stretch, passband.added, color=style.BLUE, label="a small one beside it")
     known = np.isfinite(passband.itself)
-    axes.plot(passband.stretch[known], passband.itself[known], "o", ms=3.5, color=RED,
+    axes.plot(passband.stretch[known], passband.itself[known], "o", ms=3.5, color=style.RED,
               label="the pattern itself")  # fmt: skip
     axes.set_ylim(-0.03, 1.18)
-    axes.legend(frameon=False, fontsize=7.5, loc="upper center", ncols=2)
+    axes.legend(loc="upper center", ncols=2)
     return drawn
 
 
@@ -158,118 +158,57 @@ _KEPT = 0.85
 """Share of a wave that is found, from which on images are set against best fits apart [-]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """The sentences on a resolution study.
+def _sentences(
+    found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame
+) -> tuple[str, ...]:
+    """The findings, the most important first.
 
-    Parameters
-    ----------
-    found
-        The analysis.
-    waves, floors
-        Tables: images against best fits, scatter against covariance.
+    ``waves``, ``floors``: tables: images against best fits, scatter against covariance.
     """
+    buckled, chosen, band = found.spec.buckled, found.chosen, found.passband
+    pitch = buckled.specimen.pitch / buckled.pixel_size
+    width = 2.0 * buckled.specimen.half_size[0] / buckled.pixel_size
+    first, last = found.degrees[0], found.degrees[-1]
+    before, after = (d.finest_px["v0 x"] for d in (first, last))
+    v0, v1 = (chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
+    products = [d.indicator_px2["v0"] for d in found.degrees]
+    kept = band.stretch[(band.stretch > 0.82) & (band.added >= 0.9)]
+    rise = {
+        part: f"{1e3 * first.floor_px[name]:.2g} to {1e3 * last.floor_px[name]:.2g} · 10⁻³ px"
+        for part, name in (("v0", "v0"), ("v1", "v1phi1"))
+    }
+    return (
+        sentence("resolution-finest", degree=chosen.degree, v0=v0, v1=v1, v0_cells=v0 / pitch,
+                 v1_cells=v1 / pitch, share=100 * v0 / width),
+        sentence("resolution-trade-off", first=first, last=last, before=before / pitch,
+                 after=after / pitch, **rise),
+        sentence("resolution-product", first=first, last=last, gain=before / after,
+                 least=min(products), most=max(products), subset=found.subset_px2),
+        sentence("resolution-choice"),
+        *_measured_sentences(found, waves, floors),
+        sentence("resolution-pattern", px=2 * pitch, least=kept.min(), most=kept.max(),
+                 degree=chosen.degree, retuned=100 * band.retuned),
+    )  # fmt: skip
 
-    found: ResolutionAnalysis
-    waves: pd.DataFrame
-    floors: pd.DataFrame
 
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """The findings, the most important first."""
-        return (
-            self._finest,
-            self._trade_off,
-            self._product,
-            "What a degree gains in resolution it costs in noise, so the indicator does not "
-            "choose: take the smallest degree whose period is below what v0 and v1 are expected "
-            "to show.",
-            *([self._images] if len(self.waves) else []),
-            *([self._noise] if len(self.floors) else []),
-            self._pattern,
-        )
-
-    @property
-    def _pitch_px(self) -> float:
-        return self.found.spec.buckled.specimen.pitch / self.found.spec.buckled.pixel_size
-
-    @property
-    def _finest(self) -> str:
-        b, pitch = self.found.spec.buckled, self._pitch_px
-        width = 2.0 * b.specimen.half_size[0] / b.pixel_size
-        v0, v1 = (self.found.chosen.finest_px[f"{part} x"] for part in ("v0", "v1"))
-        return (
-            f"At degree {self.found.chosen.degree} a wave along x keeps 90 % of its amplitude from "
-            f"a period of {v0:.0f} px on if it is of v0 ({v0 / pitch:.1f} cells, "
-            f"{100 * v0 / width:.0f} % of the specimen's width), and from {v1:.0f} px on "
-            f"({v1 / pitch:.1f} cells) if it is of v1, which lives in the cellular part only."
-        )
-
-    @property
-    def _trade_off(self) -> str:
-        first, last, pitch = self.found.degrees[0], self.found.degrees[-1], self._pitch_px
-        return (
-            f"From degree {first.degree} to {last.degree} that period of v0 falls from "
-            f"{first.finest_px['v0 x'] / pitch:.1f} to {last.finest_px['v0 x'] / pitch:.1f} cells, "
-            f"and the noise floor of v0 rises from {1e3 * first.floor_px['v0']:.2g} to "
-            f"{1e3 * last.floor_px['v0']:.2g} · 10⁻³ px, that of v1 φ1 from "
-            f"{1e3 * first.floor_px['v1phi1']:.2g} to {1e3 * last.floor_px['v1phi1']:.2g} · 10⁻³ "
-            "px."
-        )
-
-    @property
-    def _product(self) -> str:
-        first, last = self.found.degrees[0], self.found.degrees[-1]
-        v0 = [d.indicator_px2["v0"] for d in self.found.degrees]
-        gain = first.finest_px["v0 x"] / last.finest_px["v0 x"]
-        return (
-            f"While that period becomes {gain:.1f} times shorter, n l₁₀ % of v0 stays within "
-            f"{min(v0):.2f} to {max(v0):.2f} px². That of v1 φ1 goes from "
-            f"{first.indicator_px2['v1']:.2f} to {last.indicator_px2['v1']:.2f} px², with φ1 fixed "
-            f"and without motion from {first.fixed_px2:.2f} to {last.fixed_px2:.2f} px²: the rest "
-            "is mostly the noise of φ1's own parameters. An affine subset on the same speckle "
-            "under "
-            f"the same noise has {self.found.subset_px2:.2f} px², whatever its size (theory)."
-        )
-
-    @property
-    def _images(self) -> str:
-        off, kept = self.waves["difference"].abs(), self.waves["best fit"] >= _KEPT
-        elsewhere = "" if kept.all() else f"; otherwise by {100 * off[~kept].max():.1f} %"
-        anywhere, resolved = self.found.curves.cross_talk()
-        return (
-            f"Correlated images agree with the best fits: where these keep "
-            f"{100 * _KEPT:.0f} % or more of a wave of {self.found.spec.amplitude_px:g} px, its "
-            f"share differs by {100 * off[kept].max():.1f} % of the amplitude at "
-            f"most{elsewhere}. Of a "
-            f"wave of one part up to {100 * resolved:.1f} % is found in the other where it is "
-            f"resolved, up to {100 * anywhere:.0f} % where it isn't."
-        )
-
-    @property
-    def _noise(self) -> str:
-        ratio = self.floors["Monte Carlo / predicted"]
-        return (
-            f"Scatter under noise is {ratio.min():.2f} to {ratio.max():.2f} times what the "
-            f"results' own covariance predicts, each ± {self.floors['±'].mean():.2f}, with and "
-            "without motion."
-        )
-
-    @property
-    def _pattern(self) -> str:
-        """Why l10 means nothing for the pattern itself."""
-        band = self.found.passband
-        kept = band.stretch[(band.stretch > 0.82) & (band.added >= 0.9)]
-        return (
-            "The pattern itself has a wavelength of 2 cells along x and y, "
-            f"{2 * self._pitch_px:.0f} px, far below those periods, and none of it is lost: it is "
-            "one of the functions that are fitted. A small pattern beside it passes as through a "
-            f"filter, from {kept.min():.2f} to {kept.max():.2f} times its wave numbers at degree "
-            f"{self.found.chosen.degree}; but if the pattern itself is up to "
-            f"{100 * band.retuned:.0f} % longer or shorter, its wave numbers follow, and all of "
-            f"its amplitude is found: "
-            "l₁₀ % is a filter's number, and φ1 isn't filtered but tuned."
-        )
+def _measured_sentences(
+    found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame
+) -> list[str]:
+    """What correlated images add to best fits and theory, where there are any."""
+    text = []
+    if len(waves):
+        off, kept = 100 * waves["difference"].abs(), waves["best fit"] >= _KEPT
+        elsewhere = "" if kept.all() else f"; otherwise by {off[~kept].max():.1f} %"
+        anywhere, resolved = (100 * share for share in found.curves.cross_talk())
+        text.append(sentence(
+            "resolution-images", kept=100 * _KEPT, amplitude=found.spec.amplitude_px,
+            off=off[kept].max(), elsewhere=elsewhere, resolved=resolved, anywhere=anywhere,
+        ))  # fmt: skip
+    if len(floors):
+        ratio = floors["Monte Carlo / predicted"]
+        text.append(sentence("resolution-noise", least=ratio.min(), most=ratio.max(),
+                             error=floors["±"].mean()))  # fmt: skip
+    return text
 
 
 def report_resolution(study: ResolutionStudy, table: pd.DataFrame, folder: Path) -> Findings:
@@ -291,7 +230,7 @@ def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
             "cross_talk": dict(zip(("any_period", "resolved"), curves.cross_talk(), strict=True)),
             "longest_retuned": found.passband.retuned,
         },
-        sentences=Answers(found, waves, floors).sentences,
+        sentences=_sentences(found, waves, floors),
         keys=_keys(found.chosen, spec),
         figures=_figures(found, waves, seeds),
         tables=[
@@ -307,35 +246,19 @@ def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
 
 
 def _figures(found: ResolutionAnalysis, waves: pd.DataFrame, seeds: str) -> list[Card]:
-    degree = found.chosen.degree
     again = (
         " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds cos(πx/l) "
         "/ 2."
     )
     return [
-        *(
-            Card.single(
-                f"transfer-{part}", f"Amplitude ratio of a wave of {part}",
-                partial(draw_transfer, part, found.curves, waves, found.spec),
-                f"Waves of {part}, over both phases. Lines: best fits of the ansatz to the "
-                "displacement; dots: correlated images. Dotted: 10 % are lost."
-                + (again if part == "v1" else ""), wide=True,
-            )
-            for part in WAVED
-        ),
-        Card.single(
-            "indicators", "Noise against resolution",
-            partial(draw_indicators, found.degrees, found.subset_px2),
-            f"Numbers: the degree. l₁₀ %: mean of both axes; n: by the covariance; {seeds}. Along "
-            "the dashed line, and any parallel to it, the indicator n l₁₀ % is the same.",
-        ),
-        Card.single(
-            "passband", "Patterns of other wavelengths", partial(draw_passband, found.passband),
-            f"Degree {degree}; best fits. Line: a small pattern with other wave numbers than the "
-            "mode's, added to it: v0 takes the longest, v1 those next to the mode, between them "
-            "nothing passes. Dots: the pattern itself has them, and the initial guess is the mode: "
-            "its wave numbers are unknowns and follow, until the fit ends in another minimum.",
-        ),
+        *(Card.captioned(f"transfer-{part}",
+                         partial(draw_transfer, part, found.curves, waves, found.spec),
+                         "resolution-transfer", True, part=part,
+                         again=again if part == "v1" else "") for part in WAVED),
+        Card.captioned("indicators", partial(draw_indicators, found.degrees, found.subset_px2),
+                       "resolution-indicators", seeds=seeds),
+        Card.captioned("passband", partial(draw_passband, found.passband), "resolution-passband",
+                       degree=found.chosen.degree),
     ]  # fmt: skip
 
 
@@ -390,13 +313,10 @@ def _keys(chosen: DegreeResolution, spec: ResolutionSpec) -> tuple[KeyNumber, ..
     for part in WAVED:
         x, y = (chosen.finest_px[f"{part} {axis}"] / pitch for axis in AXES)
         keys.append(KeyNumber(f"l₁₀ % of {part}", f"{x:.1f} – {y:.1f}", "cells", f"{at}; x – y"))
-    noise = f"{at}; {100 * spec.noise:g} % of noise"
-    keys += [
-        KeyNumber(f"n of {name}", f"{1e3 * chosen.floor_px[floor]:.2f}", "10⁻³ px", noise)
-        for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1"))
-    ]
-    keys += [
-        KeyNumber(f"n l₁₀ % of {part}", number(chosen.indicator_px2[part]), "px²", at)
-        for part in WAVED
-    ]
+    for name, floor in (("v0", "v0"), ("v1 φ1", "v1phi1")):
+        keys.append(KeyNumber(f"n of {name}", f"{1e3 * chosen.floor_px[floor]:.2f}", "10⁻³ px",
+                              f"{at}; {100 * spec.noise:g} % of noise"))  # fmt: skip
+    for part in WAVED:
+        value = number(chosen.indicator_px2[part])
+        keys.append(KeyNumber(f"n l₁₀ % of {part}", value, "px²", at))
     return tuple(keys)

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from modeharvest.report.figures.style import BLUE, GOLD, GREEN, MUTED, figure
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number
+from modeharvest.report.figures import style
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
 from modeharvest.validation.studies.systematic import (
     BASE,
     FACTORS,
@@ -52,9 +52,8 @@ def by_level(found: SystematicAnalysis) -> pd.DataFrame:
             for key, label in ERROR_LABELS.items():
                 row[label] = part[key].mean()
             row[MOVED] = part["moved"].mean()
-            row["measurement error, sd over speckles [px]"] = part["measurement_error_px"].std(
-                ddof=0
-            )
+            scatter = part["measurement_error_px"].std(ddof=0)
+            row["measurement error, sd over speckles [px]"] = scatter
             row["pixels per ligament"] = part["pixels_per_ligament"].mean()
             row["converged"] = f"{int((part['outcome'] == 'converged').sum())} of {len(part)}"
             rows.append(row)
@@ -66,11 +65,8 @@ def by_factor(levels: pd.DataFrame) -> pd.DataFrame:
 
     Levels at which not all converged have no part in it.
     """
-    measurement, model, moved = (
-        ERROR_LABELS["measurement_error_px"],
-        ERROR_LABELS["model_error_px"],
-        f"largest, {MOVED}",
-    )
+    measurement, model = (ERROR_LABELS[f"{name}_error_px"] for name in ("measurement", "model"))
+    moved = f"largest, {MOVED}"
     rows = []
     settled = levels[~levels["converged"].map(_not_all_converged)]
     for name, part in settled.groupby("name", sort=False):
@@ -92,9 +88,9 @@ def _not_all_converged(converged: str) -> bool:
 
 
 _CURVES: dict[str, dict[str, Any]] = {
-    ERROR_LABELS["measurement_error_px"]: {"color": BLUE, "marker": "o"},
-    ERROR_LABELS["model_error_px"]: {"color": GREEN, "marker": "s"},
-    MOVED: {"color": GOLD, "marker": "^"},
+    ERROR_LABELS["measurement_error_px"]: {"color": style.BLUE, "marker": "o"},
+    ERROR_LABELS["model_error_px"]: {"color": style.GREEN, "marker": "s"},
+    MOVED: {"color": style.GOLD, "marker": "^"},
 }
 _COLUMNS = 3
 
@@ -104,21 +100,13 @@ def report_systematic(study: SystematicStudy, table: pd.DataFrame, folder: Path)
     found = study.analyse(table, folder)
     bases, seeds, levels = found.bases, study.seeds, by_level(found)
     spans = by_factor(levels)
+    drawn = partial(draw_factors, levels, bases)
+    figure = Card.captioned("factors", drawn, "systematic-factors", True, seeds=seeds)
     return Findings(
         numbers={"base": dict(found.base), "factors": spans.to_dict("records")},
         sentences=_sentences(levels, spans, found.base),
         keys=_keys(spans, found.base),
-        figures=[
-            Card.single(
-                "factors",
-                "Error against each factor",
-                partial(draw_factors, levels, bases),
-                f"Rms per component, in pixels of the base; means over {seeds}. Blue dots: "
-                "measurement error, IDIC − best fit; green squares: model (ansatz) error; golden "
-                "triangles: how far the measurement is from the base’s. Dotted: the base.",
-                wide=True,
-            )
-        ],
+        figures=[figure],
         tables=[
             ReportTable.of("Which factor matters", spans),
             ReportTable.of("Every level", levels.drop(columns="number")),
@@ -145,12 +133,9 @@ _FAR, _NEAR = 0.1, 0.01
 def _sentences(
     levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]
 ) -> tuple[str, ...]:
-    text = [
-        f"At the base the measurement is {number(base['measurement_error_px'])} px rms per "
-        f"component from the best fit of its ansatz, which is "
-        f"{number(base['model_error_px'])} px from the truth; v₁ is "
-        f"{number(base['v1_percent'])} % off the best fit's."
-    ]
+    names = {"measurement": "measurement_error_px", "model": "model_error_px", "v1": "v1_percent"}
+    values = {name: number(base[key]) for name, key in names.items()}
+    text = [sentence("systematic-base", **values)]
     far = spans[f"largest, {MOVED}"]
     for heading, part in (
         (f"These move the measurement by more than {_FAR:g} px", spans[far > _FAR]),
@@ -167,18 +152,14 @@ def _sentences(
     if len(lost_ones):
         named = ", ".join(f"{r['name']} = {number(r['level'])}" for _, r in lost_ones.iterrows())
         text.append(f"Not every correlation converged at {named}: left out above.")
-    text.append(
-        "Model error is most of the error here, and hides smaller ones: how far a factor moves the "
-        "measurement is given beside, rms per component at the junctions "
-        "between holes. All are in pixels of the base."
-    )
+    text.append(sentence("systematic-model-error"))
     return tuple(text)
 
 
 def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Figure:
     """Draw small curves, one for each factor, on a common scale."""
     rows = -(-len(bases) // _COLUMNS)
-    drawn = figure(9.6, 2.3 * rows)
+    drawn = style.figure(9.6, 2.3 * rows)
     grid = drawn.subplots(rows, _COLUMNS, squeeze=False, sharey=True).ravel()
     for axes in grid[len(bases) :]:
         axes.set_visible(False)
@@ -191,7 +172,7 @@ def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Fig
         _finish_axes(axes, part, at_base)
     for axes in grid[::_COLUMNS]:
         axes.set_ylabel("rms [px of the base]")
-    drawn.legend(*grid[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="upper left")
+    drawn.legend(*grid[0].get_legend_handles_labels(), ncols=3, loc="upper left")
     drawn.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.3 / drawn.get_figheight()))
     return drawn
 
@@ -202,7 +183,7 @@ def _finish_axes(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:
     is_geometric = levels.min() > 0 and levels.max() / levels.min() >= 4 and not factor.whole
     axes.set(xlabel=factor.label, yscale="log", xscale="log" if is_geometric else "linear")
     if at_base is not None:
-        axes.axvline(at_base, color=MUTED, linestyle=":", linewidth=1)
+        axes.axvline(at_base, color=style.MUTED, linestyle=":", linewidth=1)
     ticks = [factor.label_of(level) for level in levels]
     if name == "pixel_size":
         axes.set_xlabel("pixel [mm], below: pixels per ligament")

@@ -41,7 +41,7 @@ from modeharvest.util.files import make_folder, read_json, remove_orphans, sha25
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import Progress, silent
 
-_SOURCES = (".py", ".html", ".css")
+_SOURCES = (".py", ".html", ".css", ".toml")
 C = TypeVar("C")
 R = TypeVar("R")
 

@@ -13,23 +13,9 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.report.figures.fits import (
-    FINE,
-    UM,
-    FittedState,
-    Panel,
-    SpecimenView,
-    always,
-    ansatz_panels,
-    draw_length,
-    has_mode,
-    largest_density,
-    named,
-    spectrum_panels,
-)
+from modeharvest.report.figures import fits, style
 from modeharvest.report.figures.maps import ColourScale, draw_blend, draw_field, draw_image
 from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.report.figures.style import GLOW
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.truth import Comparison, lengths, pattern_field
 
@@ -38,18 +24,10 @@ from modeharvest.validation.truth import Comparison, lengths, pattern_field
 class ExperimentData:
     """What the figures of a virtual experiment are drawn from.
 
-    Parameters
-    ----------
-    solution, images
-        Of the run.
-    strains, results
-        Of each snapshot its nominal strain [-] and what was found, by ascending strain.
-    comparisons
-        Of each snapshot with the truth; may still be computed.
-    spectra
-        Of each its spectral densities and what is read off them; may still be computed.
-    pitch
-        Unit cell size l [mm].
+    ``solution``, ``images``: of the run. ``strains``, ``results``: of each snapshot its nominal
+    strain [-] and what was found, by ascending strain. ``comparisons``: of each snapshot with the
+    truth; may still be computed. ``spectra``: of each its spectral densities and what is read off
+    them; may still be computed. ``pitch``: unit cell size l [mm].
     """
 
     solution: Solution
@@ -64,7 +42,7 @@ class ExperimentData:
     def states(self) -> list[SnapshotState]:
         """All snapshots."""
         outline, images = MeshBoundary.of(self.solution.mesh), self.images
-        view = SpecimenView(outline, images.grid, images.mask(), self.pitch)
+        view = fits.SpecimenView(outline, images.grid, images.mask(), self.pitch)
         return [
             SnapshotState(f"{round(1e4 * strain):04d}", self._label(strain), view, result,
                           partial(self._densities, k), self, k)
@@ -83,14 +61,14 @@ class ExperimentData:
 
     @cached_property
     def _density_end(self) -> float:
-        return largest_density(self.spectra)
+        return fits.largest_density(self.spectra)
 
     def _densities(self, k: int) -> tuple[Spectrum, WavePattern, float]:
         return (*self.spectra[k], self._density_end)
 
 
 @dataclass(frozen=True, eq=False)
-class SnapshotState(FittedState):
+class SnapshotState(fits.FittedState):
     """A snapshot: number ``k`` of ``data``."""
 
     data: ExperimentData
@@ -115,19 +93,16 @@ def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
 
 def draw_hero(state: SnapshotState) -> Figure:
     """The deformed image turning into the pattern that was measured in it."""
-    images, strain, map_frame = (
-        state.data.images,
-        state.data.strains[state.k],
-        state.view.map_frame(),
-    )
-    if has_mode(0)(state):
-        length = UM * lengths(pattern_field(state.result, map_frame.grid))
+    images, strain = state.data.images, state.data.strains[state.k]
+    map_frame = state.view.map_frame()
+    if fits.has_mode(0)(state):
+        length = fits.UM * lengths(pattern_field(state.result, map_frame.grid))
     else:
-        length = map_frame.average(UM * lengths(state.comparison.w))
+        length = map_frame.average(fits.UM * lengths(state.comparison.w))
     end = ColourScale.size(state.view.on_material(length), "µm")
     return draw_blend(
         map_frame, images.deformed(strain), images.deformed_mask(strain), images.grid, length,
-        ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
+        ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
 
 
@@ -140,7 +115,7 @@ def _image(state: SnapshotState) -> Figure:
 
 
 def _residual(state: SnapshotState) -> Figure:
-    map_frame = state.view.map_frame(FINE)
+    map_frame = state.view.map_frame(fits.FINE)
     residual = map_frame.sample(state.comparison.residual)
     return draw_field(map_frame, residual, ColourScale.signed(residual, "", 0.99), state.motion)
 
@@ -150,45 +125,20 @@ def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
 
     def draw(state: SnapshotState) -> Figure:
         field: FloatArray = getattr(state.comparison, name)
-        return draw_length(state, state.view.map_frame().average(lengths(field)))
+        return fits.draw_length(state, state.view.map_frame().average(lengths(field)))
 
     return draw
 
 
-def snapshot_panels(modes: int) -> list[Panel[SnapshotState]]:
+def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
     """Every quantity that is drawn of a snapshot, for an ansatz of so many modes."""
     spectra, fields = ("spect_virt", "virt") if modes <= 1 else ("", "")  # the paper has one
     return [
-        Panel(
-            "images", "image", "", "Deformed image", named(spectra, "(a)"),
-            "The speckle as the camera would see it. Each pixel is evaluated exactly at its "
-            "reference point; nothing is interpolated from the reference image.",
-            _image,
-        ),
-        *spectrum_panels("images", spectra, "snapshots", always),
-        *ansatz_panels("found", fields, modes),
-        Panel(
-            "errors", "residual", "f − g∘φ", "Residual", named(fields, "(g) and (o)"),
-            "Grey levels as a fraction of full scale, in the deformed configuration; single "
-            "pixels, not averages. The colours end at the 99th percentile.",
-            _residual, exact=True, late=True,
-        ),
-        Panel(
-            "errors", "w", "‖w‖", "Microfluctuation field",
-            named(fields, "(h) and (p)"),
-            "Truth − IDIC, the whole error of the measured displacement, in the deformed "
-            "configuration. The colours end at the 99.8th percentile.",
-            _length_of("w"), late=True,
-        ),
-        Panel(
-            "errors", "best", "‖u − u<sub>best</sub>‖", "Model (ansatz) error", "",
-            "Truth − best fit of the same unknowns to the true displacement: the least error that "
-            "any measurement with this ansatz can have.",
-            _length_of("best_error"), late=True,
-        ),
-        Panel(
-            "errors", "loss", "‖u<sub>IDIC</sub> − u<sub>best</sub>‖", "Measurement error", "",
-            "IDIC − best fit: the error that the measurement adds, on its own, smaller scale.",
-            _length_of("idic_to_best"), late=True,
-        ),
-    ]  # fmt: skip
+        fits.Panel.of("images", "image", _image, figure=spectra),
+        *fits.spectrum_panels("images", spectra, "snapshots", fits.always),
+        *fits.ansatz_panels("found", fields, modes),
+        fits.Panel.of("errors", "residual", _residual, figure=fields, exact=True, late=True),
+        fits.Panel.of("errors", "w", _length_of("w"), figure=fields, late=True),
+        fits.Panel.of("errors", "best", _length_of("best_error"), late=True),
+        fits.Panel.of("errors", "loss", _length_of("idic_to_best"), late=True),
+    ]

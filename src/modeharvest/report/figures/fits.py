@@ -6,10 +6,10 @@ ansatz are listed here; the others where their kind of run is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from markupsafe import Markup
@@ -19,7 +19,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.report.figures.curves import draw_density, pattern_density
+from modeharvest.report.figures.curves import draw_convergence, draw_density, pattern_density
 from modeharvest.report.figures.maps import (
     ColourScale,
     DisplacementFunction,
@@ -28,7 +28,7 @@ from modeharvest.report.figures.maps import (
     draw_shape,
 )
 from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.report.model import Card, ReportFigure, Section
+from modeharvest.report.model import Card, ReportFigure, Section, caption
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 FINE, SMOOTH, COARSE = 740, 360, 160
@@ -42,27 +42,21 @@ UM = 1e3  # micrometres in a millimetre
 class SpecimenView:
     """The specimen that the maps of all states are drawn on.
 
-    Parameters
-    ----------
-    outline
-        Of the material in the reference.
-    grid, mask
-        The images' pixels, and (rows, cols) which of the reference's show material.
-    pitch
-        Unit cell size l [mm].
+    ``outline``: of the material in the reference. ``grid``, ``mask``: the images' pixels, and
+    (rows, cols) which of the reference's show material. ``pitch``: unit cell size l [mm].
     """
 
     outline: MeshBoundary
     grid: PixelGrid
     mask: BoolArray
     pitch: float
-    _sheets: dict[int, MapFrame] = field(default_factory=dict, repr=False)
+    _frames: dict[int, MapFrame] = field(default_factory=dict, repr=False)
 
     def map_frame(self, cells: int = SMOOTH) -> MapFrame:
         """The frame of maps with about that many cells along the longer side."""
-        if cells not in self._sheets:
-            self._sheets[cells] = MapFrame.of(self.outline, self.grid, cells)
-        return self._sheets[cells]
+        if cells not in self._frames:
+            self._frames[cells] = MapFrame.of(self.outline, self.grid, cells)
+        return self._frames[cells]
 
     def on_material(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:
         """Values on a map; NaN off the material, where the ansatz has no meaning."""
@@ -76,17 +70,9 @@ class SpecimenView:
 class FittedState:
     """A deformed state and what was fitted to its image.
 
-    Parameters
-    ----------
-    name, label
-        Ending of its pictures' anchors, and what is written above them.
-    view
-        The specimen.
-    result
-        Of its correlation.
-    densities
-        Gives the spectral densities of the displacement, what is read off them, and where their
-        colours end [mm⁶], the same for all states.
+    ``name``, ``label``: ending of its pictures' anchors, and what is written above them. ``view``:
+    the specimen. ``result``: of its correlation. ``densities``: gives the spectral densities of the
+    displacement, what is read off them, and where their colours end [mm⁶], the same for all states.
     """
 
     name: str
@@ -111,6 +97,12 @@ class FittedState:
         return DRAWN_SHAPE * self.view.pitch / largest if largest > 0 else 1.0
 
 
+def convergence_card(state: FittedState, caption: str = "") -> Card:
+    """The steps of a state's correlation."""
+    drawn = partial(draw_convergence, state.result)
+    return Card.single(f"convergence-{state.name}", state.label, drawn, caption)
+
+
 def largest_density(spectra: Iterable[tuple[Spectrum, WavePattern]]) -> float:
     """Of any state's pattern [mm⁶]; 0 without."""
     return max((pattern_density(*pair) for pair in spectra), default=0.0)
@@ -128,32 +120,41 @@ def always(state: FittedState) -> bool:
 class Panel(Generic[S]):
     """A quantity that is drawn for every state.
 
-    Parameters
-    ----------
-    section, key
-        Where on the page it is, and its anchor there.
-    symbol, title, paper, caption
-        HTML, words, the panel in the paper or "", and what is shown, HTML.
-    draw
-        Draws it of a state.
-    shows
-        Whether there is something to draw.
-    exact
-        Whether the picture's pixels are kept exactly.
-    late
-        Whether what it shows may still be computed while others are drawn.
+    ``section``, ``key``: where on the page it is, and its anchor there. ``draw``: draws it of a
+    state. ``shows``: whether there is something to draw. ``title``, ``symbol``, ``paper``,
+    ``caption``: its words, and the panel in the paper or "". ``exact``: whether the picture's
+    pixels are kept exactly. ``late``: whether what it shows may still be computed meanwhile.
     """
 
     section: str
     key: str
-    symbol: str
-    title: str
-    paper: str
-    caption: str
     draw: Callable[[S], Figure]
     shows: Callable[[S], bool] = always
+    title: str = ""
+    symbol: str = ""
+    paper: str = ""
+    caption: str = ""
     exact: bool = False
     late: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        section: str,
+        key: str,
+        draw: Callable[[S], Figure],
+        shows: Callable[[S], bool] = always,
+        text: str = "",
+        figure: str = "-",
+        *,
+        exact: bool = False,
+        late: bool = False,
+        **values: object,
+    ) -> Panel[S]:
+        """With the words named ``text``, or as the key; ``figure``: in the paper, "" for none."""
+        words = caption(text or key, figure=figure, **values)
+        words |= {} if figure else {"paper": Markup()}
+        return cls(section, key, draw, shows, exact=exact, late=late, **words)
 
     def card(self, states: Sequence[S], numbers: Callable[[str, S], str]) -> Card:
         """Its pictures of these states; ``numbers`` makes the lines below them."""
@@ -163,26 +164,28 @@ class Panel(Generic[S]):
             for state in states if self.shows(state)
         ]  # fmt: skip
         paper = f"paper: Fig. {self.paper}" if self.paper else ""
-        return Card(self.title, figures, caption=Markup(self.caption), name=self.key,
-                    symbol=Markup(self.symbol), paper=paper)  # fmt: skip
+        return Card(self.title, figures, caption=self.caption, name=self.key, symbol=self.symbol,
+                    paper=paper)  # fmt: skip
 
 
 def panel_sections(
+    names: Sequence[str],
     panels: Sequence[Panel[S]],
     states: Sequence[S],
-    heads: Mapping[str, tuple[str, str]],
     numbers: Callable[[str, S], str],
+    **values: object,
 ) -> list[Section]:
-    """Panels that have a picture, under the title and lead of their sections.
+    """Sections of these names with their panels that have a picture.
 
-    ``numbers`` makes the line below the picture of a panel's key and a state.
+    ``numbers`` makes the line below the picture of a panel's key and a state; ``values`` are filled
+    into the sections' words.
     """
-    cards: dict[str, list[Card]] = {name: [] for name in heads}
+    cards: dict[str, list[Card]] = {name: [] for name in names}
     for panel in panels:
         card = panel.card(states, numbers)
         if card.figures:
             cards[panel.section].append(card)
-    return [Section(name, title, cards[name], lead) for name, (title, lead) in heads.items()]
+    return [Section.of(name, cards[name], **values) for name in names]
 
 
 def draw_length(
@@ -226,54 +229,36 @@ def _fluctuation(state: FittedState, i: int, component: int) -> Figure:
     return draw_field(map_frame, values, scale, motion)
 
 
-def named(paper: str, letters: str) -> str:
-    """A panel's name in the paper; empty where it has none."""
-    return f"{paper} {letters}" if paper else ""
-
-
 def spectrum_panels(
-    section: str, paper: str, states: str, shows: Callable[[S], bool]
+    section: str, figure: str, states: str, shows: Callable[[S], bool]
 ) -> list[Panel[S]]:
     """Both spectral densities; ``states`` is what the states are called.
 
-    ``paper`` names the paper's figure; it is empty for patterns that aren't the paper's.
+    ``figure``: the paper's; empty for patterns that aren't the paper's.
     """
-    return [
-        Panel(
-            section, "Sxx", "S<sub>xx</sub>", "Spectral density along x", named(paper, "(b)"),
-            "Of the displacement without its affine part. The colours end at the pattern’s own "
-            f"density, the same for all {states}; what is beyond, on the axes, comes from the "
-            "specimen’s edges. Rings: the wave vectors found (faint: the largest peak where there "
-            "is no pattern).",
-            partial(_spectrum, component=0), shows, late=True,
-        ),
-        Panel(
-            section, "Syy", "S<sub>yy</sub>", "Spectral density along y", named(paper, "(c)"),
-            "A wave and its mirror image on either diagonal make four peaks at (±½, ±½): a pattern "
-            "that repeats after two cells." if paper else "",
-            partial(_spectrum, component=1), shows, late=True,
-        ),
-    ]  # fmt: skip
+    xx, yy = (
+        Panel.of(section, key, partial(_spectrum, component=component), shows, figure=figure,
+                 late=True, states=states)
+        for component, key in enumerate(("Sxx", "Syy"))
+    )  # fmt: skip
+    return [xx, yy if figure else replace(yy, caption="")]
 
 
-def ansatz_panels(section: str, paper: str, modes: int) -> list[Panel[FittedState]]:
+def ansatz_panels(section: str, figure: str, modes: int) -> list[Panel[FittedState]]:
     """v0, and of each mode amplitude, shape and fluctuation."""
-    slow: list[Panel[FittedState]] = [
-        Panel(
-            section, "v0x", "v<sub>0</sub> · e<sub>x</sub>", "Smooth field along x",
-            named(paper, "(a) and (i)"),
-            "The applied deformation, and a rigid motion between the images if there is one.",
-            partial(_v0, component=0),
-        ),
-        Panel(
-            section, "v0y", "v<sub>0</sub> · e<sub>y</sub>", "Smooth field along y",
-            named(paper, "(b) and (j)"),
-            "Lateral expansion before buckling. The pattern, once it is there, undoes it near the "
-            "specimen’s centre: the auxetic effect." if paper else "",
-            partial(_v0, component=1),
-        ),
-    ]  # fmt: skip
-    return slow + [panel for i in range(modes) for panel in _mode_panels(section, paper, i)]
+    x, y = (Panel.of(section, key, partial(_v0, component=component), figure=figure)
+            for component, key in enumerate(("v0x", "v0y")))  # fmt: skip
+    panels: list[Panel[FittedState]] = [x, y if figure else replace(y, caption="")]
+    for i in range(modes):
+        own: dict[str, Any] = {"shows": has_mode(i), "figure": figure if i == 0 else "", "n": i + 1}
+        panels += [
+            Panel.of(section, f"v{i + 1}", partial(_amplitude, i=i), text="v", **own),
+            Panel.of(section, f"phi{i + 1}", partial(_shape, i=i), text="phi",
+                     enlarged=DRAWN_SHAPE, **own),
+            *(Panel.of(section, f"fluc{i + 1}{axis}", partial(_fluctuation, i=i, component=c),
+                       text=f"fluc{axis}", **own) for c, axis in enumerate("xy")),
+        ]  # fmt: skip
+    return panels
 
 
 def shape_numbers(key: str, state: FittedState) -> str:
@@ -287,35 +272,3 @@ def shape_numbers(key: str, state: FittedState) -> str:
 def has_mode(i: int) -> Callable[[FittedState], bool]:
     """Whether a state has mode i (from 0)."""
     return lambda state: i < len(state.result.ansatz.modes)
-
-
-def _mode_panels(section: str, paper: str, i: int) -> list[Panel[FittedState]]:
-    """Of mode i (from 0)."""
-    n, shows = f"<sub>{i + 1}</sub>", has_mode(i)
-    names = [named(paper, letters) if i == 0 else "" for letters in
-             ("(c) and (k)", "(d) and (l)", "(e) and (m)", "(f) and (n)")]  # fmt: skip
-    fluctuations: list[Panel[FittedState]] = [
-        Panel(
-            section, f"fluc{i + 1}{axis}", f"v{n}φ{n} · e<sub>{axis}</sub>",
-            f"Correlated fluctuation along {axis}", names[2 + component],
-            "In the deformed configuration of this contribution alone.",
-            partial(_fluctuation, i=i, component=component), shows,
-        )
-        for component, axis in enumerate("xy")
-    ]  # fmt: skip
-    return [
-        Panel(
-            section, f"v{i + 1}", f"v{n}", "Amplitude of the mode", names[0],
-            f"Where the pattern is; blank where φ{n} is zero and v{n} has no meaning. The values "
-            f"are large because φ{n} is scaled to 0.04. Near the corners it also takes up part of "
-            "the edge effect.",
-            partial(_amplitude, i=i), shows,
-        ),
-        Panel(
-            section, f"phi{i + 1}", f"φ{n}", "The mode", names[1],
-            "The identified mode as a deformed configuration over the undeformed outline, enlarged "
-            f"to a largest displacement of {DRAWN_SHAPE} l.",
-            partial(_shape, i=i), shows,
-        ),
-        *fluctuations,
-    ]  # fmt: skip

@@ -8,27 +8,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.collections import Collection, LineCollection
+from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
+from matplotlib.image import BboxImage
+from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path
+from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.transforms import Bbox, TransformedBbox
+from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
+from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.report.figures.style import (
-    BLUE,
-    EDGE,
-    GREY,
-    INK,
-    MUTED,
-    SIGNED,
-    SIZE,
-    draw_path,
-    figure,
-    scale_bar,
-)
+from modeharvest.report.figures import style
+from modeharvest.report.figures.outlines import MeshBoundary, block_means
+from modeharvest.report.model import ten_to
 from modeharvest.util.arrays import BoolArray, FloatArray
 
 DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
@@ -39,16 +34,8 @@ DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
 class MapFrame:
     """What all maps of a specimen share, so that they can be laid over each other.
 
-    Parameters
-    ----------
-    outline
-        Of the specimen.
-    grid
-        The images' pixels joined to the cells that are drawn.
-    factor
-        Pixels joined, in each direction.
-    limits
-        (left, right, bottom, top) of every map [mm].
+    ``outline``: of the specimen. ``grid``: the images' pixels, ``factor`` of them joined in each
+    direction to the cells that are drawn. ``limits``: (left, right, bottom, top) of every map [mm].
     """
 
     outline: MeshBoundary
@@ -68,26 +55,23 @@ class MapFrame:
     def average(self, field: FloatArray) -> FloatArray:
         """Average a field (rows, cols) of the images over the cells, NaN left out."""
         known = np.isfinite(field)
-        count = self._sum(known.astype(np.float64))
-        total = self._sum(np.where(known, field, 0.0))
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-    def _sum(self, field: FloatArray) -> FloatArray:
-        """Sums over the cells' pixels; rows first, which is several times faster."""
-        (rows, cols), n = self.grid.shape, self.factor
-        whole = field[: rows * n].reshape(rows, n, -1).sum(axis=1)[:, : cols * n]
-        return np.asarray(whole.reshape(rows, cols, n).sum(axis=2))
+        share = block_means(known, self.factor)
+        mean = block_means(np.where(known, field, 0.0), self.factor)
+        return np.divide(mean, share, out=np.full_like(mean, np.nan), where=share > 0)
 
     def sample(self, field: FloatArray) -> FloatArray:
         """Take the middle pixel of each cell from a field (rows, cols) of the images."""
-        rows, cols = self.grid.shape
-        n, middle = self.factor, self.factor // 2
-        return field[middle : rows * n : n, middle : cols * n : n]
+        return field[np.ix_(*self.pixels)]
 
-    def moved_nodes(self, motion: DisplacementFunction | None) -> FloatArray | None:
+    @property
+    def pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns of the images' pixels that are the middles of the cells."""
+        n = self.factor
+        rows, cols = (n // 2 + n * np.arange(size) for size in self.grid.shape)
+        return rows, cols
+
+    def moved_nodes(self, motion: DisplacementFunction) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes [mm]."""
-        if motion is None:
-            return None
         x, y = self.outline.nodes.T
         return motion(x[:, None], y[:, None])[:, 0]
 
@@ -104,25 +88,21 @@ class MapFrame:
         return X + u[..., 0], Y + u[..., 1]
 
 
+_FINER = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # four straight triangles in a T6
+_STEPS = (1, 2, 2.5, 5, 10)
 WIDTH = 2.35  # of a map with its colour bar [in]
-_MAP, _BAR_LEFT, _BAR = 0.76, 0.79, 0.03  # shares of the width
+_MAP = 0.76  # the map's share of the width
 _BELOW, _ABOVE = 0.24, 0.22  # for the scale bar and the unit [in]
+_GAP, _BAR, _POINTED = 0.05, 0.072, 0.05  # before a colour bar, its width, its pointed ends [in]
 
 
 @dataclass(frozen=True)
 class ColourScale:
     """Colours for values.
 
-    Parameters
-    ----------
-    colours
-        The colour map.
-    low, high
-        Its ends, in ``unit``.
-    unit
-        As written above the colour bar; "" for a number without one.
-    extend
-        Whether values lie beyond the ends: "neither", "min", "max" or "both".
+    ``low``, ``high``: ends of the colour map, in ``unit``, which is written above the colour bar;
+    "" for a number without one. ``extend``: whether values lie beyond the ends: "neither", "min",
+    "max" or "both". ``is_log``: for values of many orders of magnitude.
     """
 
     colours: Colormap
@@ -130,23 +110,52 @@ class ColourScale:
     high: float
     unit: str = ""
     extend: str = "neither"
+    is_log: bool = False
 
     @classmethod
     def signed(cls, values: FloatArray, unit: str, share: float = 1.0) -> ColourScale:
         """Diverge from zero, with equal ends that keep this ``share`` of the values inside."""
         end = _quantile(np.abs(values), share)
-        return cls(SIGNED, -end, end, unit, "neither" if share == 1.0 else "both")
+        return cls(style.SIGNED, -end, end, unit, "neither" if share == 1.0 else "both")
 
     @classmethod
     def size(cls, values: FloatArray, unit: str, share: float = 1.0) -> ColourScale:
         """Rise from zero, with an end that keeps this ``share`` of the values inside."""
         end = _quantile(values, share)
-        return cls(SIZE, 0.0, end, unit, "neither" if share == 1.0 else "max")
+        return cls(style.SIZE, 0.0, end, unit, "neither" if share == 1.0 else "max")
 
     @property
     def normalise(self) -> Normalize:
         """Values to 0 ... 1."""
-        return Normalize(self.low, self.high)
+        return (LogNorm if self.is_log else Normalize)(self.low, self.high)
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """(..., 4) colours of values; transparent where they are NaN."""
+        shares: Any = self.normalise(values)
+        return np.array(self.colours(np.where(np.isnan(values), np.nan, shares)))
+
+    @property
+    def ticks(self) -> FloatArray:
+        """Round values from end to end."""
+        subs = (1.0,) if self.high > 100 * self.low else (1.0, 2.0, 5.0)
+        locator = LogLocator(10.0, subs) if self.is_log else MaxNLocator(7, steps=_STEPS)
+        values = np.asarray(locator.tick_values(self.low, self.high))
+        slack = 1e-9 * (self.high - self.low)
+        return values[(values >= self.low - slack) & (values <= self.high + slack)]
+
+    @property
+    def power(self) -> int:
+        """Of ten, which stands beside the unit of very small and very large values."""
+        power = int(np.floor(np.log10(max(abs(self.low), abs(self.high)))))
+        return 0 if self.is_log or -3 <= power < 5 else power
+
+    @property
+    def labels(self) -> list[str]:
+        """The ticks as they are written, all with as many decimals unless logarithmic."""
+        plain = [f"{tick:.6g}" for tick in self.ticks / 10.0**self.power + 0.0]
+        decimals = max((len(text.partition(".")[2]) for text in plain), default=0)
+        texts = plain if self.is_log else [f"{float(text):.{decimals}f}" for text in plain]
+        return [text.replace("-", "−") for text in texts]
 
 
 def draw_field(
@@ -157,69 +166,51 @@ def draw_field(
 ) -> Figure:
     """Draw a field of the reference configuration, where it is or where ``motion`` takes it.
 
-    Parameters
-    ----------
-    map_frame
-        Frame and outline.
-    values
-        (rows, cols) on ``map_frame.grid``; NaN is left blank.
-    scale
-        Colours and unit.
-    motion
-        The displacement to draw it with; None for the reference configuration.
+    ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank.
     """
     drawn, axes = _empty_map(map_frame)
-    edge = _draw_edge(axes, map_frame.outline.path(map_frame.moved_nodes(motion)))
-    X, Y = map_frame.moved_corners(motion)
-    quads = axes.pcolormesh(X, Y, values, cmap=scale.colours,
-                            norm=scale.normalise, rasterized=True)  # fmt: skip
-    quads.set_clip_path(edge)
-    colour_bar(drawn, axes, scale)
+    _draw_cells(axes, map_frame, scale.of(values), motion)
+    colour_bar(axes, scale)
     return drawn
 
 
 def draw_image(
     map_frame: MapFrame,
     image: NDArray[np.float32],
-    material: BoolArray,
+    material: BoolArray | None,
     grid: PixelGrid,
     displacement: FloatArray,
+    scale: ColourScale | None = None,
 ) -> Figure:
     """Draw an image, its background left to the page.
 
-    Parameters
-    ----------
-    map_frame
-        Frame and outline.
-    image, material
-        (rows, cols) grey levels [fraction of full scale] and where they show material.
-    grid
-        Their pixels.
-    displacement
-        (n, 2) true displacement at the mesh's nodes [mm], for the outline.
+    ``image``, ``material``: (rows, cols) grey levels [0 black, 1 white] and where they show
+    material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) true
+    displacement at the mesh's nodes [mm], for the outline. ``scale``: what the levels mean;
+    fractions of full scale by default.
     """
     drawn, axes = _empty_map(map_frame)
     _show_grey(axes, map_frame, image, material, grid)
     _draw_edge(axes, map_frame.outline.path(displacement))
-    colour_bar(drawn, axes, ColourScale(GREY, 0.0, 1.0))
+    colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0))
     return drawn
 
 
 def draw_shape(map_frame: MapFrame, motion: DisplacementFunction) -> Figure:
     """Draw the specimen's outline deformed over the undeformed one; no colour bar."""
     drawn, axes = _empty_map(map_frame)
-    draw_path(axes, map_frame.outline.path(), fill=False, ec=MUTED, lw=0.45, alpha=0.7,
-              clip_on=False)  # fmt: skip
+    style.draw_path(axes, map_frame.outline.path(), fill=False, ec=style.MUTED, lw=0.45, alpha=0.7,
+                    clip_on=False)  # fmt: skip
     deformed = map_frame.outline.path(map_frame.moved_nodes(motion))
-    draw_path(axes, deformed, fc=BLUE, ec="none", alpha=0.28, clip_on=False)
-    draw_path(axes, deformed, fill=False, ec=BLUE, lw=0.9, clip_on=False)
+    style.draw_path(axes, deformed, fc=style.BLUE, ec="none", alpha=0.28, clip_on=False)
+    style.draw_path(axes, deformed, fill=False, ec=style.BLUE, lw=0.9, clip_on=False)
     return drawn
 
 
 def draw_blend(
     map_frame: MapFrame,
     image: NDArray[np.float32],
-    material: BoolArray,
+    material: BoolArray | None,
     grid: PixelGrid,
     values: FloatArray,
     scale: ColourScale,
@@ -227,73 +218,110 @@ def draw_blend(
 ) -> Figure:
     """Let the deformed image dissolve, from left to right, into what was measured in it.
 
-    Parameters
-    ----------
-    map_frame
-        Frame and outline.
-    image, material
-        (rows, cols) grey levels [fraction of full scale] and where they show material.
-    grid
-        Their pixels.
-    values
-        (rows, cols) on ``map_frame.grid``, what was measured; NaN is left blank.
-    scale
-        Colours and unit.
-    motion
-        The displacement to draw it with.
+    ``image``, ``material``, ``grid``: as for :func:`draw_image`. ``values``: (rows, cols) on
+    ``map_frame.grid``, what was measured, drawn with the displacement ``motion``.
     """
     drawn, axes = _empty_map(map_frame, width=3.2)
     # Gone where the field is opaque, or slivers of it would show along the holes.
     _show_grey(axes, map_frame, image, material, grid, dissolve=True)
-    edge = _draw_edge(axes, map_frame.outline.path(map_frame.moved_nodes(motion)))
-    X, Y = map_frame.moved_corners(motion)
-    colours = scale.colours(scale.normalise(values))
+    colours = scale.of(values)
     colours[..., 3] *= _ramp(values.shape)
-    quads = axes.pcolormesh(X, Y, colours, rasterized=True)
-    quads.set_clip_path(edge)
-    colour_bar(drawn, axes, scale)
+    _draw_cells(axes, map_frame, colours, motion)
+    colour_bar(axes, scale)
     return drawn
+
+
+def _draw_cells(
+    axes: Axes, map_frame: MapFrame, colours: FloatArray, motion: DisplacementFunction | None
+) -> None:
+    """Cells (rows, cols, 4) in their colours, cut out along the boundary, and the boundary."""
+    moved = None if motion is None else map_frame.moved_nodes(motion)
+    edge = _draw_edge(axes, map_frame.outline.path(moved))
+    if motion is None:
+        picture = axes.imshow(colours, extent=map_frame.grid.extent, rasterized=True,
+                              interpolation="nearest", aspect="auto")  # fmt: skip
+        axes.set(xlim=map_frame.limits[:2], ylim=map_frame.limits[2:])
+        picture.set_clip_path(edge)
+    else:
+        X, Y = map_frame.moved_corners(motion)
+        axes.pcolormesh(X, Y, colours, rasterized=True).set_clip_path(edge)
+
+
+def shaded(
+    axes: Axes, mesh: Mesh, moved: FloatArray, values: FloatArray, scale: ColourScale
+) -> Collection:
+    """Shade T6 elements by values (n,) at their nodes, which are ``moved`` (n, 2) [mm]."""
+    x, y = (mesh.nodes + moved).T
+    triangles = Triangulation(x, y, mesh.cells[:, np.array(_FINER)].reshape(-1, 3))
+    return axes.tripcolor(triangles, values, shading="gouraud", rasterized=True,
+                          cmap=scale.colours, norm=scale.normalise)  # fmt: skip
 
 
 def _empty_map(map_frame: MapFrame, width: float = WIDTH) -> tuple[Figure, Axes]:
     """An empty map with a scale bar."""
     left, right, bottom, top = map_frame.limits
-    tall = _MAP * width * (top - bottom) / (right - left)
-    height = tall + _BELOW + _ABOVE
-    drawn = figure(width, height)
-    axes = drawn.add_axes((0.01, _BELOW / height, _MAP, tall / height))
-    axes.set_axis_off()
+    size = np.array([right - left, top - bottom])
+    drawn, axes = bare_axes(width, size, _MAP, _BELOW, _ABOVE)
     axes.set(xlim=(left, right), ylim=(bottom, top))
-    length = _round_down(0.35 * (right - left))
-    scale_bar(axes, length, f"{length:g} mm")
+    length = _round_down(0.35 * size[0])
+    style.scale_bar(axes, length, f"{length:g} mm")
+    return drawn, axes
+
+
+def bare_axes(
+    width: float, size: FloatArray, share: float, below: float, above: float, left: float = 0.01
+) -> tuple[Figure, Axes]:
+    """Axes without any frame for something of a ``size`` (2,), over a share of a figure's width.
+
+    ``below``, ``above``: room for what is written there [in]. ``left``: share of the width.
+    """
+    tall = share * width * size[1] / size[0]
+    height = tall + below + above
+    drawn = style.figure(width, height)
+    axes = drawn.add_axes((left, below / height, share, tall / height))
+    axes.set_axis_off()
     return drawn, axes
 
 
 def _draw_edge(axes: Axes, path: Path) -> PathPatch:
-    return draw_path(axes, path, fill=False, ec=EDGE, lw=0.5, rasterized=True, clip_on=False,
-                     zorder=1.5)  # fmt: skip
+    return style.draw_path(axes, path, fill=False, ec=style.EDGE, lw=0.5, rasterized=True,
+                           clip_on=False, zorder=1.5)  # fmt: skip
 
 
-def colour_bar(drawn: Figure, axes: Axes, scale: ColourScale) -> None:
-    """A bar beside the map, its unit above it.
+def colour_bar(axes: Axes, scale: ColourScale) -> None:
+    """A bar to the right of the axes, its unit above it.
 
-    Parameters
-    ----------
-    drawn, axes
-        The figure, and the map in it.
-    scale
-        Colours and unit.
+    Made of a few artists: axes of its own, as matplotlib's have, take longer than the map.
     """
-    box = axes.get_position()
-    place = drawn.add_axes((_BAR_LEFT, box.y0, _BAR, box.height), label="colour bar")
-    mappable = ScalarMappable(scale.normalise, scale.colours)
-    bar = drawn.colorbar(mappable, cax=place, extend=scale.extend, extendfrac=0.02)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(length=2, pad=2, labelsize=7.5, color=MUTED)
-    bar.ax.set_title(scale.unit, fontsize=8, pad=6, loc="left", color=INK)
-    if bar.solids is not None:
-        bar.solids.set_rasterized(True)
-    bar.ax.set_label("colour bar")
+    drawn, box = axes.get_figure(root=True), axes.get_position()
+    assert drawn is not None
+    width, height = drawn.get_size_inches()
+    point = _POINTED / height
+    left, right = box.x1 + _GAP / width, box.x1 + (_GAP + _BAR) / width
+    extended = [scale.extend in (end, "both") for end in ("min", "max")]
+    bottom, top = box.y0 + extended[0] * point, box.y1 - extended[1] * point
+    place: dict[str, Any] = {"transform": drawn.transFigure, "clip_on": False}
+    bbox = TransformedBbox(Bbox([(left, bottom), (right, top)]), drawn.transFigure)
+    ramp = BboxImage(bbox, cmap=scale.colours, origin="lower", rasterized=True, zorder=1.4,
+                     clip_on=False)  # fmt: skip
+    ramp.set_data(np.linspace(0.0, 1.0, 256)[:, None])
+    axes.add_artist(ramp)
+    for value, flat, end, has in (
+        (0.0, bottom, box.y0, extended[0]),
+        (1.0, top, box.y1, extended[1]),
+    ):
+        if has:
+            corners = [(left, flat), (right, flat), (0.5 * (left + right), end)]
+            axes.add_artist(Polygon(corners, fc=scale.colours(value), ec="none", **place))
+    heights = bottom + (top - bottom) * np.asarray(scale.normalise(scale.ticks))
+    tick, space = 0.028 / width, 0.06 / width
+    axes.add_artist(LineCollection([[(right, y), (right + tick, y)] for y in heights], lw=0.8,
+                                   colors=style.MUTED, **place))  # fmt: skip
+    for y, label in zip(heights, scale.labels, strict=True):
+        axes.text(right + space, y, label, fontsize=7.5, va="center_baseline", **place)
+    power = f"{ten_to(scale.power)} " if scale.power else ""
+    axes.text(left, box.y1 + 0.085 / height, f"{power}{scale.unit}".strip(), fontsize=8,
+              label="colour bar", **place)  # fmt: skip
 
 
 def _ramp(shape: tuple[int, ...]) -> FloatArray:
@@ -307,25 +335,22 @@ def _show_grey(
     axes: Axes,
     map_frame: MapFrame,
     image: NDArray[np.float32],
-    material: BoolArray,
+    material: BoolArray | None,
     grid: PixelGrid,
     dissolve: bool = False,
 ) -> None:
     """Show an image averaged over blocks of pixels, its background transparent."""
     joined = max(1, map_frame.factor // 2)
-    coarse = grid.binned(joined)
-    rows, cols = coarse.shape
-
-    def blocks(a: NDArray[Any]) -> FloatArray:
-        part = a[: rows * joined, : cols * joined].reshape(rows, joined, cols, joined)
-        return np.asarray(part.mean(axis=(1, 3), dtype=np.float64))
-
-    cover = blocks(material)
-    level = blocks(np.where(material, image, 0.0)) / np.maximum(cover, 1e-9)
+    if material is None:
+        level = block_means(image, joined)
+        cover = np.ones_like(level)
+    else:
+        cover = block_means(material, joined)
+        level = block_means(np.where(material, image, 0.0), joined) / np.maximum(cover, 1e-9)
     rgba = np.repeat(np.clip(level, 0.0, 1.0)[..., None], 4, axis=2)
-    rgba[..., 3] = cover * np.minimum(1.0, 4.0 * (1.0 - _ramp(coarse.shape))) if dissolve else cover
-    axes.imshow(np.nan_to_num(rgba), extent=coarse.extent, interpolation="antialiased",
-                rasterized=True, aspect="auto")  # fmt: skip
+    rgba[..., 3] = cover * np.minimum(1.0, 4.0 * (1.0 - _ramp(cover.shape))) if dissolve else cover
+    axes.imshow(np.nan_to_num(rgba), extent=grid.binned(joined).extent, aspect="auto",
+                interpolation="antialiased", rasterized=True)  # fmt: skip
     axes.set(xlim=map_frame.limits[:2], ylim=map_frame.limits[2:])
 
 

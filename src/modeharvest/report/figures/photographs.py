@@ -27,39 +27,12 @@ from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
+from modeharvest.report.figures import fits, maps, style
 from modeharvest.report.figures.curves import draw_density
-from modeharvest.report.figures.fits import (
-    COARSE,
-    FINE,
-    SMOOTH,
-    UM,
-    FittedState,
-    SpecimenView,
-    draw_length,
-    largest_density,
-)
-from modeharvest.report.figures.maps import (
-    WIDTH,
-    ColourScale,
-    MapFrame,
-    colour_bar,
-    draw_blend,
-    draw_field,
-    draw_image,
-)
-from modeharvest.report.figures.outlines import MeshBoundary, mask_boundary
-from modeharvest.report.figures.style import (
-    BLUE,
-    GLOW,
-    GOLD,
-    GREEN,
-    GREY,
-    INK,
-    RED,
-    SIZE,
-    draw_path,
-    figure,
-)
+from modeharvest.report.figures.fits import UM
+from modeharvest.report.figures.maps import ColourScale
+from modeharvest.report.figures.outlines import MeshBoundary, block_means, mask_boundary
+from modeharvest.report.figures.style import BLUE, GOLD, GREEN, GREY, INK, RED
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
 
@@ -110,15 +83,11 @@ def grey_levels(image: NDArray[Any], levels: tuple[float, float]) -> NDArray[np.
 
 
 @dataclass(frozen=True, eq=False)
-class PhotographState(FittedState):
+class PhotographState(fits.FittedState):
     """A deformed photograph.
 
-    Parameters
-    ----------
-    harvest, frame
-        The test, and what was found in this photograph.
-    levels
-        Grey levels that are drawn black and white.
+    ``harvest``, ``frame``: the test, and what was found in this photograph. ``levels``: grey levels
+    that are drawn black and white.
     """
 
     harvest: Harvest
@@ -129,10 +98,10 @@ class PhotographState(FittedState):
 def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[PhotographState]:
     """The photographs that are shown, with their labels by name."""
     shown = shown_frames(harvest)
-    view = SpecimenView(material_outline(harvest), harvest.grid, harvest.mask, harvest.pitch)
+    view = fits.SpecimenView(material_outline(harvest), harvest.grid, harvest.mask, harvest.pitch)
     levels = drawn_levels(harvest)
     pairs = [(frame.spectrum, frame.pattern or _NO_PATTERN) for frame in shown]
-    end = largest_density((spectrum, pattern) for spectrum, pattern in pairs if spectrum)
+    end = fits.largest_density((spectrum, pattern) for spectrum, pattern in pairs if spectrum)
 
     def densities(k: int) -> tuple[Spectrum, WavePattern, float]:
         spectrum, pattern = pairs[k]
@@ -154,10 +123,9 @@ def draw_hero(state: PhotographState) -> Figure:
         pattern = pattern - result.v0(map_frame.grid)
     length = UM * np.linalg.norm(pattern, axis=-1)
     end = ColourScale.size(state.view.on_material(length), "µm")
-    everywhere = np.ones(state.frame.image.shape, dtype=np.bool_)
-    drawn = draw_blend(
-        map_frame, grey_levels(state.frame.image, state.levels), everywhere, state.view.grid,
-        length, ColourScale(GLOW, 0.0, end.high, "µm"), state.motion,
+    drawn = maps.draw_blend(
+        map_frame, grey_levels(state.frame.image, state.levels), None, state.view.grid, length,
+        ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
     # The photograph ends where the measured outline does: a mask of it may have ragged edges.
     axes = drawn.axes[0]
@@ -169,16 +137,11 @@ def draw_deformed(state: PhotographState) -> Figure:
     """Draw a deformed photograph, and over it the reference's outline moved as measured."""
     map_frame = state.view.map_frame()
     moved = map_frame.moved_nodes(state.motion)
-    assert moved is not None
-    image, everywhere = state.frame.image, np.ones(state.frame.image.shape, dtype=np.bool_)
-    drawn = draw_image(
-        map_frame, grey_levels(image, state.levels), everywhere, state.view.grid, moved
-    )
-    axes, bar = drawn.axes
-    draw_path(axes, map_frame.outline.path(moved), fill=False, ec=GOLD, lw=0.7, rasterized=True,
-              zorder=2)  # fmt: skip
-    bar.set_yticks([0.0, 1.0], [f"{level:.0f}" for level in state.levels])
-    bar.set_title("levels", fontsize=8, pad=6, loc="left")
+    image = grey_levels(state.frame.image, state.levels)
+    scale = ColourScale(GREY, *state.levels, "levels")
+    drawn = maps.draw_image(map_frame, image, None, state.view.grid, moved, scale)
+    style.draw_path(drawn.axes[0], map_frame.outline.path(moved), fill=False, ec=GOLD, lw=0.7,
+                    rasterized=True, zorder=2)  # fmt: skip
     return drawn
 
 
@@ -194,53 +157,45 @@ def draw_closeup(state: PhotographState) -> Figure:
     )
     part = grey_levels(state.frame.image[top : bottom + 1, left : right + 1], state.levels)
     x0, y0 = map(float, grid.to_mm(top, left))
-    extent = PixelGrid(bottom + 1 - top, right + 1 - left, grid.pixel_size, x0, y0).extent
-    drawn = figure(WIDTH, WIDTH)
+    drawn = style.figure(maps.WIDTH, maps.WIDTH)
     axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
-    axes.imshow(part, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, rasterized=True,
-                interpolation="antialiased", aspect="auto")  # fmt: skip
+    _show(axes, part, PixelGrid(len(part), part.shape[1], grid.pixel_size, x0, y0).extent)
     path = state.view.outline.path(state.view.map_frame().moved_nodes(state.motion))
-    draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
+    style.draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return drawn
+
+
+def _show(axes: Axes, grey: NDArray[Any], extent: tuple[float, float, float, float]) -> None:
+    """Show grey levels from 0 (black) to 1 (white)."""
+    axes.imshow(grey, extent=extent, cmap=GREY, vmin=0.0, vmax=1.0, interpolation="antialiased",
+                rasterized=True, aspect="auto")  # fmt: skip
 
 
 def draw_part_spectrum(state: PhotographState, part: int, component: int) -> Figure:
     """S_xx or S_yy of a part with modes of its own; the colours are that part's."""
     parts = [frame.parts[part] for frame in shown_frames(state.harvest)]
-    end = largest_density([(p.spectrum, p.pattern) for p in parts])
+    end = fits.largest_density([(p.spectrum, p.pattern) for p in parts])
     own = state.frame.parts[part]
     return draw_density(own.spectrum, own.pattern, component, end)
 
 
 def draw_residual(state: PhotographState) -> Figure:
-    """Draw f - g(x + u) in the deformed configuration, single pixels."""
-    full, map_frame = state.harvest.full_scale, state.view.map_frame(FINE)
-    values = np.asarray(_residual(state, map_frame) / (full or 1.0), dtype=np.float64)
-    scale = ColourScale.signed(values, "" if full else "levels", 0.99)
-    return draw_field(map_frame, values, scale, state.motion)
-
-
-def _residual(state: PhotographState, map_frame: MapFrame) -> FloatArray:
-    """The residual at a pixel of each fine cell [grey levels]; NaN where not compared."""
-    harvest, ansatz, a = state.harvest, state.result.ansatz, state.result.unknowns
-    rows, cols = _pixels(map_frame)
+    """Draw f - g(x + u) in the deformed configuration, single pixels; blank where not compared."""
+    map_frame, harvest = state.view.map_frame(fits.FINE), state.harvest
+    full, ansatz, a = harvest.full_scale, state.result.ansatz, state.result.unknowns
+    rows, cols = map_frame.pixels
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     u = ansatz.displacement(a, x, y) / harvest.grid.pixel_size
     spline = SplineImage.of(np.asarray(state.frame.image), state.result.order)
     value, _, _ = spline.sample(rows[:, None] - u[..., 1], cols[None, :] + u[..., 0])
     gain, offset = ansatz.gain_and_offset(a, x, y)
     picked = np.ix_(rows, cols)
-    residual = harvest.reference[picked] - gain * value - offset
-    return np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
-
-
-def _pixels(map_frame: MapFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the images' pixels that the middles of a map's cells show."""
-    n = map_frame.factor
-    rows, cols = (n // 2 + n * np.arange(size) for size in map_frame.grid.shape)
-    return rows, cols
+    residual = (harvest.reference[picked] - gain * value - offset) / (full or 1.0)
+    values = np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
+    scale = ColourScale.signed(values, "" if full else "levels", 0.99)
+    return maps.draw_field(map_frame, values, scale, state.motion)
 
 
 def draw_w(state: PhotographState) -> Figure:
@@ -248,13 +203,13 @@ def draw_w(state: PhotographState) -> Figure:
     local, result, grid = state.frame.local, state.result, state.view.grid
     assert local is not None
     w = local.less(lambda points: result.ansatz.displacement_at(result.unknowns, points))
-    cells = min(SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
+    cells = min(fits.SMOOTH, max(40, int(max(grid.shape) * grid.pixel_size / w.spacing)))
     map_frame = state.view.map_frame(cells)
     points = np.stack(np.meshgrid(map_frame.grid.x, map_frame.grid.y), axis=-1)
     near, nearest = cKDTree(np.column_stack([w.x, w.y])[w.good]).query(points)
     reach = _REACH * max(w.spacing, map_frame.grid.pixel_size)
     length = np.linalg.norm(w.u[w.good], axis=1)[nearest]
-    return draw_length(state, np.where(near <= reach, length, np.nan), cells)
+    return fits.draw_length(state, np.where(near <= reach, length, np.nan), cells)
 
 
 def draw_error(state: PhotographState, field: str, cause: Cause) -> Figure:
@@ -262,15 +217,15 @@ def draw_error(state: PhotographState, field: str, cause: Cause) -> Figure:
 
     That of a vector is the root of the sum of both components' variances.
     """
-    map_frame, frame = state.view.map_frame(COARSE), state.frame
+    map_frame, frame = state.view.map_frame(fits.COARSE), state.frame
     errors = frame.by_noise if cause == "noise" else frame.by_model_error
     assert errors is not None
     sd = UM * _resampled(frame, _sd(errors, field), map_frame)
     if field != "v0":
         i = int(field.removeprefix("fluc").removeprefix("v")) - 1
-        sd = np.where(state.support(i, COARSE) > 0.0, sd, np.nan)
-    scale = ColourScale.size(state.view.on_material(sd, COARSE), "µm", 0.99)
-    return draw_field(map_frame, sd, scale)
+        sd = np.where(state.support(i, fits.COARSE) > 0.0, sd, np.nan)
+    scale = ColourScale.size(state.view.on_material(sd, fits.COARSE), "µm", 0.99)
+    return maps.draw_field(map_frame, sd, scale)
 
 
 def _sd(errors: FieldErrors, field: str) -> FloatArray:
@@ -282,7 +237,7 @@ def _sd(errors: FieldErrors, field: str) -> FloatArray:
     return np.asarray(errors.v[int(field[1:]) - 1])
 
 
-def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: MapFrame) -> FloatArray:
+def _resampled(frame: HarvestedFrame, sd: FloatArray, map_frame: maps.MapFrame) -> FloatArray:
     """Error bars on the cells of a map, linear between the axes' values; NaN if infinite."""
     along_y, along_x = np.argsort(frame.error_y), np.argsort(frame.error_x)
     between = RegularGridInterpolator(
@@ -302,7 +257,7 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
     harvest, map_frame = state.harvest, state.view.map_frame()
     assert harvest.truth is not None
     known = harvest.truth.frames[state.frame.name]
-    rows, cols = _pixels(map_frame)
+    rows, cols = map_frame.pixels
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     fields: dict[str, Callable[[], FloatArray]] = {
         "truth": lambda: np.asarray(known.displacement[np.ix_(rows, cols)], dtype=np.float64),
@@ -312,7 +267,7 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
     first, second = {"true_w": ("truth", "idic"), "best": ("truth", "best"),
                      "loss": ("best", "idic")}[part]  # fmt: skip
     length = np.linalg.norm(fields[first]() - fields[second](), axis=-1)
-    return draw_length(state, np.where(harvest.mask[np.ix_(rows, cols)], length, np.nan))
+    return fits.draw_length(state, np.where(harvest.mask[np.ix_(rows, cols)], length, np.nan))
 
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
@@ -324,64 +279,43 @@ _LENGTH = 0.9  # of the longest arrow, distances between arrows
 
 def draw_reference(harvest: Harvest, outline: MeshBoundary, levels: tuple[float, float]) -> Figure:
     """Draw the reference and all that was found in it, for a look whether that is right."""
-    drawn, axes = _picture(harvest.grid, WIDE, _LEGEND)
+    size = np.array([harvest.grid.cols, harvest.grid.rows])
+    drawn, axes = maps.bare_axes(WIDE, size, 0.996, 0.02, _LEGEND, 0.002)
     factor = max(1, round(max(harvest.grid.shape) / _PIXELS))
-    cells = harvest.grid.binned(factor)
-    rows, cols = cells.shape
-    part = grey_levels(harvest.reference, levels)[: rows * factor, : cols * factor]
-    joined = part.reshape(rows, factor, cols, factor).mean(axis=(1, 3))
-    axes.imshow(joined, extent=cells.extent, cmap=GREY, vmin=0.0, vmax=1.0,
-                interpolation="antialiased", rasterized=True, aspect="auto")  # fmt: skip
+    joined = block_means(grey_levels(harvest.reference, levels), factor)
+    _show(axes, joined, harvest.grid.binned(factor).extent)
     axes.set(xlim=harvest.grid.extent[:2], ylim=harvest.grid.extent[2:])
-    draw_path(axes, outline.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
+    style.draw_path(axes, outline.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
     shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
     if harvest.lattice is not None:
         shown += _draw_lattice(axes, harvest.lattice, harvest.grid)
     shown.append(_draw_box(axes, harvest.cellular))
     axes.legend(handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown),
-                frameon=False, fontsize=7.5, handlelength=1.6, columnspacing=1.4,
-                borderaxespad=0.1)  # fmt: skip
+                handlelength=1.6, columnspacing=1.4, borderaxespad=0.1)  # fmt: skip
     return drawn
 
 
 def draw_distortion(distortion: Distortion, grid: PixelGrid) -> Figure:
-    """Draw the length of S in colour and S itself as arrows, enlarged.
-
-    Parameters
-    ----------
-    distortion
-        Of the optics.
-    grid
-        The images' pixels.
-    """
-    rows, cols = _positions(grid, _CELLS)
-    down, right = distortion.shift(rows, cols)
-    drawn, axes, scale = _coloured(grid, np.hypot(down, right))
+    """Draw the length of S in colour and S itself as arrows, enlarged; ``grid``: the images'."""
+    drawn = _coloured(grid, np.hypot(*distortion.shift(*_positions(grid, _CELLS))))
     rows, cols = _positions(grid, _ARROWS)
-    down, right = np.broadcast_arrays(*distortion.shift(rows, cols))
-    row, col = np.broadcast_arrays(rows, cols)
+    down, right, row, col = np.broadcast_arrays(*distortion.shift(rows, cols), rows, cols)
     longest = float(np.hypot(down, right).max())
     step = max(grid.shape) / _ARROWS
     enlarged = _LENGTH * step / longest if longest > 0 else 1.0
-    axes.quiver(col, row, enlarged * right, enlarged * down, angles="xy", scale_units="xy",
-                scale=1.0, width=0.0035, color="white", pivot="mid")  # fmt: skip
-    colour_bar(drawn, axes, scale)
+    drawn.axes[0].quiver(col, row, enlarged * right, enlarged * down, angles="xy", color="white",
+                         scale_units="xy", scale=1.0, width=0.0035, pivot="mid")  # fmt: skip
     return drawn
 
 
 def draw_distortion_sd(calibration: Calibration, grid: PixelGrid) -> Figure:
     """Draw the standard deviation of S by the photographs' noise, both components together."""
-    sd = np.hypot(*calibration.sd(*_positions(grid, _CELLS)))
-    drawn, axes, scale = _coloured(grid, sd)
-    colour_bar(drawn, axes, scale)
-    return drawn
+    return _coloured(grid, np.hypot(*calibration.sd(*_positions(grid, _CELLS))))
 
 
 def draw_distortion_error(found: Distortion, true: Distortion, grid: PixelGrid) -> Figure:
     """Draw the length of S_found - S_true without its affine part, which can't be observed."""
-    drawn, axes, scale = _coloured(grid, np.hypot(*unaffine(found, true, grid)))
-    colour_bar(drawn, axes, scale)
-    return drawn
+    return _coloured(grid, np.hypot(*unaffine(found, true, grid)))
 
 
 def unaffine(found: Distortion, true: Distortion, grid: PixelGrid) -> FloatArray:
@@ -405,26 +339,17 @@ def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
     return along_row[:, None], along_col[None, :]
 
 
-def _picture(grid: PixelGrid, width: float, above: float, share: float = 1.0
-             ) -> tuple[Figure, Axes]:  # fmt: skip
-    """An empty picture for the whole image, over this share of its width; room above [in]."""
-    tall = share * width * grid.rows / grid.cols
-    height = tall + above + 0.04
-    drawn = figure(width, height)
-    axes = drawn.add_axes((0.002, 0.02 / height, 0.996 * share, tall / height))
-    axes.set_axis_off()
-    return drawn, axes
-
-
-def _coloured(grid: PixelGrid, length: FloatArray) -> tuple[Figure, Axes, ColourScale]:
+def _coloured(grid: PixelGrid, length: FloatArray) -> Figure:
     """A map of lengths [px] over the whole image, in its own frame: columns right, rows down."""
-    drawn, axes = _picture(grid, NARROW, 0.26, 0.77)
+    size = np.array([grid.cols, grid.rows])
+    drawn, axes = maps.bare_axes(NARROW, size, 0.77, 0.02, _LEGEND, 0.002)
     scale = ColourScale.size(length, "px")
-    axes.imshow(length, extent=(-0.5, grid.cols - 0.5, grid.rows - 0.5, -0.5), cmap=SIZE,
+    axes.imshow(length, extent=(-0.5, grid.cols - 0.5, grid.rows - 0.5, -0.5), cmap=style.SIZE,
                 norm=scale.normalise, interpolation="bilinear", rasterized=True,
                 aspect="auto")  # fmt: skip
     axes.set(xlim=(-0.5, grid.cols - 0.5), ylim=(grid.rows - 0.5, -0.5))
-    return drawn, axes, scale
+    maps.colour_bar(axes, scale)
+    return drawn
 
 
 def _draw_box(axes: Axes, box: Box) -> Line2D:

@@ -66,6 +66,8 @@ _RC: dict[Any, Any] = {  # matplotlib types the names, a different way in each v
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
     "lines.linewidth": 1.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.5,
 }
 
 
@@ -85,21 +87,12 @@ def figure(width: float, height: float) -> Figure:
 
 def _oklch_to_srgb(L: FloatArray, C: FloatArray, hue: float) -> FloatArray:
     """(n, 3) colours of equal steps in perceived lightness (B. Ottosson's Oklab, 2020)."""
-    a, b = C * np.cos(np.radians(hue)), C * np.sin(np.radians(hue))
-    roots = np.stack(
-        [
-            L + 0.3963377774 * a + 0.2158037573 * b,
-            L - 0.1055613458 * a - 0.0638541728 * b,
-            L - 0.0894841775 * a - 1.2914855480 * b,
-        ]
-    )
-    to_rgb = np.array(
-        [
-            [4.0767416621, -3.3077115913, 0.2309699292],
-            [-1.2684380046, 2.6097574011, -0.3413193965],
-            [-0.0041960863, -0.7034186147, 1.7076147010],
-        ]
-    )
+    to_roots = np.array([[0.3963377774, 0.2158037573], [-0.1055613458, -0.0638541728],
+                         [-0.0894841775, -1.2914855480]])  # fmt: skip
+    to_rgb = np.array([[4.0767416621, -3.3077115913, 0.2309699292],
+                       [-1.2684380046, 2.6097574011, -0.3413193965],
+                       [-0.0041960863, -0.7034186147, 1.7076147010]])  # fmt: skip
+    roots = L + to_roots @ np.stack([C * np.cos(np.radians(hue)), C * np.sin(np.radians(hue))])
     linear = np.clip(to_rgb @ roots**3, 0.0, 1.0)
     curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.asarray(curved.T)
@@ -153,16 +146,9 @@ def scale_bar(axes: Axes, length: float, text: str) -> None:
 def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     """Turn a figure into an SVG element for an HTML page.
 
-    Parameters
-    ----------
-    drawn
-        The figure.
-    name
-        Prefix that keeps the ids of this picture apart from all others in the page.
-    title
-        What the picture shows, for those who cannot see it.
-    exact
-        Keep every pixel as it is: for fields as fine as the pixels, whose colours would run.
+    ``name``: prefix that keeps the ids of this picture apart from all others
+    in the page. ``title``: what the picture shows, for those who cannot see it. ``exact``: keep
+    every pixel as it is: for fields as fine as the pixels, whose colours would run.
     """
     buffer = io.StringIO()
     width, height = drawn.get_size_inches()
