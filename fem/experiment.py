@@ -26,20 +26,18 @@ def require_edges(edges: str) -> None:
 
 @dataclass(frozen=True)
 class PathOptions:
-    """How the path is followed.
-
-    first_step, largest_step : of nominal strain along the primary path [-].
-    critical_tolerance : to which the critical strain is located [-].
-    first_amplitude : largest nodal displacement of the first step onto the branch, as a share of
-        the pitch or whatever length the branch is given [-].
-    growth : most by which the mode's amplitude may grow in one step along the branch [-].
-    """
+    """How the path is followed."""
 
     first_step: float = 0.04
     largest_step: float = 0.04
+    """First and largest step of nominal strain along the primary path [-]."""
     critical_tolerance: float = 1e-7
+    """To which the critical strain is located [-]."""
     first_amplitude: float = 0.08
+    """Largest nodal displacement of the first step onto the branch, as a share of the pitch or
+    whatever length the branch is given [-]."""
     growth: float = 2.0
+    """Most by which the mode's amplitude may grow in one step along the branch [-]."""
 
     def __post_init__(self) -> None:
         what, tolerance = "path options: expected a", self.critical_tolerance
@@ -53,18 +51,30 @@ class PathOptions:
 class Experiment:
     """A virtual compression test. Defaults: the paper's 6 x 10 specimen.
 
-    specimen, material : geometry [mm] and strain energy density [MPa].
-    strains : nominal strains of the snapshots, ascending, compression positive [-].
-    mesh_size : target edge length of the T6 elements [mm].
-    edges : loaded edges "clamped" or "sliding".
-    branches : what to keep above the critical strain, out of "primary" (unstable there), "buckled+"
-        and "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
-    imperfection : scatter of the holes; with any, there is no bifurcation but one natural path.
-    tilt : by how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
+    Parameters
+    ----------
+    specimen, material
+        Geometry [mm] and strain energy density [MPa].
+    strains
+        Nominal strains of the snapshots, ascending, compression positive [-].
+    mesh_size
+        Target edge length of the T6 elements [mm].
+    edges
+        Loaded edges "clamped" or "sliding".
+    branches
+        What to keep above the critical strain, out of "primary" (unstable there), "buckled+" and
+        "buckled-" (stable; + has a positive overlap with ``Specimen.pattern`` if it has any).
+    imperfection
+        Scatter of the holes; with any, there is no bifurcation but one natural path.
+    path
+        How the equilibrium path is followed.
+    tilt
+        By how much the loaded edge at x > 0 turns, per nominal strain [rad], counter-clockwise
         about its middle: at the strain e its u_x varies along y by -e tilt y. A stage that is not
         quite parallel; 0.0137 is 0.1 degrees at 12.7 %. The natural path is followed.
-    guided : fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail
-        would; ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing.
+    guided
+        Fix u_y at the solid junctions on the line of mid-height, as pins in a straight rail would;
+        ``holes_y`` has to be even, rows not staggered. Keeps long specimens from bowing.
     """
 
     specimen: Specimen = field(default_factory=Specimen)

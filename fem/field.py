@@ -36,13 +36,12 @@ _MESHIO_NAME = {"T3": "triangle", "T6": "triangle6", "Q4": "quad", "Q8": "quad8"
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A plane isoparametric mesh of one element type: T3, T6, Q4, Q8 or Q9.
-
-    ``nodes`` (n, 2) are positions [mm], ``cells`` (m, k) node numbers in the module's order.
-    """
+    """A plane isoparametric mesh of one element type: T3, T6, Q4, Q8 or Q9."""
 
     nodes: FloatArray
+    """(n, 2) positions [mm]."""
     cells: IntArray
+    """(m, k) node numbers in the module's order."""
     element: str
 
     def __post_init__(self) -> None:
@@ -81,31 +80,38 @@ def boundary_sides(mesh: Mesh) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """One equilibrium state, with the displacement (n, 2) at the mesh's nodes [mm].
-
-    nominal_strain : applied shortening over L, the length of the cellular part [-].
-    reaction, energy : compressive force on the loaded edge [N/mm], stored energy [N], by thickness.
-    negative_pivots : negative eigenvalues of the tangent stiffness; 0: stable, None: unknown.
-    eigenvalues : lowest ones of K x = lambda M x, ascending [N/mm^4], where they were computed; M
-        is the mass matrix of unit density.
-    branch : "primary", "buckled+" or "buckled-".
-    """
+    """One equilibrium state."""
 
     nominal_strain: float
+    """Applied shortening over L, the length of the cellular part [-]."""
     displacement: FloatArray
+    """(n, 2) at the mesh's nodes [mm]."""
     reaction: float = float("nan")
+    """Compressive force on the loaded edge, by thickness [N/mm]."""
     energy: float = float("nan")
+    """Stored energy by thickness [N]."""
     negative_pivots: int | None = None
+    """Negative eigenvalues of the tangent stiffness; 0: stable, None: unknown."""
     eigenvalues: tuple[float, ...] = ()
+    """Lowest ones of K x = lambda M x, ascending [N/mm^4], where they were computed; M is the mass
+    matrix of unit density."""
     branch: str = "primary"
+    """Either "primary", "buckled+" or "buckled-"."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A mesh and its snapshots, with everything needed to make them again.
 
-    ``info`` holds plain JSON values: geometry, material, loading, versions, seed, the
-    critical strain and what the path cost.
+    Parameters
+    ----------
+    mesh
+        The undeformed specimen.
+    snapshots
+        Its equilibrium states.
+    info
+        Plain JSON values: geometry, material, loading, versions, seed, the critical strain and what
+        the path cost.
     """
 
     mesh: Mesh

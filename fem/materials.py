@@ -22,11 +22,19 @@ class Ogden:
 
     W = sum_i c_i/m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3 - m_i ln J) + kappa/2 (J - 1)^2
 
-    with the principal stretches l1, l2 and l3 = 1, ``moduli`` c_i [MPa], ``exponents`` m_i [-]
-    other than 0, and ``kappa`` [MPa]. Small strain: shear modulus mu = sum(c_i)/2, Lame's
-    lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)). The form is that of van Bree et
-    al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333; the default constants are this
+    with the principal stretches l1, l2 and l3 = 1. Small strain: shear modulus mu = sum(c_i)/2,
+    Lame's lambda = kappa, Poisson's ratio nu = kappa/(2 (kappa + mu)). The form is that of van Bree
+    et al., Comput. Methods Appl. Mech. Eng. 372 (2020) 113333; the default constants are this
     project's choice (mu = 0.60 MPa, nu = 0.45), because the paper's own are not public.
+
+    Parameters
+    ----------
+    moduli
+        c_i [MPa].
+    exponents
+        m_i [-], other than 0.
+    kappa
+        Constant of the volumetric term [MPa].
     """
 
     moduli: tuple[float, ...] = (1.2,)
@@ -59,13 +67,14 @@ class Ogden:
 class TwoTermI1:
     """W = c1 (I1 - 3) + c2 (I1 - 3)^2 - 2 c1 ln J + K/2 (J - 1)^2 [MPa], with I1 = tr C + 1.
 
-    ``bulk`` is K. Bertoldi, Boyce, Deschanel, Prange & Mullin, J. Mech. Phys. Solids 56 (2008)
-    2642-2668, doi 10.1016/j.jmps.2008.03.006; defaults are theirs (nu = 0.490).
+    Bertoldi, Boyce, Deschanel, Prange & Mullin, J. Mech. Phys. Solids 56 (2008) 2642-2668, doi
+    10.1016/j.jmps.2008.03.006; defaults are theirs (nu = 0.490).
     """
 
     c1: float = 0.55
     c2: float = 0.3
     bulk: float = 55.0
+    """K [MPa]."""
 
     def __post_init__(self) -> None:
         if not (self.c1 > 0 and self.c2 >= 0 and self.bulk > 0):

@@ -72,10 +72,12 @@ SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 @dataclass(frozen=True)
 class MeshBlock:
-    """A small T6 mesh to be placed many times: nodes (n, 2) [mm], cells (m, 6)."""
+    """A small T6 mesh to be placed many times."""
 
     nodes: FloatArray
+    """(n, 2) [mm]."""
     cells: IntArray
+    """(m, 6) node numbers."""
 
     def placed(self, sign: tuple[float, float], origin: tuple[float, float]) -> MeshBlock:
         """The block reflected about its own axes by ``sign`` and moved to ``origin`` [mm]."""

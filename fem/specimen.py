@@ -18,14 +18,12 @@ MOST_HOLES = 1000
 
 @dataclass(frozen=True)
 class Stacking:
-    """How rows of holes along x are stacked along y.
-
-    shift : by how much a row is moved along x against the one below: 0, or 0.5 [pitch].
-    rise : distance of the rows [pitch]; None where ``pitch_y`` gives it.
-    """
+    """How rows of holes along x are stacked along y."""
 
     shift: float
+    """By how much a row is moved along x against the one below: 0, or 0.5 [pitch]."""
     rise: float | None
+    """Distance of the rows [pitch]; None where ``pitch_y`` gives it."""
 
 
 STACKINGS = {
@@ -47,17 +45,27 @@ class Specimen:
     the specimen is symmetric about the y axis, and with an odd number of rows about the x axis too.
     The cellular part is the bounding box of the holes' cells; what these leave of it is solid.
 
-    holes_x, holes_y : number of holes in a row, along the loading direction; number of rows.
-    diameter : hole diameter d, of ellipses along x, of a graded specimen at its centre [mm].
-    pitch : centre-to-centre distance l along a row, the unit cell size [mm].
-    bulk_x, bulk_y : width of the solid strips at loaded and at free edges [mm]; 0: none.
-    grading_x, grading_y : change of the diameter from hole to hole, per distance of their centres
-        in the loading and in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x +
-        grading_y y. A specimen graded in one direction keeps its mirror symmetry in the other.
-        Ellipses keep their aspect.
-    stacking : "square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``.
-    pitch_y : distance of the rows [mm] of rectangular stacking; others have it from ``pitch``.
-    diameter_y : diameter of elliptical holes along y [mm]; None for round ones.
+    Parameters
+    ----------
+    holes_x, holes_y
+        Number of holes in a row, along the loading direction; number of rows.
+    diameter
+        Hole diameter d, of ellipses along x, of a graded specimen at its centre [mm].
+    pitch
+        Centre-to-centre distance l along a row, the unit cell size [mm].
+    bulk_x, bulk_y
+        Width of the solid strips at loaded and at free edges [mm]; 0: none.
+    grading_x, grading_y
+        Change of the diameter from hole to hole, per distance of their centres in the loading and
+        in the transverse direction [mm/mm]: d(x, y) = diameter + grading_x x + grading_y y. A
+        specimen graded in one direction keeps its mirror symmetry in the other. Ellipses keep their
+        aspect.
+    stacking
+        "square", "rectangular" or "triangular" (equilateral, rows along x): ``STACKINGS``.
+    pitch_y
+        Distance of the rows [mm] of rectangular stacking; others have it from ``pitch``.
+    diameter_y
+        Diameter of elliptical holes along y [mm]; None for round ones.
     """
 
     holes_x: int = 6
@@ -272,14 +280,12 @@ def centred(count: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Imperfection:
-    """Independent normal scatter of every hole.
-
-    position_sd : standard deviation of each coordinate of a hole's centre [mm].
-    diameter_sd : standard deviation of a hole's diameter [mm].
-    """
+    """Independent normal scatter of every hole."""
 
     position_sd: float = 0.0
+    """Standard deviation of each coordinate of a hole's centre [mm]."""
     diameter_sd: float = 0.0
+    """Standard deviation of a hole's diameter [mm]."""
     seed: int = 0
 
     def __post_init__(self) -> None:

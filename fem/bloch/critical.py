@@ -28,30 +28,30 @@ _BESIDE = 1e-6  # of the critical load: where the proof is made
 
 @dataclass(frozen=True, eq=False)
 class LatticeCritical:
-    """Where a lattice first becomes unstable, or how far it was found to be stable.
-
-    load : critical load; without one, the last load reached [-].
-    found, outcome : whether there is a critical point up to there; what was found, as a sentence.
-    least_stable, state : the least stable wave and the equilibrium at ``load``.
-    waves : all waves of the grid that are critical there: a degenerate set has more than one. k and
-        -k are the same mode and appear once. Empty for long waves.
-    history : the least stable wave at every load looked at, by load.
-    below, above : number of negative eigenvalues at each of ``waves`` a millionth of the load below
-        and above the critical one: the proof.
-    unstable_before : waves of the grid that are unstable already a millionth below: this is the
-        first critical point if there are none. Not looked for where one wave was given.
-    """
+    """Where a lattice first becomes unstable, or how far it was found to be stable."""
 
     load: float
+    """Critical load; without one, the last load reached [-]."""
     found: bool
+    """Whether there is a critical point up to ``load``."""
     outcome: str
+    """What was found, as a sentence."""
     least_stable: LeastStable
+    """The least stable wave at ``load``."""
     waves: tuple[Wave, ...]
+    """All waves of the grid that are critical at ``load``: a degenerate set has more than one. k
+    and -k are the same mode and appear once. Empty for long waves."""
     state: CellState
+    """The equilibrium at ``load``."""
     history: tuple[LeastStable, ...]
+    """The least stable wave at every load looked at, by load."""
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
+    """Number of negative eigenvalues at each of ``waves`` a millionth of the load below and above
+    the critical one: the proof."""
     unstable_before: tuple[Wave, ...] = ()
+    """Waves of the grid that are unstable already a millionth of the load below: this is the first
+    critical point if there are none. Not looked for where one wave was given."""
 
 
 def first_critical(

@@ -53,17 +53,15 @@ _MAP_ARRAYS = ("phases", "eigenvalues", "lattice")
 
 @dataclass(frozen=True, eq=False)
 class ZoneMap:
-    """The lowest eigenvalue over all of the zone at one load [-].
-
-    phases : (g,) from -pi to pi, of k . a1 and of k . a2 alike [rad].
-    eigenvalues : (g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0.
-    lattice : (2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm].
-    """
+    """The lowest eigenvalue over all of the zone at one load [-]."""
 
     load: float
     phases: FloatArray
+    """(g,) from -pi to pi, of k . a1 and of k . a2 alike [rad]."""
     eigenvalues: FloatArray
+    """(g, g) [N/mm^4]; the first index is k . a1. At (0, 0), a translation, it is 0."""
     lattice: FloatArray
+    """(2, 2) lattice vectors as rows [mm]: k = phases . inv(lattice).T [rad/mm]."""
 
     @property
     def least_stable(self) -> tuple[float, Wave]:
@@ -81,21 +79,22 @@ class ZoneMap:
 
 @dataclass(frozen=True, eq=False)
 class Dispersion:
-    """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors.
-
-    labels, stops : names of the path's corners, and their places among its points.
-    waves, distances, loads : (p, 2) phases [rad]; (p,) length of the path [rad/mm]; (s,) [-].
-    eigenvalues : (s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them.
-    zone : maps of the zone, one for each requested load.
-    """
+    """Lowest eigenvalues of K x = lambda M x, M of unit density, along a path of wave vectors."""
 
     labels: tuple[str, ...]
+    """Names of the path's corners."""
     stops: tuple[int, ...]
+    """Places of the corners among the path's points."""
     waves: FloatArray
+    """(p, 2) phases [rad]."""
     distances: FloatArray
+    """(p,) length of the path [rad/mm]."""
     loads: FloatArray
+    """(s,) [-]."""
     eigenvalues: FloatArray
+    """(s, p, bands) ascending [N/mm^4]; at Γ the translations' zeros are among them."""
     zone: tuple[ZoneMap, ...] = ()
+    """Maps of the zone, one for each requested load."""
 
     def __post_init__(self) -> None:
         expected = (len(self.loads), len(self.waves))

@@ -37,15 +37,13 @@ _DIRECTIONS = 36  # over half a turn
 
 @dataclass(frozen=True, eq=False)
 class BlochModes:
-    """The lowest eigenpairs at one wave vector.
-
-    ``eigenvalues`` (m,) ascend [N/mm^4]; ``vectors`` (size, m) have x^H M x = 1, in the order of
-    ``Reduction``.
-    """
+    """The lowest eigenpairs at one wave vector."""
 
     wave: Wave
     eigenvalues: FloatArray
+    """(m,) ascending [N/mm^4]."""
     vectors: NDArray[Any]
+    """(size, m) with x^H M x = 1, in the order of ``Reduction``."""
 
 
 class BlochWaves:

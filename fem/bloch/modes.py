@@ -41,28 +41,26 @@ NORMALISATION = "the mean over the cell's material of phi_i . phi_j is 1 for i =
 
 @dataclass(frozen=True, eq=False)
 class ModeSet:
-    """Real modes of a lattice on its smallest cell that has their period.
-
-    mesh, lattice, primitive : T6 mesh of the commensurate cell, undeformed; lattice vectors of it
-        and of the primitive cell as rows (2, 2) [mm].
-    waves : (m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad].
-    eigenvalues : (m,) of K x = lambda M x, M of unit density [N/mm^4]; near 0 at a critical point.
-    shapes : (m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
-        delta_ij. The sign is such that the first large component is positive. Waves with phases
-        other than 0 and pi have their modes in pairs, which are the real and imaginary part.
-    load, gradient : load parameter and F̄ (2, 2) of the state whose tangent they belong to [-].
-    info : plain JSON values: lattice, material, loading, where it is critical, versions.
-    """
+    """Real modes of a lattice on its smallest cell that has their period."""
 
     mesh: Mesh
+    """T6 mesh of the commensurate cell, undeformed [mm]."""
     lattice: FloatArray
     primitive: FloatArray
+    """Lattice vectors of the commensurate and of the primitive cell as rows (2, 2) [mm]."""
     waves: tuple[Wave, ...]
+    """(m,) phases (k . a1, k . a2) of each mode from primitive cell to primitive cell [rad]."""
     eigenvalues: FloatArray
+    """(m,) of K x = lambda M x, M of unit density [N/mm^4]; near 0 at a critical point."""
     shapes: FloatArray
+    """(m, n, 2) nodal modes [-], orthonormal: the mean of phi_i . phi_j over the material is
+    delta_ij. The sign is such that the first large component is positive. Waves with phases other
+    than 0 and pi have their modes in pairs, which are the real and imaginary part."""
     load: float
     gradient: FloatArray
+    """Load parameter and F̄ (2, 2) of the state whose tangent the modes belong to [-]."""
     info: Mapping[str, Any] = field(default_factory=dict)
+    """Plain JSON values: lattice, material, loading, where it is critical, versions."""
 
     def __post_init__(self) -> None:
         count = len(self.waves)
@@ -77,25 +75,23 @@ class ModeSet:
 
 @dataclass(frozen=True, eq=False)
 class BranchState:
-    """An equilibrium of the commensurate cell beyond the critical point.
-
-    gradient, stress : (2, 2) F̄ [-] and P̄ [MPa].
-    energy, primary_energy : stored energy per area of the cell, here and on the primary path at the
-        same load [MPa]; NaN where that path ends before. Under a stress other than 0 the lower
-        energy minus P̄ : F̄ is what is preferred.
-    negative_eigenvalues : of the cell's tangent with F̄'s free components; 0: stable in its period.
-    displacement : (n, 2) of the mesh's nodes [mm].
-    amplitudes : (m,) mean of (u - affine part - primary fluctuation) . phi_i over material [mm].
-    """
+    """An equilibrium of the commensurate cell beyond the critical point."""
 
     load: float
     gradient: FloatArray
     stress: FloatArray
+    """(2, 2) F̄ [-] and P̄ [MPa]."""
     energy: float
     primary_energy: float
+    """Stored energy per area of the cell, here and on the primary path at the same load [MPa]; NaN
+    where that path ends before. Under a stress other than 0 the lower energy minus P̄ : F̄ is what
+    is preferred."""
     negative_eigenvalues: int
+    """Of the cell's tangent with F̄'s free components; 0: stable in its period."""
     displacement: FloatArray
+    """(n, 2) of the mesh's nodes [mm]."""
     amplitudes: FloatArray
+    """(m,) mean of (u - affine part - primary fluctuation) . phi_i over material [mm]."""
 
     def fluctuation(self, mesh: Mesh) -> FloatArray:
         """(n, 2) displacement without its affine part (F̄ - I) X [mm]."""
@@ -104,18 +100,16 @@ class BranchState:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A buckled branch: which combination of modes it started with, and its states.
-
-    combination : (m,) coefficients of the modes at the start, of unit length [-].
-    states : by load; empty if it could not be followed. A load met twice is there twice.
-    outcome : how far it was followed, and why no farther.
-    curve : (p, 2) amplitude of the combination [mm] and load [-] of all points from the first.
-    """
+    """A buckled branch: which combination of modes it started with, and its states."""
 
     combination: tuple[float, ...]
+    """(m,) coefficients of the modes at the start, of unit length [-]."""
     states: tuple[BranchState, ...]
+    """By load; empty if it could not be followed. A load met twice is there twice."""
     outcome: str
+    """How far it was followed, and why no farther."""
     curve: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    """(p, 2) amplitude of the combination [mm] and load [-] of all points from the first."""
 
 
 FORMAT = "modeharvest-modes-1"

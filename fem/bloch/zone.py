@@ -25,18 +25,16 @@ _SAME = 1e-3  # phases [rad] that far apart are the same wave
 
 @dataclass(frozen=True)
 class LeastStable:
-    """The wave that is nearest to instability at one load.
-
-    value : filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves its
-        limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable.
-    wave : phases [rad]; (0, 0) for long waves and for modes with the cell's own period.
-    angle : direction of k for long waves [rad]; None otherwise.
-    """
+    """The wave that is nearest to instability at one load."""
 
     load: float
     value: float
+    """filling * lambda / |k|^2, with a |k|^2 that has the lattice's period; for long waves its
+    limit, the acoustic tensor's eigenvalue [MPa]. Negative: unstable."""
     wave: Wave
+    """Phases [rad]; (0, 0) for long waves and for modes with the cell's own period."""
     angle: float | None = None
+    """Direction of k for long waves [rad]; None otherwise."""
 
 
 class Zone:

@@ -31,35 +31,32 @@ _AMPLITUDE_TOLERANCE = 1e-11  # relative
 
 @dataclass(frozen=True, eq=False)
 class CellState:
-    """An equilibrium of a cell.
-
-    load : e: for compressions the nominal strain [-].
-    gradient, gradient_rate : (2, 2) F̄ and dF̄/de [-].
-    fluctuation, fluctuation_rate : (2 count,) w of the masters as in ``Reduction``, dw/de [mm].
-    stress : (2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa].
-    stiffness : (2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2].
-    moduli : (2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa].
-    """
+    """An equilibrium of a cell."""
 
     load: float
+    """e; for compressions the nominal strain [-]."""
     gradient: FloatArray
     gradient_rate: FloatArray
+    """(2, 2) F̄ and dF̄/de [-]."""
     fluctuation: FloatArray
     fluctuation_rate: FloatArray
+    """(2 count,) w of the masters as in ``Reduction``, dw/de [mm]."""
     stress: FloatArray
+    """(2, 2) P̄, mean first Piola-Kirchhoff stress over the cell with its holes [MPa]."""
     stiffness: csr_array
+    """(2 n, 2 n) of the mesh's nodes without any constraint [N/mm^2]."""
     moduli: FloatArray
+    """(2, 2, 2, 2) effective tangent dP̄_ij/dF̄_kl with w at equilibrium [MPa]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Amplitude:
-    """``weights . w = value`` [mm] is prescribed, while the load is found.
-
-    Weights (2 count,) are in the order of ``Reduction``, and not those of a translation.
-    """
+    """``weights . w = value`` is prescribed, while the load is found."""
 
     weights: FloatArray
+    """(2 count,) in the order of ``Reduction``, and not those of a translation."""
     value: float
+    """[mm]."""
 
 
 class LinearisedCell:

@@ -42,12 +42,13 @@ from modeharvest.util.errors import InputError
 class UnitCell:
     """A piece of a lattice whose copies, moved by the lattice vectors, make up all of it.
 
-    A T6 mesh [mm] and the lattice vectors a1 and a2 as rows (2, 2) [mm]. An InputError refuses a
-    mesh that is not periodic, and names the nodes without a partner.
+    An InputError refuses a mesh that is not periodic, and names the nodes without a partner.
     """
 
     mesh: Mesh
+    """T6 [mm]."""
     lattice: FloatArray
+    """Lattice vectors a1 and a2 as rows (2, 2) [mm]."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lattice", np.array(self.lattice, dtype=np.float64))

@@ -18,17 +18,17 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True)
 class CriticalSearch:
-    """How the first critical point is looked for.
-
-    divisions : of each axis of the zone; an even number has the points M and X on the grid.
-    largest, first_step, largest_step, tolerance : load up to which to look; how it is located [-].
-    """
+    """How the first critical point is looked for."""
 
     largest: float = 0.3
+    """Load up to which to look [-]."""
     divisions: int = 8
+    """Of each axis of the zone; an even number has the points M and X on the grid."""
     first_step: float = 1e-3
     largest_step: float = 0.02
+    """Steps of the load [-]."""
     tolerance: float = 1e-10
+    """To which the critical load is located [-]."""
 
     def __post_init__(self) -> None:
         lengths = (self.largest, self.first_step, self.largest_step, self.tolerance)
@@ -41,18 +41,16 @@ class CriticalSearch:
 
 @dataclass(frozen=True)
 class BranchOptions:
-    """How a branch is followed; lengths are shares of the primitive cell's shorter vector.
-
-    first, longest, farthest : first and largest step of the amplitude, the rms displacement in the
-        mode, and the amplitude where to stop [-].
-    growth : of the step from one point to the next.
-    """
+    """How a branch is followed; lengths are shares of the primitive cell's shorter vector."""
 
     # At small amplitudes the directions of a degenerate set are all but equivalent.
     first: float = 0.01
     longest: float = 0.02
+    """First and largest step of the amplitude, the rms displacement in the mode [-]."""
     growth: float = 1.6
+    """Of the step from one point to the next [-]."""
     farthest: float = 0.4
+    """Amplitude where to stop [-]."""
 
     def __post_init__(self) -> None:
         if not 0 < self.first <= self.longest <= self.farthest < math.inf or self.growth < 1:

@@ -29,10 +29,11 @@ class Periodicity:
     """The nodes of a cell as translates of independent ones ("masters").
 
     Node i is at the position of ``master[i]``, 0 ... count - 1, plus R1 a1 + R2 a2 with the
-    integers R = ``shift[i]``; a1 and a2 are the rows of ``lattice`` (2, 2) [mm].
+    integers R = ``shift[i]``.
     """
 
     lattice: FloatArray
+    """(2, 2) a1 and a2 as rows [mm]."""
     master: IntArray
     shift: IntArray
 

@@ -28,30 +28,29 @@ _RESIDUAL = 3e-3  # of modes: a hundred thousandth of their eigenvalues
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """An equilibrium state: nominal strain [-], displacement and du/d(strain) [mm], stability.
-
-    ``eigenvalues`` are the lowest ones of the tangent stiffness [N/mm^4], if any were computed.
-    """
+    """An equilibrium state and its stability."""
 
     strain: float
+    """Nominal [-]."""
     u: PETSc.Vec
+    """Displacement [mm]."""
     tangent: PETSc.Vec
+    """du/d(strain) [mm]."""
     negative_pivots: int
     eigenvalues: tuple[float, ...] = ()
+    """The lowest ones of the tangent stiffness [N/mm^4], if any were computed."""
 
 
 @dataclass(eq=False)
 class PathFollower:
-    """Follows the paths of one structure; the last state's factor serves the next step.
-
-    ``linearisation`` and ``modes`` (the lowest ones) belong to the state found last.
-    """
+    """Follows the paths of one structure; the last state's factor serves the next step."""
 
     structure: Structure
     options: PathOptions = field(default_factory=PathOptions)
     progress: Progress = silent
     linearisation: Linearisation | None = None
     modes: list[Mode] = field(default_factory=list)
+    """Both of the state found last; the modes are its lowest ones."""
 
     def __post_init__(self) -> None:
         self.mass = self.structure.mass()

@@ -18,20 +18,18 @@ _ZERO = 1e-3  # of the eigenvalue at the unstable state: so small it has to beco
 
 @dataclass(frozen=True, eq=False)
 class Critical:
-    """The first critical point of the primary path.
-
-    strain, u : critical nominal strain [-], and the displacement there.
-    modes : those whose eigenvalues are nearest to zero, the critical one(s) first.
-    eigenvalues : (strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed.
-    below, above : negative pivots at strain - tolerance and strain + tolerance: the proof.
-    """
+    """The first critical point of the primary path."""
 
     strain: float
     u: PETSc.Vec
+    """Critical nominal strain [-], and the displacement there."""
     modes: list[Mode]
+    """Those whose eigenvalues are nearest to zero, the critical one(s) first."""
     eigenvalues: list[tuple[float, float]]
+    """(strain [-], eigenvalue [N/mm^4]) of the critical mode wherever it was computed."""
     below: int
     above: int
+    """Negative pivots at strain - tolerance and strain + tolerance: the proof."""
 
 
 def locate_critical(follower: PathFollower, low: State, high: State) -> Critical | None:

@@ -28,21 +28,19 @@ _TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
 
 @dataclass(frozen=True)
 class EdgeCompression:
-    """Compression along x by displacing the two edges x = +-half_width [mm] towards each other.
-
-    length : the length that nominal strain refers to [mm]; e * length is the shortening.
-    edges : "clamped": both components prescribed; "sliding": u_y is free on the loaded edges but
-        for one node at mid-height, which keeps the specimen in place.
-    tilt : counter-clockwise rotation of the edge x = +half_width about its middle, per nominal
-        strain [rad]: -e tilt y is added to its u_x.
-    pins : points (x, y) whose u_y is fixed [mm]; nodes have to be there.
-    """
+    """Compression along x by displacing the two edges x = +-half_width [mm] towards each other."""
 
     half_width: float
     length: float
+    """The length that nominal strain refers to [mm]; e * length is the shortening."""
     edges: str = "clamped"
+    """With "clamped", both components are prescribed; with "sliding", u_y is free on the loaded
+    edges but for one node at mid-height, which keeps the specimen in place."""
     tilt: float = 0.0
+    """Counter-clockwise rotation of the edge x = +half_width about its middle, per nominal strain
+    [rad]: -e tilt y is added to its u_x."""
     pins: tuple[tuple[float, float], ...] = ()
+    """Points (x, y) whose u_y is fixed [mm]; nodes have to be there."""
 
     def __post_init__(self) -> None:
         require_edges(self.edges)

@@ -36,16 +36,14 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """How the structure answers to small changes of an equilibrium: serves states nearby, too.
-
-    factor : of the tangent stiffness.
-    tangent : du/d(strain) along the path [mm].
-    load_size : norm of ``Structure.load`` [N/mm].
-    """
+    """How the structure answers to small changes of an equilibrium: serves states nearby, too."""
 
     factor: SymmetricFactor
+    """Of the tangent stiffness."""
     tangent: PETSc.Vec
+    """du/d(strain) along the path [mm]."""
     load_size: float
+    """Norm of ``Structure.load`` [N/mm]."""
 
 
 @dataclass(frozen=True, eq=False)

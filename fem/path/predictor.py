@@ -42,16 +42,15 @@ def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class BranchPoint:
-    """A point of a branch as a function of its mode's amplitude [mm].
-
-    The load [-] and the ``value`` of the state, such as displacements [mm]; the rates are their
-    derivatives by the amplitude.
-    """
+    """A point of a branch by its mode's amplitude; the rates are derivatives by that."""
 
     amplitude: float
+    """[mm]."""
     load: float
+    """[-]."""
     load_rate: float
     value: Any
+    """Of the state, such as displacements [mm]."""
     rate: Any
 
 

@@ -26,15 +26,14 @@ _LITTLE, _DEPENDENT = 1e-4, 1e-12  # eigenvalues of a normalised Gram matrix: sm
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """An eigenpair K x = lambda M x, with x normalised to x . M x = 1.
-
-    lambda [N/mm^4] is stiffness per unit thickness over area; x is zero at the constrained
-    components; ``weighted`` is M x, so that overlaps with other vectors are dot products.
-    """
+    """An eigenpair K x = lambda M x, with x normalised to x . M x = 1."""
 
     eigenvalue: float
+    """lambda [N/mm^4]: stiffness per unit thickness over area."""
     vector: PETSc.Vec
+    """x, zero at the constrained components."""
     weighted: PETSc.Vec
+    """M x, so that overlaps with other vectors are dot products."""
 
     def overlap(self, other: PETSc.Vec) -> float:
         """x . M other; its size is at most 1 if ``other`` is normalised likewise."""
