@@ -28,16 +28,14 @@ _MOST_POINTS = 16  # a side
 
 @dataclass(frozen=True)
 class PixelQuadrature:
-    """How the pixels of an image were averaged.
-
-    points : points in each pixel away from the edges; 0: none needed, the average is exact.
-    rms_bound : bound of their root-mean-square error on the pattern [fraction of full scale].
-    edge_points : points in each pixel near an edge.
-    """
+    """How the pixels of an image were averaged."""
 
     points: int
+    """Points in each pixel away from the edges; 0: none needed, the average is exact."""
     rms_bound: float
+    """Bound of their root-mean-square error on the pattern [fraction of full scale]."""
     edge_points: int = EDGE_POINTS
+    """Points in each pixel near an edge."""
 
 
 def integrate(
@@ -97,32 +95,31 @@ def points_a_side(
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRecord:
-    """What the sidecar of a set says of an image.
-
-    image, camera_image, mask : files without noise, as exposed, and of where there is material.
-    noise_sd : rms of the camera image's predicted noise on the material [fraction of full scale].
-    saturated_px, doubly_covered_px : material pixels at the highest level, and pixels inside more
-        than one element, where the specimen overlaps.
-    light : the factor on the irradiance; None if the light doesn't flicker.
-    quadrature : how the pixels were averaged; None if they show points.
-    """
+    """What the sidecar of a set says of an image."""
 
     image: str
     camera_image: str
     mask: str
+    """Files of the image without noise, of the one as exposed, and of where there is material."""
     noise_sd: float
+    """Rms of the camera image's predicted noise on the material [fraction of full scale]."""
     saturated_px: int
+    """Material pixels at the highest level."""
     doubly_covered_px: int
+    """Pixels inside more than one element, where the specimen overlaps."""
     light: float | None = None
+    """Factor on the irradiance; None if the light doesn't flicker."""
     quadrature: PixelQuadrature | None = None
+    """How the pixels were averaged; None if they show points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A lens and a sensor; ``points`` are the ideal ones that pixels show, None without a lens."""
+    """A lens and a sensor."""
 
     spec: ImagingSpec
     points: Positions | None
+    """The ideal ones that pixels show; None without a lens."""
     folder: Path
 
     @classmethod

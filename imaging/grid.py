@@ -18,17 +18,16 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """A regular grid of square pixels laid over the physical plane.
-
-    rows, cols, pixel_size : image size [px]; edge of a pixel [mm/px].
-    x0, y0 : position of the centre of pixel (row 0, column 0), the upper left one [mm].
-    """
+    """A regular grid of square pixels laid over the physical plane."""
 
     rows: int
     cols: int
+    """Image size [px]."""
     pixel_size: float
+    """Edge of a pixel [mm/px]."""
     x0: float
     y0: float
+    """Position of the centre of pixel (row 0, column 0), the upper left one [mm]."""
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1 or not self.pixel_size > 0:

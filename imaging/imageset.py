@@ -82,27 +82,27 @@ _OWN_FILES = ("reference*.tif", "mask.tif", "deformed_[0-9]*.tif", "truth_[0-9]*
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotRecord(ImageRecord):
-    """What the sidecar says of a deformed image.
-
-    nominal_strain, branch, truth : of the snapshot [-]; name of the truth's file.
-    inverse_map_max_residual_px : largest residual of the inverse mapping [px].
-    """
+    """What the sidecar says of a deformed image."""
 
     nominal_strain: float
     branch: str
+    """Of the snapshot; the strain [-]."""
     truth: str
+    """Name of the truth's file."""
     inverse_map_max_residual_px: float
+    """Largest residual of the inverse mapping [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """A finished set on disk; ``info`` is the content of ``images.json``.
+    """A finished set on disk.
 
     Images and truth are read when asked for: InputError if a file is not what was written.
     """
 
     folder: Path
     info: dict[str, Any]
+    """Content of ``images.json``."""
 
     @classmethod
     def read(cls, folder: Path | str) -> ImageSet:

@@ -56,11 +56,12 @@ class HasDisplacement(Protocol):
 class Truth:
     """What a measurement of one deformed image should find; each part is made when asked for.
 
-    ``part`` gives it by the name of its property. The last axis of length 2 holds the components
-    (x, y) along the physical axes; NaN where there is no material.
+    The last axis of length 2 holds the components (x, y) along the physical axes; NaN where there
+    is no material.
     """
 
     part: Callable[[str], NDArray[Any]]
+    """Gives a part by the name of its property."""
 
     @classmethod
     def of(cls, **parts: NDArray[Any]) -> Truth:
@@ -127,11 +128,18 @@ class ImagePair:
 
     InputError if sizes differ, a mask is empty, or an image has NaN or one level on its material.
 
-    reference, deformed : (rows, cols) grey levels f and g; kept as float32.
-    grid : their pixels.
-    mask, deformed_mask : (rows, cols) True on material, in f and in g; None for everywhere.
-    truth : what a measurement should find, where that is known.
-    strain : nominal strain of the deformed image [-]; NaN where it isn't known.
+    Parameters
+    ----------
+    reference, deformed
+        (rows, cols) grey levels f and g; kept as float32.
+    grid
+        Their pixels.
+    mask, deformed_mask
+        (rows, cols) True on material, in f and in g; None for everywhere.
+    truth
+        What a measurement should find, where that is known.
+    strain
+        Nominal strain of the deformed image [-]; NaN where it isn't known.
     """
 
     reference: FloatImage

@@ -26,21 +26,19 @@ from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 
 @dataclass(frozen=True, eq=False)
 class ImagedState:
-    """A state of the specimen before a camera.
-
-    mesh : the undeformed mesh.
-    displacement : (n, 2) at its nodes [mm]; None for the undeformed state.
-    grid : the pixels; the speckle's whole pixels are the grid's.
-    speckle, background : intensity of the material and around it [fraction of full scale].
-    where : what to call the state in an error.
-    """
+    """A state of the specimen before a camera."""
 
     mesh: Mesh
+    """Undeformed."""
     displacement: FloatArray | None
+    """(n, 2) at its nodes [mm]; None for the undeformed state."""
     grid: PixelGrid
+    """The pixels; the speckle's whole pixels are the grid's."""
     speckle: Speckle
     background: float
+    """Intensity of the material and around it [fraction of full scale]."""
     where: str = "mesh"
+    """What to call the state in an error."""
 
     @property
     def nodes(self) -> FloatArray:
@@ -91,17 +89,15 @@ class ImagedState:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An image, and where it shows material.
-
-    image : (rows, cols) float32 intensity [fraction of full scale].
-    mask : (rows, cols) True where there is material.
-    doubly_covered : how many of its pixels lie inside more than one element: the specimen overlaps
-        there, and the element of the lowest number is shown.
-    """
+    """An image, and where it shows material."""
 
     image: FloatImage
+    """(rows, cols) float32 intensity [fraction of full scale]."""
     mask: BoolArray
+    """(rows, cols) True where there is material."""
     doubly_covered: int = 0
+    """How many of its pixels lie inside more than one element: the specimen overlaps there, and the
+    element of the lowest number is shown."""
 
 
 def render_reference(state: ImagedState, located: Located) -> Rendering:

@@ -56,14 +56,12 @@ _TAIL = 5.0  # standard deviations of the blur; 6e-7 of it lie beyond
 
 @dataclass(frozen=True)
 class Aperture:
-    """The weight h with which a pixel averages light; InputError if a value is out of its range.
-
-    fill_factor : sensitive part of the pixel's area [-], a centred square; 0 is a point.
-    psf_px : standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens.
-    """
+    """The weight h with which a pixel averages light; InputError if a value is out of its range."""
 
     fill_factor: float = 0.0
+    """Sensitive part of the pixel's area [-], a centred square; 0 is a point."""
     psf_px: float = 0.0
+    """Standard deviation of the lens's Gaussian point spread [px]; 0 is a perfect lens."""
 
     def __post_init__(self) -> None:
         require_within("sensor: expected a fill factor", self.fill_factor, 0.0, 1.0)
@@ -128,29 +126,28 @@ class Aperture:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How a sensor turns light into grey levels; InputError if a value is out of its range.
-
-    fill_factor, psf_px : as of an :class:`Aperture`.
-    gain : factor from irradiance to grey level [-].
-    offset : grey level of the dark [fraction of full scale].
-    full_well : electrons that an irradiance of 1 frees [-]; the fewer, the more noise; 0: none.
-    read_noise : standard deviation of the read noise [fraction of full scale].
-    saturation : grey level that is never exceeded [fraction of full scale].
-    flicker : relative standard deviation of the light from image to image [-], even over an image.
-    shot_seed, read_seed, flicker_seed : of noises; every image of a set has streams of its own.
-    """
+    """How a sensor turns light into grey levels; InputError if a value is out of its range."""
 
     fill_factor: float = 0.0
     psf_px: float = 0.0
+    """As of an :class:`Aperture`."""
     gain: float = 1.0
+    """Factor from irradiance to grey level [-]."""
     offset: float = 0.0
+    """Grey level of the dark [fraction of full scale]."""
     full_well: float = 0.0
+    """Electrons that an irradiance of 1 frees [-]; the fewer, the more noise; 0: none."""
     read_noise: float = 0.0
+    """Standard deviation of the read noise [fraction of full scale]."""
     saturation: float = 1.0
+    """Grey level that is never exceeded [fraction of full scale]."""
     shot_seed: int = 0
     read_seed: int = 0
+    """Of the shot and of the read noise; every image of a set has streams of its own."""
     flicker: float = 0.0
+    """Relative standard deviation of the light from image to image [-], even over an image."""
     flicker_seed: int = 0
+    """Of the flicker, likewise."""
 
     def __post_init__(self) -> None:
         _ = self.aperture  # checks fill factor and point spread

@@ -26,17 +26,28 @@ _BYTES_PER_PIXEL = 250.0
 class ImagingSpec:
     """How a specimen is imaged; InputError if a value is out of its range.
 
-    pixel_size : edge of a pixel [mm/px].
-    margin_px : background kept around the specimen in all its states [px]; the image size follows.
-    shape : (rows, cols) instead of the size that follows from the margin [px].
-    background : intensity where there is no material [fraction of full scale].
-    bits : bits of the camera-like copies, 1 to 16.
-    speckle : the pattern.
-    sensor : what a pixel averages, and its noise; the default shows points without noise.
-    distortion : of the lens: a camera's, or the name of a file; None is a perfect lens. Where there
-        is one, pixels show points, in the images and in their masks as the lens distorts them; the
-        truth stays on the ideal grid, that of the images once undistorted.
-    affine_distortion : False takes the distortion's affine part away
+    Parameters
+    ----------
+    pixel_size
+        Edge of a pixel [mm/px].
+    margin_px
+        Background kept around the specimen in all its states [px]; the image size follows.
+    shape
+        (rows, cols) instead of the size that follows from the margin [px].
+    background
+        Intensity where there is no material [fraction of full scale].
+    bits
+        Bits of the camera-like copies, 1 to 16.
+    speckle
+        The pattern.
+    sensor
+        What a pixel averages, and its noise; the default shows points without noise.
+    distortion
+        Of the lens: a camera's, or the name of a file; None is a perfect lens. Where there is one,
+        pixels show points, in the images and in their masks as the lens distorts them; the truth
+        stays on the ideal grid, that of the images once undistorted.
+    affine_distortion
+        False takes the distortion's affine part away
         (:func:`modeharvest.imaging.distortion.undistort.without_affine`): it is no more than
         another pixel size, unobservable in images of a target whose shifts are unknown.
     """

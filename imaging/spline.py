@@ -285,12 +285,10 @@ PAD = 6
 
 @dataclass(frozen=True, eq=False)
 class SplineImage:
-    """An image that can be evaluated anywhere, by a spline of order 3, 5 or 11.
-
-    ``coefficients`` are (rows + 2 PAD, cols + 2 PAD), float32 or float64.
-    """
+    """An image that can be evaluated anywhere, by a spline of order 3, 5 or 11."""
 
     coefficients: NDArray[Any]
+    """(rows + 2 PAD, cols + 2 PAD), float32 or float64."""
     order: int
 
     def __post_init__(self) -> None:

@@ -98,15 +98,13 @@ class PolynomialDistortion(Distortion):
 
     S(row, col) = sum over i + j <= degree of c_ij T_i(xi) T_j(eta), where xi and eta run from -1 to
     1 from the first to the last column and row. Beyond the image it goes on as it is.
-
-    shape : (rows, cols) of the image [px].
-    coefficients : (2, n) c_ij along the rows' and the columns' index [px], n = (degree + 1)(degree
-        + 2)/2, by rising i + j, in each of them by rising j: 1, xi, eta, T_2(xi), xi eta, T_2(eta),
-        ...
     """
 
     shape: tuple[int, int]
+    """(rows, cols) of the image [px]."""
     coefficients: FloatArray
+    """(2, n) c_ij along the rows' and the columns' index [px], n = (degree + 1)(degree + 2)/2, by
+    rising i + j, in each of them by rising j: 1, xi, eta, T_2(xi), xi eta, T_2(eta), ..."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
@@ -200,16 +198,14 @@ class CameraDistortion(Distortion):
         q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
 
     col' = cx + fx x', row' = cy + fy y'. The ideal image has the same fx, fy, cx, cy.
-
-    fx, fy : focal lengths [px].
-    cx, cy : principal point, column and row [px]; whole numbers are pixel centres, as in OpenCV.
-    k1, k2, p1, p2, k3, k4, k5, k6 : coefficients [-], in OpenCV's order.
     """
 
     fx: float
     fy: float
+    """Focal lengths [px]."""
     cx: float
     cy: float
+    """Principal point, column and row [px]; whole numbers are pixel centres, as in OpenCV."""
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
@@ -218,6 +214,7 @@ class CameraDistortion(Distortion):
     k4: float = 0.0
     k5: float = 0.0
     k6: float = 0.0
+    """Coefficients [-], in OpenCV's order."""
 
     def __post_init__(self) -> None:
         require_finite(np.array(astuple(self)), "camera parameters")
@@ -265,15 +262,13 @@ class CameraDistortion(Distortion):
 
 @dataclass(frozen=True, eq=False)
 class SampledDistortion(Distortion):
-    """S given on a grid, with a bicubic spline through it; beyond, it goes on linearly.
-
-    rows, cols : (n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each.
-    field : (2, n, m) S along the rows' and the columns' index [px].
-    """
+    """S given on a grid, with a bicubic spline through it; beyond, it goes on linearly."""
 
     rows: FloatArray
     cols: FloatArray
+    """(n,) and (m,) positions of the grid's lines [px], ascending, at least 4 of each."""
     field: FloatArray
+    """(2, n, m) S along the rows' and the columns' index [px]."""
 
     def __post_init__(self) -> None:
         for name in ("rows", "cols", "field"):

@@ -22,20 +22,18 @@ from modeharvest.util.errors import InputError, require_within
 
 @dataclass(frozen=True)
 class CalibrationTarget:
-    """A target and its stage's shifts; InputError if a value is out of its range.
-
-    shifts_px : intended shifts (along columns, along rows) [px], one for each photograph.
-    stage_sd_px : standard deviation of the stage's error, of each component of each shift [px].
-    seed : seed of the stage's errors, and of the target's speckle.
-    speckle : the target's pattern, but for its seeds; the specimen's where it is None.
-    """
+    """A target and its stage's shifts; InputError if a value is out of its range."""
 
     shifts_px: tuple[tuple[float, float], ...] = (
         (0.0, 0.0), (100.0, 0.0), (0.0, 100.0), (-250.0, 60.0), (60.0, -250.0), (200.0, 200.0),
     )  # fmt: skip
+    """Intended shifts (along columns, along rows) [px], one for each photograph."""
     stage_sd_px: float = 0.3
+    """Standard deviation of the stage's error, of each component of each shift [px]."""
     seed: int = 0
+    """Of the stage's errors, and of the target's speckle."""
     speckle: SpeckleSpec | None = None
+    """The target's pattern, but for its seeds; the specimen's where it is None."""
 
     def __post_init__(self) -> None:
         if not self.shifts_px or not np.isfinite(self.shifts_px).all():

@@ -31,59 +31,55 @@ _AFFINE_PX = 1e-13  # terms of higher degree that add up to less are rounding
 
 
 class ElementTable(NamedTuple):
-    """A mesh of m elements with k sides each; positions are (row, col).
-
-    polynomials : (m, 2, 9) position relative to the centre [px].
-    absolute : (m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check.
-    sides : (m, k, 2, 3) coefficients of 1, u, u^2 of the position along each side, 0 <= u <= 1,
-        relative to the centre [px].
-    centres : (m, 2) whole pixels.
-    affine : (m,) whether the polynomials have no terms of higher than the first degree.
-    row_from, row_to : (m,) the image rows row_from ... row_to - 1 may hold pixels of it.
-    corners : (k, 2) local coordinates of the corners, where side i begins and side i - 1 ends.
-    bezier : (p, 9) from polynomials to control points.
-    slopes : (len(BEYOND), 9, 2 q) from polynomials to the Bernstein coefficients of the two
-        derivatives over the reference domain enlarged.
-    quarters : (4, 3) sub-elements.
-    middle : both local coordinates of the reference domain's middle.
-    triangular : triangles or quadrilaterals.
-    """
+    """A mesh of m elements with k sides each; positions are (row, col)."""
 
     polynomials: FloatArray
+    """(m, 2, 9) position relative to the centre [px]."""
     absolute: FloatArray
+    """(m, 2, 9) (x, y) [mm]; only the residual is from them, which makes it a check."""
     sides: FloatArray
+    """(m, k, 2, 3) coefficients of 1, u, u^2 of the position along each side, 0 <= u <= 1, relative
+    to the centre [px]."""
     centres: FloatArray
+    """(m, 2) whole pixels."""
     affine: BoolArray
+    """(m,) whether the polynomials have no terms of higher than the first degree."""
     row_from: IntArray
     row_to: IntArray
+    """(m,) the image rows row_from ... row_to - 1 may hold pixels of it."""
     corners: FloatArray
+    """(k, 2) local coordinates of the corners, where side i begins and side i - 1 ends."""
     bezier: FloatArray
+    """(p, 9) from polynomials to control points."""
     slopes: FloatArray
+    """(len(BEYOND), 9, 2 q) from polynomials to the Bernstein coefficients of the two derivatives
+    over the reference domain enlarged."""
     quarters: FloatArray
+    """(4, 3) sub-elements."""
     middle: float
+    """Both local coordinates of the reference domain's middle."""
     triangular: bool
+    """True for triangles, False for quadrilaterals."""
 
 
 class Pixels(NamedTuple):
-    """What is found, over some rows of an image, pixels in the order of memory.
-
-    element : (n,) int32 element, -1 where none is.
-    values : (c, n) fields at the pixels, NaN where no element is.
-    residual : (n,) float32 [px], NaN where no element is; (0,) if it isn't computed, and then
-        ``values`` are left as they were where no element is.
-    first_row : of these pixels in the image.
-    cols : pixels a row.
-    x0, y0, pixel_size : of the image's grid [mm].
-    """
+    """What is found, over some rows of an image, pixels in the order of memory."""
 
     element: NDArray[np.int32]
+    """(n,) int32 element, -1 where none is."""
     values: FloatArray
+    """(c, n) fields at the pixels, NaN where no element is."""
     residual: NDArray[np.float32]
+    """(n,) float32 [px], NaN where no element is; (0,) if it isn't computed, and then ``values``
+    are left as they were where no element is."""
     first_row: int
+    """The first of these rows in the image."""
     cols: int
+    """Pixels a row."""
     x0: float
     y0: float
     pixel_size: float
+    """Of the image's grid [mm]."""
 
 
 def tabulate_elements(

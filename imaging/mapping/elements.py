@@ -36,20 +36,18 @@ _SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0],
 
 @dataclass(frozen=True, eq=False)
 class ReferenceElement:
-    """One element type.
-
-    name : T3, T6, Q4, Q8 or Q9.
-    triangular : whether the reference domain is the triangle (else the square).
-    nodes : (k, 2) local coordinates (xi, eta) of the nodes [-].
-    monomials : which k of the nine monomials the element spans.
-    coefficients : (9, k); column a holds the coefficients of node a's shape function.
-    """
+    """One element type."""
 
     name: str
+    """T3, T6, Q4, Q8 or Q9."""
     triangular: bool
+    """Whether the reference domain is the triangle (else the square)."""
     nodes: FloatArray
+    """(k, 2) local coordinates (xi, eta) of the nodes [-]."""
     monomials: tuple[int, ...]
+    """Which k of the nine monomials the element spans."""
     coefficients: FloatArray = field(init=False)
+    """(9, k); column a holds the coefficients of node a's shape function."""
 
     def __post_init__(self) -> None:
         full = np.zeros((9, len(self.nodes)))

@@ -27,20 +27,18 @@ from modeharvest.util.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Every pixel of an image in terms of a mesh.
-
-    element : (rows, cols) int32 number of the element that covers the pixel centre, -1 where none
-        does. A pixel on a shared edge or node belongs to the element of the lowest number.
-    values : (c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi,
-        eta) there [-]; NaN where no element is.
-    residual_px : (rows, cols) float32 distance of the mapped (xi, eta) from the pixel [px], or NaN.
-    doubly_covered : how many pixels lie inside more than one element: the mesh overlaps there.
-    """
+    """Every pixel of an image in terms of a mesh."""
 
     element: NDArray[np.int32]
+    """(rows, cols) int32 number of the element that covers the pixel centre, -1 where none does. A
+    pixel on a shared edge or node belongs to the element of the lowest number."""
     values: FloatArray
+    """(c, rows, cols) nodal fields at the pixel centres, or the two local coordinates (xi, eta)
+    there [-]; NaN where no element is."""
     residual_px: NDArray[np.float32]
+    """(rows, cols) float32 distance of the mapped (xi, eta) from the pixel [px], or NaN."""
     doubly_covered: int = 0
+    """How many pixels lie inside more than one element: the mesh overlaps there."""
 
     @property
     def mask(self) -> BoolArray:

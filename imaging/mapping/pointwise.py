@@ -39,21 +39,19 @@ _SLACK_PX = 1e-7
 
 
 class _Buckets(NamedTuple):
-    """Which elements may hold the points of a square of the image plane.
-
-    boxes : (m, 4) each element's least row and column, greatest row and column [px].
-    start, members : members[start[b]:start[b + 1]] are the elements of bucket b, ascending.
-    top, left : where the first bucket begins [px].
-    rows, cols : how many buckets.
-    """
+    """Which elements may hold the points of a square of the image plane."""
 
     boxes: FloatArray
+    """(m, 4) each element's least row and column, greatest row and column [px]."""
     start: IntArray
     members: IntArray
+    """members[start[b]:start[b + 1]] are the elements of bucket b, ascending."""
     top: float
     left: float
+    """Where the first bucket begins [px]."""
     rows: int
     cols: int
+    """How many buckets."""
 
 
 def locate_points(

@@ -49,22 +49,20 @@ _MARGIN_PX = 1e-3  # beyond a row's ends; these are found much more closely
 
 
 class Batch(NamedTuple):
-    """Pixels of one element on their way through the kernels: arrays of equal length.
-
-    row, col : relative to the element's centre [px].
-    s, t : local coordinates.
-    off : squared residual in the kernels' own coordinates [px^2].
-    residual : distance in the physical plane, by the nodes' own coordinates [px].
-    where : place among the pixels.
-    """
+    """Pixels of one element on their way through the kernels: arrays of equal length."""
 
     row: FloatArray
     col: FloatArray
+    """Relative to the element's centre [px]."""
     s: FloatArray
     t: FloatArray
+    """Local coordinates."""
     off: FloatArray
+    """Squared residual in the kernels' own coordinates [px^2]."""
     residual: FloatArray
+    """Distance in the physical plane, by the nodes' own coordinates [px]."""
     where: IntArray
+    """Place among the pixels."""
 
 
 @compiled(parallel=True)

@@ -43,10 +43,12 @@ _ORIENTATION = 274
 
 @dataclass(frozen=True, eq=False)
 class StoredImage:
-    """What a file holds: levels (rows, cols), or (rows, cols, 3) colour; what was changed."""
+    """What a file holds."""
 
     levels: NDArray[Any]
+    """(rows, cols), or (rows, cols, 3) colour."""
     notes: tuple[str, ...]
+    """What was changed."""
 
     @property
     def grey(self) -> NDArray[Any]:

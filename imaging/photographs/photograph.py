@@ -34,26 +34,24 @@ _OTHER_SCALE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph in grey.
-
-    path : its file.
-    image : (rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top.
-    bits : bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats.
-    stored_bits : bits of a number in the file: 8, 16, or 32 or 64 for floats.
-    full_scale : the level that counts as white: 2^bits - 1; for floats 1, or the largest if above.
-    saturated, black : (rows, cols) True where a channel is at the level beyond which the camera or
-        the file cuts off, or at 0.
-    notes : sentences about what was changed when it was read.
-    """
+    """A photograph in grey."""
 
     path: Path
+    """Its file."""
     image: FloatImage
+    """(rows, cols) grey levels as counts; of a float file as they are. Row 0 is the top."""
     bits: int
+    """Bits that the grey levels fill: 8, 10, 12, 14 or 16; 0 for floats."""
     stored_bits: int
+    """Bits of a number in the file: 8, 16, or 32 or 64 for floats."""
     full_scale: float
+    """The level that counts as white: 2^bits - 1; for floats 1, or the largest if above."""
     saturated: BoolArray
     black: BoolArray
+    """(rows, cols) True where a channel is at the level beyond which the camera or the file cuts
+    off, or at 0."""
     notes: tuple[str, ...] = ()
+    """Sentences about what was changed when it was read."""
 
     @property
     def shape(self) -> tuple[int, int]:

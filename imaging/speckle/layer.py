@@ -59,18 +59,16 @@ def gaussian_field(
 
 @dataclass(frozen=True)
 class BinaryField:
-    """A thresholded Gaussian field of two phases, and its blur: what a layer looks like.
-
-    cycles_per_px : standard deviation of the Gaussian field's spectral density [cycles/px].
-    blur_px : standard deviation of the Gaussian blur [px].
-    levels : values outside and inside the second phase, before the blur.
-    coverage : share of the area of the second phase [-].
-    """
+    """A thresholded Gaussian field of two phases, and its blur: what a layer looks like."""
 
     cycles_per_px: float
+    """Standard deviation of the Gaussian field's spectral density [cycles/px]."""
     blur_px: float
+    """Standard deviation of the Gaussian blur [px]."""
     levels: tuple[float, float]
+    """Values outside and inside the second phase, before the blur."""
     coverage: float
+    """Share of the area of the second phase [-]."""
     seed: int | tuple[int, ...]
 
     @property

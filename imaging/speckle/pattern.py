@@ -31,20 +31,18 @@ _WIDEST_FREQUENCY = 0.125  # cycles a sample: Nyquist is 4 standard deviations a
 
 @dataclass(frozen=True)
 class Ink:
-    """Dots of ink on the first layer, from a field of their own; InputError if out of range.
-
-    standard_deviation : standard deviation of the Gaussian field's spectral density [cycles/px].
-    blur_px : standard deviation of the Gaussian blur [px].
-    coverage : share of the area under ink [-].
-    darkness : share of the light that ink takes away [-].
-    seed : of the random numbers; streams differ from those of the layer below.
-    """
+    """Dots of ink on the first layer, from a field of their own; InputError if out of range."""
 
     standard_deviation: float = 0.05
+    """Standard deviation of the Gaussian field's spectral density [cycles/px]."""
     blur_px: float = 1.5
+    """Standard deviation of the Gaussian blur [px]."""
     coverage: float = 0.4
+    """Share of the area under ink [-]."""
     darkness: float = 0.8
+    """Share of the light that ink takes away [-]."""
     seed: int = 0
+    """Of the random numbers; streams differ from those of the layer below."""
 
     def __post_init__(self) -> None:
         _require_band_limited(self.standard_deviation, self.blur_px, "ink")
@@ -62,24 +60,22 @@ class Ink:
 
 @dataclass(frozen=True)
 class SpeckleSpec:
-    """What the speckle looks like; InputError if a value is out of its range.
-
-    standard_deviation : of the spectral density of the Gaussian field, in ``unit``.
-    unit : "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi times
-        coarser); the paper leaves it open.
-    blur_px : standard deviation of the Gaussian blur [px], at least 0.75.
-    dark, bright : grey levels of the two phases before the blur, as fractions of full scale [-].
-    seed : seed of the random numbers.
-    ink : a second layer; none by default.
-    """
+    """What the speckle looks like; InputError if a value is out of its range."""
 
     standard_deviation: float = 1.0 / 20.0
+    """Of the spectral density of the Gaussian field, in ``unit``."""
     unit: SpectralUnit = "cycles/px"
+    """Either "cycles/px" (correlation length 3.2 px, mean chord about 10 px) or "rad/px" (2 pi
+    times coarser); the paper leaves it open."""
     blur_px: float = 3.0
+    """Standard deviation of the Gaussian blur [px], at least 0.75."""
     dark: float = 0.2
     bright: float = 1.0
+    """Grey levels of the two phases before the blur, as fractions of full scale [-]."""
     seed: int = 0
+    """Of the random numbers."""
     ink: Ink | None = None
+    """A second layer; none by default."""
 
     def __post_init__(self) -> None:
         if self.unit not in _CYCLES:

@@ -40,17 +40,15 @@ _NOWHERE = -(2**62)
 
 
 class SplineTable(NamedTuple):
-    """A spline in a compiled kernel.
-
-    coefficients : (rows + 7, cols + 7) as those of :class:`PeriodicSpline`.
-    weights : (8, 8) coefficient of t^d in the weight of tap j.
-    finer_row, finer_col : samples a pixel.
-    """
+    """A spline in a compiled kernel."""
 
     coefficients: FloatArray
+    """(rows + 7, cols + 7) as those of :class:`PeriodicSpline`."""
     weights: FloatArray
+    """(8, 8) coefficient of t^d in the weight of tap j."""
     finer_row: float
     finer_col: float
+    """Samples a pixel."""
 
 
 class Workspace(NamedTuple):
@@ -65,17 +63,15 @@ class Workspace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PeriodicSpline:
-    """A pattern that can be evaluated anywhere, fast, to within a proved bound.
-
-    coefficients : (rows + 7, cols + 7) B-spline coefficients over one period of the finer samples;
-        the first ones are repeated after the last.
-    period : (rows, cols) of the period [px].
-    bound : bound of the error anywhere, in units of the pattern.
-    """
+    """A pattern that can be evaluated anywhere, fast, to within a proved bound."""
 
     coefficients: FloatArray
+    """(rows + 7, cols + 7) B-spline coefficients over one period of the finer samples; the first
+    ones are repeated after the last."""
     period: tuple[int, int]
+    """(rows, cols) of the period [px]."""
     bound: float
+    """Of the error anywhere, in units of the pattern."""
 
     @classmethod
     def of(

@@ -50,22 +50,20 @@ _LEAST_SHIFT, _LEAST_BREADTH = 5.0, 0.05
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How to calibrate.
-
-    degrees : of S, total, to compare, ascending, from 2 on, until the criterion rises two times.
-    rotations : whether the target may turn a little in photographs whose shifts are not known.
-    blurs_px : blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
-        correlation and S leave; the last makes the spline's noise independent of where between
-        pixels it samples, which would else draw S towards half pixels.
-    points : about how many points of the target to look at; more lower the standard deviation.
-    order : of the spline that samples the photographs: 5 or 3.
-    """
+    """How to calibrate."""
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
+    """Total degrees of S to compare, ascending, from 2 on, until the criterion rises two times."""
     rotations: bool = True
+    """Whether the target may turn a little in photographs whose shifts are not known."""
     blurs_px: tuple[float, ...] = (12.0, 6.0, 3.0, 0.7)
+    """Blurs of the photographs, from coarse to fine [px]. The first bridges what the binned
+    correlation and S leave; the last makes the spline's noise independent of where between pixels
+    it samples, which would else draw S towards half pixels."""
     points: int = 100_000
+    """About how many points of the target to look at; more lower the standard deviation."""
     order: int = 5
+    """Of the spline that samples the photographs: 5 or 3."""
 
     def __post_init__(self) -> None:
         if not self.degrees or self.degrees[0] < 2 or list(self.degrees) != sorted(self.degrees):

@@ -33,16 +33,15 @@ class Pose:
     """Where the target is in a photograph, and how bright that is.
 
     T(x) = centre + R (x - centre) + shift, a small rotation from the columns' to the rows' axis.
-
-    shift : (row, col) [px].
-    angle : rotation [rad].
-    contrast, brightness : c and o: c I + o is as bright as the first photograph.
     """
 
     shift: tuple[float, float] = (0.0, 0.0)
+    """(row, col) [px]."""
     angle: float = 0.0
+    """Rotation [rad]."""
     contrast: float = 1.0
     brightness: float = 0.0
+    """c and o: c I + o is as bright as the first photograph."""
 
     def stepped(self, step: FloatArray) -> Pose:
         """Add the five unknowns' changes."""
@@ -53,20 +52,18 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photograph and what is unknown of it.
-
-    spline : the photograph.
-    pose : where the target is in it.
-    free : (5,) whether shift (2), rotation, contrast and brightness are unknown.
-    distorted : False if the photograph has no distortion, as one of a known pair.
-    border_px : width of the margin left out [px]: spline and blur know only its mirror image.
-    """
+    """A photograph and what is unknown of it."""
 
     spline: SplineImage
+    """Of the photograph."""
     pose: Pose = field(default_factory=Pose)
+    """Where the target is in it."""
     free: tuple[bool, ...] = (False,) * POSE_UNKNOWNS
+    """(5,) whether shift (2), rotation, contrast and brightness are unknown."""
     distorted: bool = True
+    """False if the photograph has no distortion, as one of a known pair."""
     border_px: float = 4.0
+    """Width of the margin left out [px]: spline and blur know only its mirror image."""
 
 
 def checked_images(images: Sequence[ArrayLike], names: Sequence[str]) -> list[FloatImage]:
@@ -114,28 +111,27 @@ _CHUNK = 4096
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where the least squares ended.
-
-    coefficients : (k,) of the model.
-    poses : one a view.
-    inverse : (K, K) of the normal matrix: of the coefficients, then of each view's unknowns.
-    free : (views, 5) which of the views' unknowns are free, in the order of ``inverse``.
-    sum_of_squares, freedom : scatter about the mean [grey levels squared], its degrees of freedom.
-    matches : (views,) correlation of each photograph with the mean of the others [-].
-    iterations, converged : how many steps, and whether the last one was short enough.
-    condition_number : of the normal matrix, scaled to a unit diagonal.
-    """
+    """Where the least squares ended."""
 
     coefficients: FloatArray
+    """(k,) of the model."""
     poses: tuple[Pose, ...]
+    """One for each view."""
     inverse: FloatArray
+    """(K, K) of the normal matrix: of the coefficients, then of each view's unknowns."""
     free: NDArray[np.bool_]
+    """(views, 5) which of the views' unknowns are free, in the order of ``inverse``."""
     sum_of_squares: float
+    """Scatter about the mean [grey levels squared]."""
     freedom: int
+    """Degrees of freedom of that."""
     matches: FloatArray
+    """(views,) correlation of each photograph with the mean of the others [-]."""
     iterations: int
     converged: bool
+    """Whether the last step was short enough."""
     condition_number: float
+    """Of the normal matrix, scaled to a unit diagonal."""
 
     @property
     def variance(self) -> float:

@@ -32,17 +32,15 @@ class DistortionModel(Protocol):
 
 @dataclass(frozen=True)
 class PolynomialModel:
-    """Polynomials of a total degree, all of their terms or those above the affine ones.
-
-    shape : (rows, cols) of the image [px].
-    degree : total degree, at least 1.
-    fixed : how many terms of each component are zero: 3, the affine ones, where shifts are not
-        known; 1, the constant, where they are; 0 if all are observable.
-    """
+    """Polynomials of a total degree, all of their terms or those above the affine ones."""
 
     shape: tuple[int, int]
+    """(rows, cols) of the image [px]."""
     degree: int
+    """Total degree, at least 1."""
     fixed: int = 3
+    """How many terms of each component are zero: 3, the affine ones, where shifts are not known; 1,
+    the constant, where they are; 0 if all are observable."""
 
     def __post_init__(self) -> None:
         if self.fixed not in (0, 1, 3) or self.terms < 1:
@@ -88,14 +86,12 @@ class PolynomialModel:
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A camera, some parameters of which are unknown.
-
-    camera : the parameters that are known, and where the unknown ones begin.
-    unknown : names among cx, cy and k1 ... p2; not focal lengths: another f with other k is that S.
-    """
+    """A camera, some parameters of which are unknown."""
 
     camera: CameraDistortion
+    """The parameters that are known, and where the unknown ones begin."""
     unknown: tuple[str, ...] = ("cx", "cy", "k1", "k2", "k3")
+    """Names among cx, cy and k1 ... p2; not focal lengths: another f with other k is that S."""
 
     def __post_init__(self) -> None:
         known = tuple(f.name for f in fields(CameraDistortion))[2:]

@@ -58,23 +58,21 @@ def sampled_correlations(
 
 @dataclass(frozen=True, eq=False)
 class LensEstimate:
-    """A lens as a fit found it.
-
-    distortion : what the model made of it.
-    coefficients, covariance : (k,) and (k, k) of the model's unknowns.
-    model : which these are.
-    noise_sd : noise of an image, estimated from the residual [grey levels].
-    matches : (m,) correlation of each image with the mean of the others, without distortion [-].
-    bic : Bayesian information criterion, the lower the better, of one set; NaN if not kept.
-    """
+    """A lens as a fit found it."""
 
     distortion: Distortion
+    """What the model made of it."""
     coefficients: FloatArray
     covariance: FloatArray
+    """(k,) and (k, k) of the model's unknowns."""
     model: DistortionModel
+    """Which these are."""
     noise_sd: float
+    """Noise of an image, estimated from the residual [grey levels]."""
     matches: FloatArray
+    """(m,) correlation of each image with the mean of the others, without distortion [-]."""
     bic: float = math.nan
+    """Bayesian information criterion, the lower the better, of one set; NaN if not kept."""
 
     @classmethod
     def of(cls, model: DistortionModel, fit: Fit, noise: tuple[float, float]) -> LensEstimate:
@@ -103,42 +101,39 @@ class LensEstimate:
 
 @dataclass(frozen=True)
 class DegreeTrial:
-    """What a degree of S gave.
-
-    degree, unknowns : total degree; number of all unknowns.
-    residual_rms : scatter of the photographs about their mean [grey levels].
-    bic : Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N
-        for N values; the degree with 0 is taken [-].
-    change_px : rms per component over the image by which S differs from the degree before [px].
-    sd_px : rms per component over the image of S's standard deviation [px].
-    """
+    """What a degree of S gave."""
 
     degree: int
+    """Total degree."""
     unknowns: int
+    """Number of all unknowns."""
     residual_rms: float
+    """Scatter of the photographs about their mean [grey levels]."""
     bic: float
+    """Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N for
+    N values; the degree with 0 is taken [-]."""
     change_px: float
+    """Rms per component over the image by which S differs from the degree before [px]."""
     sd_px: float
+    """Rms per component over the image of S's standard deviation [px]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration(LensEstimate):
-    """The lens of a set of photographs, without the part of S that can't be observed.
-
-    distortion, model : S; the model's ``fixed`` terms could not be observed and are zero.
-    shifts, shifts_sd : (m, 2) motion of the target since the first photograph, along rows and
-        columns [px], and its standard deviation; 0 where given.
-    angles, angles_sd : (m,) likewise its rotation, from the columns' to the rows' axis [rad].
-    trials : one for each degree.
-    """
+    """The lens of a set of photographs, without the part of S that can't be observed."""
 
     distortion: PolynomialDistortion
     model: PolynomialModel
+    """S; the model's ``fixed`` terms could not be observed and are zero."""
     shifts: FloatArray
     shifts_sd: FloatArray
+    """(m, 2) motion of the target since the first photograph, along rows and columns [px], and its
+    standard deviation; 0 where given."""
     angles: FloatArray
     angles_sd: FloatArray
+    """(m,) likewise its rotation, from the columns' to the rows' axis [rad]."""
     trials: tuple[DegreeTrial, ...]
+    """One for each degree."""
 
 
 def calibration_of(
