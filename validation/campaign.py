@@ -36,16 +36,15 @@ _ATTEMPTS = 3
 
 @dataclass(frozen=True)
 class Campaign:
-    """A function and its cases.
-
-    ``function``: "package.module:name" of a :data:`~modeharvest.validation.workers.CaseFunction`;
-    ``cases``: what to run it with, all with the same keys. What it reads from ``folder``, where the
-    results go, belongs in them by a digest, so that a result is known to be of other inputs.
-    """
+    """A function and its cases."""
 
     function: str
+    """A :data:`~modeharvest.validation.workers.CaseFunction`, as "package.module:name"."""
     cases: Cases
+    """What to run it with, all with the same keys. What it reads from ``folder`` belongs in them by
+    a digest, so that a result is known to be of other inputs."""
     folder: Path
+    """Where the results go."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cases", tuple(dict(case) for case in self.cases))

@@ -17,18 +17,16 @@ _FIT = 3
 
 @dataclass(frozen=True)
 class ImageAmplitude:
-    """One image of a test.
-
-    ``strain``: mean nominal compression of the cellular part, from v0 [-]. The others are rms per
-    component [px]: ``amplitude_px`` of v1 phi1 (of several modes the root of their squares' sum),
-    ``model_error_px``, and ``noise_px``, the standard deviation of v1 phi1 by the images' noise.
-    """
+    """One image of a test; pixels are rms per component."""
 
     name: str
     strain: float
+    """Mean nominal compression of the cellular part, from v0 [-]."""
     amplitude_px: float
+    """Of v1 phi1 [px]; of several modes the root of their squares' sum."""
     model_error_px: float
     noise_px: float
+    """Standard deviation of v1 phi1 by the images' noise [px]."""
 
     @property
     def has_pattern(self) -> bool:
@@ -38,18 +36,18 @@ class ImageAmplitude:
 
 @dataclass(frozen=True)
 class Buckling:
-    """When the pattern appears, in numbers and as ``text``.
-
-    ``before``, ``after``: strains of the last image without a pattern and of the first with one
-    [-], NaN if there is none; ``estimate``: strain at which the pattern begins if its amplitude
-    grows with the square root of the strain beyond, as after a pitchfork bifurcation [-], NaN with
-    fewer than three images that have a pattern.
-    """
+    """When the pattern appears."""
 
     before: float
     after: float
+    """Strains of the last image without a pattern and of the first with one [-]; NaN if there is
+    none."""
     estimate: float
+    """Strain at which the pattern begins if its amplitude grows with the square root of the strain
+    beyond, as after a pitchfork bifurcation [-]; NaN with fewer than three images that have a
+    pattern."""
     text: str
+    """The numbers in words."""
 
 
 def mean_strain(result: Result, cellular: Box) -> tuple[float, float]:

@@ -69,13 +69,10 @@ class ModeSummary:
 class SnapshotSummary:
     """One strain of a virtual experiment; rms is per component.
 
-    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``, which staggered
-    rows have instead of a single mode. The mode's parameters are, of all equivalents, the ones
-    nearest to ``mode_ideal``, the exact pattern with its origin on a solid junction; their standard
-    errors are by noise, and by model error (empty where the mode is not observable). Without free
-    parameters the lists are empty; without gain and offset as unknowns they are None, and so is
-    what belongs to noise for noise-free images. ``noise_sd`` is rms over the material and both
-    images. ``details_px`` has statistics of w, best-fit error, and IDIC - best fit.
+    Lengths of ``pattern_...`` are of v1 phi1, or of the sum over all ``modes``. The mode's
+    parameters are, of all equivalents, the ones nearest to ``mode_ideal``. Without free parameters
+    the lists are empty; without gain and offset as unknowns they are None, and so is what belongs
+    to noise for noise-free images.
     """
 
     nominal_strain: float
@@ -94,6 +91,7 @@ class SnapshotSummary:
     condition_number: float = quantity("condition number", "–")
     residual_correlation: float = quantity("autocorrelation of the residual, 4 to 12 px", "–")
     noise_sd: float | None = quantity("noise of the camera images, rms, share of full scale", "–")
+    """Rms over the material and both images."""
     chi_square: float | None = quantity("χ² of the residual: 1 if that noise and no more", "–")
     gain_min: float | None = quantity("gain between the images, smallest", "–", default=None)
     gain_max: float | None = quantity("… largest", "–", default=None)
@@ -105,11 +103,15 @@ class SnapshotSummary:
     outcome_why: str
     mode: tuple[float, ...] = ()
     mode_ideal: tuple[float, ...] = ()
+    """The exact pattern with its origin on a solid junction."""
     mode_standard_error: tuple[float | None, ...] = ()
     mode_model_error: tuple[float | None, ...] = ()
+    """Standard errors of ``mode``, by noise and by model error; empty where the mode is not
+    observable."""
     mode_deviation_percent: tuple[float, ...] = ()
     mode_best_fit: tuple[float, ...] = ()
     modes: tuple[ModeSummary, ...] = ()
+    """Of staggered rows, which have them instead of a single mode."""
     mode_observable: bool
     worst_determined: tuple[str, ...]
     undetermined: tuple[str, ...]
@@ -117,6 +119,7 @@ class SnapshotSummary:
     residual_verdict: str
     weighting: str
     details_px: Mapping[str, VectorStatistics]
+    """Statistics of w, best-fit error, and IDIC - best fit."""
     pattern_reading: tuple[str, ...]
 
     def plain(self) -> dict[str, Any]:
@@ -133,19 +136,20 @@ class SnapshotSummary:
 class ExperimentSummary:
     """What was run, how it buckles, how far each snapshot's measurement is from the truth.
 
-    ``critical``: how the critical point was found and proven. ``simulation_outcome``: how far the
-    simulation got. Seconds are in ``timings.json``, so that two runs leave the same summary.
+    Seconds are in ``timings.json``, so that two runs leave the same summary.
     """
 
     title: str
     case: Mapping[str, Any]
     critical_strain: float | None
     critical: Mapping[str, Any] | None
+    """How the critical point was found and proven."""
     energy_below_unstable: tuple[BuckledEnergy, ...]
     snapshots: tuple[SnapshotSummary, ...]
     inverse_map_max_residual_px: float
     factorisations: int | None
     simulation_outcome: str | None
+    """How far the simulation got."""
     warnings: tuple[str, ...]
     versions: Mapping[str, str]
     expected: tuple[Expectation, ...] = ()
@@ -207,13 +211,15 @@ def _of_buckled(snapshot: SnapshotSummary, at: str) -> list[Expectation]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredExperiment:
-    """What is to be assessed: ``results`` by nominal strain, ``options`` of the correlation."""
+    """What is to be assessed."""
 
     experiment: Experiment
     options: SquareLatticeOptions
+    """Of the correlation."""
     solution: Solution
     images: ImageSet
     results: Mapping[float, Result]
+    """By nominal strain."""
 
     @property
     def specimen(self) -> Specimen:

@@ -36,18 +36,17 @@ def lengths(field: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class VectorStatistics:
-    """Bias, rms and percentiles of a vector field; ``mean`` and ``rms`` are (x, y).
-
-    The last four are of the vectors' Euclidean length.
-    """
+    """Bias, rms and percentiles of a vector field."""
 
     mean: tuple[float, float]
     rms: tuple[float, float]
+    """Both are (x, y)."""
     rms_per_component: float
     rms_length: float
     median_length: float
     p95_length: float
     max_length: float
+    """The last four are of the vectors' Euclidean length."""
 
     @classmethod
     def of(cls, field: FloatArray, mask: BoolArray, unit: float = 1.0) -> VectorStatistics:
@@ -75,21 +74,20 @@ class ErrorParts:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Truth, measurement and best possible fit of one snapshot, in the reference frame.
-
-    ``strain``: nominal [-]. ``mask``: (rows, cols) True on material of the reference image.
-    ``displacement``: (rows, cols, 2) the truth [mm]; NaN outside the mask. ``best``: the best fit
-    of the result's ansatz to it. ``residual``: (rows, cols) f - g(x + u) [grey levels, fraction of
-    full scale]; NaN where not compared.
-    """
+    """Truth, measurement and best possible fit of one snapshot, in the reference frame."""
 
     strain: float
+    """Nominal [-]."""
     grid: PixelGrid
     mask: BoolArray
+    """(rows, cols) True on material of the reference image."""
     displacement: FloatArray
+    """(rows, cols, 2) the truth [mm]; NaN outside the mask."""
     result: Result
     best: Result
+    """The best fit of the result's ansatz to it."""
     residual: FloatArray
+    """(rows, cols) f - g(x + u) [grey levels, fraction of full scale]; NaN where not compared."""
 
     @cached_property
     def w(self) -> FloatArray:
@@ -152,14 +150,14 @@ def compare(
 
 @dataclass(frozen=True)
 class PatternSize:
-    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px].
-
-    Of the cellular part ``anywhere``, without its outermost ring of cells, in its corner cells.
-    """
+    """Largest length of the pattern, v1 phi1 or the sum of several modes, over material [px]."""
 
     anywhere: float
+    """In the cellular part."""
     inner: float
+    """Without its outermost ring of cells."""
     corners: float
+    """In its corner cells."""
 
 
 def pattern_field(result: Result, grid: PixelGrid | None = None) -> FloatArray:

@@ -142,16 +142,15 @@ LOCAL: dict[str, object] = {
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
-
-    ``count``: of processes on this machine; ``memory``: most that each may take, e.g. "4GiB", one
-    that takes more is stopped and its case fails; ``scheduler``: instead, address of a dask
-    scheduler, "tcp://host:8786", whose workers must see the folder and have this modeharvest.
-    """
+    """Who does the work."""
 
     count: int = 2
+    """Of processes on this machine."""
     memory: str = "4GiB"
+    """Most that each may take, e.g. "4GiB"; one that takes more is stopped and its case fails."""
     scheduler: str | None = None
+    """Instead, address of a dask scheduler, "tcp://host:8786", whose workers must see the folder
+    and have this modeharvest."""
 
     def __post_init__(self) -> None:
         if self.count < 1:

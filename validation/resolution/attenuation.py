@@ -37,15 +37,14 @@ _CHALLENGE_DEGREE = 12
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """T at every column of a field.
-
-    (m,) each, by ascending ``period`` of the wave there [px]: ``share``, T [-], and ``weight``, the
-    sum of the squared true displacements that T rests on [px^2].
-    """
+    """T at every column of a field, (m,) each, by ascending period."""
 
     period: FloatArray
+    """Of the wave there [px]."""
     share: FloatArray
+    """T [-]."""
     weight: FloatArray
+    """Sum of the squared true displacements that T rests on [px^2]."""
 
     @classmethod
     def of(cls, star: Star, field: LocalField, rows: BoolArray) -> Columns:
@@ -64,14 +63,12 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Attenuation:
-    """A field's curve T over the period.
-
-    ``columns``: from all rows within half a period of the centre; ``centre``: from the centre row,
-    or the row next to it, alone.
-    """
+    """A field's curve T over the period."""
 
     columns: Columns
+    """From all rows within half a period of the centre."""
     centre: Columns
+    """From the centre row, or the row next to it, alone."""
 
     @classmethod
     def of(cls, star: Star, field: LocalField) -> Attenuation:

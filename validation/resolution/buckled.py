@@ -45,16 +45,15 @@ _ENOUGH_PX = 1e-6
 
 @dataclass(frozen=True)
 class ResolutionSpec:
-    """What a resolution study measures.
-
-    ``measured``: degrees of v0 and v1 that images are measured with; ``amplitude_px``: of a wave
-    [px]; ``noise``: standard deviation in each image [fraction of full scale].
-    """
+    """What a resolution study measures."""
 
     buckled: BuckledMotion
     measured: tuple[int, ...]
+    """Degrees of v0 and v1 that images are measured with."""
     amplitude_px: float
+    """Of a wave [px]."""
     noise: float
+    """Standard deviation in each image [fraction of full scale]."""
 
     def write(self, folder: Path) -> str:
         """Leave it for workers; returns its name."""
@@ -106,18 +105,18 @@ def _resolution_spec(folder: Path, name: str) -> ResolutionSpec:
 
 @dataclass(frozen=True)
 class AddedWave:
-    """A small wave of v0 or of v1.
-
-    ``part``: "v0", a motion along ``axis`` itself, or "v1", of the pattern's amplitude; ``axis``:
-    0 if the wave runs along x, 1 if along y; ``period`` [mm]; ``phase``: at x = y = 0 [rad];
-    ``amplitude``: of the displacement, for "v1" where the pattern is largest [mm].
-    """
+    """A small wave of v0 or of v1."""
 
     part: str
+    """Either "v0", a motion along ``axis`` itself, or "v1", of the pattern's amplitude."""
     axis: int
+    """0 if the wave runs along x, 1 if along y."""
     period: float
+    """[mm]."""
     phase: float
+    """At x = y = 0 [rad]."""
     amplitude: float
+    """Of the displacement, for "v1" where the pattern is largest [mm]."""
 
     def __post_init__(self) -> None:
         if self.part not in ("v0", "v1") or self.axis not in (0, 1) or not self.period > 0.0:
@@ -131,32 +130,31 @@ class AddedWave:
 
 @dataclass(frozen=True, eq=False)
 class InverseMotion:
-    """Where deformed pixels come from.
-
-    ``near``: (rows, cols) the n pixels that show material, or nearly; ``at``, ``points``: (n, 2)
-    their positions x, and X with X + u(X) = x [mm]; ``slope``: (n, 2, 2) dX/dx, nearly [-].
-    """
+    """Where deformed pixels come from."""
 
     near: BoolArray
+    """(rows, cols) the n pixels that show material, or nearly."""
     at: FloatArray
     points: FloatArray
+    """(n, 2) their positions x, and X with X + u(X) = x [mm]."""
     slope: FloatArray
+    """(n, 2, 2) dX/dx, nearly [-]."""
 
 
 @dataclass(frozen=True)
 class BuckledMotion:
-    """A base motion and how it is imaged and correlated.
-
-    ``how``: options of the correlation, whose degrees are varied; ``pixel_size`` [mm]; ``strain``:
-    nominal compression along x [-]; ``pattern``: v1, the same everywhere [mm].
-    """
+    """A base motion and how it is imaged and correlated."""
 
     specimen: Specimen
     how: SquareLatticeOptions
+    """Options of the correlation, whose degrees are varied."""
     speckle: SpeckleSpec
     pixel_size: float
+    """[mm]."""
     strain: float
+    """Nominal compression along x [-]."""
     pattern: float
+    """v1, the same everywhere [mm]."""
 
     @cached_property
     def grid(self) -> PixelGrid:

@@ -30,11 +30,13 @@ RESOLUTION_FORMAT = "modeharvest-resolution-1"
 
 @dataclass(frozen=True, eq=False)
 class StarGrading:
-    """Codes graded on a star set, the best first; and why others were not."""
+    """Codes graded on a star set."""
 
     star_set: StarSet
     grades: tuple[StarGrade, ...]
+    """The best first."""
     refused: Mapping[str, str] = field(default_factory=dict)
+    """Why other codes were not graded."""
 
     @property
     def notes(self) -> list[str]:
@@ -45,16 +47,14 @@ class StarGrading:
 
 @dataclass(frozen=True)
 class GradeNumbers:
-    """A code's grade in numbers; NaN where not known.
-
-    Beyond what heads the table's columns: ``safe_px``, the period from which on less than 10 % are
-    lost for good, and the shortest and the longest period measured [px].
-    """
+    """A code's grade in numbers, most with what heads the table's columns; NaN where not known."""
 
     name: str
     safe_px: float
+    """Period from which on less than 10 % are lost for good [px]."""
     shortest_px: float
     longest_px: float
+    """The shortest and the longest period measured [px]."""
     finest_px: float = quantity("l10", "px")
     finest_se_px: float = quantity("± l10", "px")
     noise_px: float = quantity("n", "px")
@@ -122,19 +122,19 @@ _TOO_LOUD = 0.7
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """What is measured where nothing moves.
-
-    ``v_px``, ``u_px``: standard deviations along y and x; ``v_se_px``: standard error of ``v_px``,
-    from the scatter between stretches of the image; ``mean_px``: (u, v) along x and y up [px];
-    ``points`` of the field, and the share ``returned`` with a displacement [-].
-    """
+    """What is measured where nothing moves."""
 
     v_px: float
     u_px: float
+    """Standard deviations along y and x [px]."""
     v_se_px: float
+    """Standard error of ``v_px``, from the scatter between stretches of the image [px]."""
     mean_px: tuple[float, float]
+    """(u, v) along x and y up [px]."""
     points: int
+    """Of the field."""
     returned: float
+    """Share of the points with a displacement [-]."""
 
     @classmethod
     def of(cls, star: Star, still: LocalField) -> NoiseFloor:
@@ -160,15 +160,13 @@ class NoiseFloor:
 
 @dataclass(frozen=True, eq=False)
 class StarGrade:
-    """A code's grade.
-
-    ``moved`` and ``still``: the fields of the deformed image and without motion, None if there is
-    none, in px on the star's grid.
-    """
+    """A code's grade."""
 
     star: Star
     moved: LocalField
     still: LocalField | None = None
+    """Fields of the deformed image and without motion, in px on the star's grid; None if there is
+    none."""
     attenuation: Attenuation = field(init=False)
     noise: NoiseFloor | None = field(init=False)
 

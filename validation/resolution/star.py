@@ -55,18 +55,16 @@ _NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Star:
-    """The wave and the image it is in.
-
-    ``rows``, ``cols``: size of the image [px], with an odd number of rows; ``amplitude_px``: A
-    [px]; ``shortest_px``, ``longest_px``: periods at the first and at the last column [px].
-    InputError if the image would nearly fold, or is too small.
-    """
+    """The wave and the image it is in; InputError if that would nearly fold, or is too small."""
 
     rows: int = 501
     cols: int = 4000
+    """Size of the image [px], with an odd number of rows."""
     amplitude_px: float = 0.5
+    """A [px]."""
     shortest_px: float = 10.0
     longest_px: float = 300.0
+    """Periods at the first and at the last column [px]."""
 
     def __post_init__(self) -> None:
         size = f"{self.rows} x {self.cols} px"
@@ -161,18 +159,17 @@ _ROLES = {
 
 @dataclass(frozen=True)
 class StarSpec:
-    """What a star set holds.
-
-    ``noise``: standard deviations of the white noise in the camera's images [fraction of full
-    scale], 0.01 is 2.6 of 255 levels; ``bits``: of these images; ``seed``: of the noise.
-    InputError if a level comes twice or is out of range.
-    """
+    """What a star set holds; InputError if a level comes twice or is out of range."""
 
     star: Star = field(default_factory=Star)
     speckle: SpeckleSpec = field(default_factory=fine_speckle)
     noise: tuple[float, ...] = (0.01,)
+    """Standard deviations of the white noise in the camera's images [fraction of full scale]; 0.01
+    is 2.6 of 255 levels."""
     bits: int = 8
+    """Of these images."""
     seed: int = 0
+    """Of the noise."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", tuple(self.noise))

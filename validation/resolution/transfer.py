@@ -110,13 +110,11 @@ def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high
 
 @dataclass(frozen=True, eq=False)
 class PartFields:
-    """Changes of the displacement in the parts of an ansatz, at points.
-
-    ``v0`` and ``v1``: (points, 2, waves) of v0 and of v1 phi1 [mm].
-    """
+    """Changes of the displacement in the parts of an ansatz, at points."""
 
     v0: FloatArray
     v1: FloatArray
+    """(points, 2, waves) of v0 and of v1 phi1 [mm]."""
 
     @property
     def whole(self) -> FloatArray:
@@ -145,15 +143,14 @@ def wave_share(found: FloatArray, wave: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TransferCurves:
-    """Transfers T over the period.
-
-    ``periods``: (n,) [mm], ascending. ``own``, ``whole``: by (part, axis, degree) the share (n,) of
-    a wave that is found in its own part, and in the whole displacement, over both phases [-].
-    """
+    """Transfers T over the period."""
 
     periods: FloatArray
+    """(n,) ascending [mm]."""
     own: dict[Kind, FloatArray]
     whole: dict[Kind, FloatArray]
+    """By (part, axis, degree) the share (n,) of a wave that is found in its own part, and in the
+    whole displacement, over both phases [-]."""
 
     @classmethod
     def of(cls, spec: ResolutionSpec, degrees: Sequence[int], progress: Progress = silent) -> Self:
@@ -212,17 +209,17 @@ def _over_phases(found: FloatArray, wave: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Passband:
-    """What becomes of a pattern of another wavelength than the mode's.
-
-    (n,) each [-]: ``stretch``, its wave numbers over the mode's; the shares that are found of a
-    small one ``added`` to the mode, a filter, and of the pattern ``itself`` where it is that long,
-    by a fit that starts from the mode; ``wavelength_error``, relative, of that fit.
-    """
+    """What becomes of a pattern of another wavelength than the mode's; (n,) each [-]."""
 
     stretch: FloatArray
+    """Its wave numbers over the mode's."""
     added: FloatArray
+    """Share that is found of a small one added to the mode: a filter."""
     itself: FloatArray
+    """Share that is found of the pattern itself where it is that long, by a fit that starts from
+    the mode."""
     wavelength_error: FloatArray
+    """Relative, of that fit."""
 
     @classmethod
     def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
@@ -279,19 +276,18 @@ def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float,
 
 @dataclass(frozen=True)
 class DegreeResolution:
-    """A degree of v0 and v1, and what it costs.
-
-    ``finest_px``: l10 of waves by part and axis, as "v0 x" [px]. ``floor_px``: n by quantity,
-    :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]. ``indicator_px2``: n l10 by part,
-    l10 the geometric mean of both axes'; ``fixed_px2``: that of v1 phi1 without motion [px^2].
-    """
+    """A degree of v0 and v1, and what it costs."""
 
     degree: int
     unknowns: int
     finest_px: Mapping[str, float]
+    """l10 of waves by part and axis, as "v0 x" [px]."""
     floor_px: Mapping[str, float]
+    """n by quantity, :data:`QUANTITIES`, by 2 s^2 M^-1 of the buckled images [px]."""
     indicator_px2: Mapping[str, float]
+    """n l10 by part, l10 the geometric mean of both axes' [px^2]."""
     fixed_px2: float
+    """That of v1 phi1 without motion [px^2]."""
 
 
 def degrees_of(

@@ -79,17 +79,16 @@ SECRETS = ("solution*", "truth*", "images*", "stages.json", "*.h5", "*.vtu", "*.
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkTruth:
-    """The truth behind a set of images.
-
-    ``grid``: the images' pixels; ``specimen``: the undeformed geometry; ``strains``: nominal, of
-    the deformed images [-].
-    """
+    """The truth behind a set of images."""
 
     folder: Path
     id: str
     grid: PixelGrid
+    """The images' pixels."""
     specimen: Specimen
+    """The undeformed geometry."""
     strains: tuple[float, ...]
+    """Nominal, of the deformed images [-]."""
 
     @classmethod
     def read(cls, folder: Path | str) -> BenchmarkTruth:

@@ -61,23 +61,23 @@ _COMPONENTS = (
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One way to take a field's numbers, relative to how they were declared.
-
-    ``turn``, ``shift``: (2, 2), (2,) [mm], positions are ``turn @ (x, y) + shift``; ``origin``:
-    (2,) moves them further [mm]; ``components``: (2, 2), displacements are ``components @ (u, v)``;
-    ``scale``: and multiplied by that, because of a wrong unit [-]; ``deformed``: whether the
-    positions are those of the deformed image; ``changes``: how many things were declared wrongly;
-    ``text``: what they are, empty for the field as declared.
-    """
+    """One way to take a field's numbers, relative to how they were declared."""
 
     turn: FloatArray
     shift: FloatArray
+    """(2, 2) [-] and (2,) [mm]: positions are ``turn @ (x, y) + shift``."""
     origin: FloatArray
+    """(2,) moves them further [mm]."""
     components: FloatArray
+    """(2, 2): displacements are ``scale * components @ (u, v)``."""
     scale: float = 1.0
+    """Because of a wrong unit [-]."""
     deformed: bool = False
+    """Whether the positions are those of the deformed image."""
     changes: int = 0
+    """How many things were declared wrongly."""
     text: tuple[str, ...] = ()
+    """What they are; empty for the field as declared."""
 
     def with_change(self, count: int, text: str, **values: Any) -> Reading:
         """The same with another change, or several that go together."""

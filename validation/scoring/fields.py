@@ -37,11 +37,11 @@ _ID = re.compile(r"benchmark\W+([0-9a-f]{12})\b", re.IGNORECASE)
 class Declared:
     """What is declared of a field's file that it doesn't state itself.
 
-    ``name``: of the code, for tables, the file's by default; the rest as for
-    :func:`modeharvest.idic.local.field.read_field`.
+    What has no words is as for :func:`modeharvest.idic.local.field.read_field`.
     """
 
     name: str | None = None
+    """Of the code, for tables; the file's by default."""
     units: str | None = None
     displacement_units: str | None = None
     y_axis: str | None = None

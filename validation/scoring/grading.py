@@ -28,22 +28,23 @@ EVERYWHERE, COMMON = "everywhere", "where all measure"
 
 @dataclass(frozen=True, eq=False)
 class Grading:
-    """Graded fields of one deformed image.
-
-    ``strain`` of the image [-]; ``edge_px``: width of the region of edges [px]; ``labels``: (rows,
-    cols) of :func:`~modeharvest.validation.scoring.score.regions`; ``scores``, the best first;
-    ``spectra`` of each field's error, by its name; ``remarks``: probable errors in what was
-    declared; ``refused``: by its file's name, why a field was not graded.
-    """
+    """Graded fields of one deformed image."""
 
     truth: BenchmarkTruth
     strain: float
+    """Of the image [-]."""
     edge_px: int
+    """Width of the region of edges [px]."""
     labels: NDArray[np.int8]
+    """(rows, cols) of :func:`~modeharvest.validation.scoring.score.regions`."""
     scores: tuple[Score, ...]
+    """The best first."""
     spectra: Mapping[str, ErrorSpectrum | None]
+    """Of each field's error, by its name."""
     remarks: tuple[str, ...] = ()
+    """Probable errors in what was declared."""
     refused: Mapping[str, str] = field(default_factory=dict)
+    """Why a field was not graded, by its file's name."""
 
     @cached_property
     def _covered(self) -> BoolArray:

@@ -70,18 +70,19 @@ ENOUGH_COVERED = 0.5
 
 @dataclass(frozen=True)
 class RegionScore:
-    """The error over one region.
-
-    Of its ``points`` the share ``returned`` has a displacement [-]; ``bias_px``: (x, y) mean error;
-    ``rms_px`` is per component, ``percentiles_px`` at :data:`PERCENTILES` and ``max_px`` of length.
-    """
+    """The error over one region."""
 
     points: int
     returned: float
+    """Share of the points with a displacement [-]."""
     bias_px: tuple[float, float]
+    """Mean error (x, y) [px]."""
     rms_px: float
+    """Per component [px]."""
     percentiles_px: tuple[float, ...]
+    """Of the error's length, at :data:`PERCENTILES` [px]."""
     max_px: float
+    """Of the error's length [px]."""
 
     @classmethod
     def of(cls, error_px: FloatArray, valid: BoolArray) -> RegionScore:
@@ -101,27 +102,29 @@ class RegionScore:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """A graded field.
-
-    ``everywhere``: over all points on material; ``by_region``: for each of :data:`REGIONS`.
-    ``off_material``: points beside it, not graded. ``spacing_px`` of the points on material; of
-    those at the same place, one counts [px]. ``reach_px``: how far from a point its displacement
-    stands for others, one spacing if that is within the reach given [px]. ``near``: (rows, cols)
-    True on material within reach of a valid point; ``covered``: share of the material that is near
-    [-]. ``x``, ``y`` (m,) [mm] and ``error_px`` (m, 2) of the valid points on material.
-    """
+    """A graded field."""
 
     source: str
     everywhere: RegionScore
+    """Over all points on material."""
     by_region: Mapping[str, RegionScore]
+    """For each of :data:`REGIONS`."""
     off_material: int
+    """Points beside the material, not graded."""
     spacing_px: float
+    """Of the points on material; of those at the same place, one counts [px]."""
     reach_px: float
+    """How far from a point its displacement stands for others, one spacing if that is within the
+    reach given [px]."""
     near: BoolArray
+    """(rows, cols) True on material within reach of a valid point."""
     covered: float
+    """Share of the material that is near [-]."""
     x: FloatArray
     y: FloatArray
+    """(m,) of the valid points on material [mm]."""
     error_px: FloatArray
+    """(m, 2) at these points [px]."""
 
     def over(self, where: BoolArray, grid: PixelGrid) -> RegionScore:
         """The error of the measured points in a part of the image (rows, cols)."""
@@ -246,16 +249,15 @@ _MOST = 1000  # points along the longer side: finer fields are averaged to so ma
 
 @dataclass(frozen=True, eq=False)
 class ErrorSpectrum:
-    """The error by wavelength, in thirds of an octave.
-
-    ``wavelength_px``: (m,) middle of each band, ascending. ``rms_px``: (m,) rms error per component
-    in it; the squares of all and of ``affine_px``, the rms of the error's affine part, add up to
-    that of the whole error, but for what bins of a fine field average out.
-    """
+    """The error by wavelength, in thirds of an octave."""
 
     wavelength_px: FloatArray
+    """(m,) middle of each band, ascending [px]."""
     rms_px: FloatArray
+    """(m,) rms error per component in it [px]. The squares of all and of ``affine_px`` add up to
+    that of the whole error, but for what bins of a fine field average out."""
     affine_px: float
+    """Rms of the error's affine part [px]."""
 
 
 def error_spectrum(graded: Score, grid: PixelGrid) -> ErrorSpectrum | None:

@@ -42,17 +42,7 @@ Key = tuple[str, str, float, float, int]
 
 @dataclass(frozen=True)
 class ModeRow:
-    """The pattern of one lattice under one loading; labels and units head the table's columns.
-
-    ``kind``, what is critical first: "pattern" for (π, π) alone, "long waves", "other waves";
-    "none" up to the largest load asked for; "path ends" where no equilibrium was found beyond.
-    ``pattern``: first load at which (π, π) is critical, whatever else is; NaN if none in the
-    range. ``state``: load of the state that the mode belongs to, the first critical one or the
-    last. ``overlap``: |<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both
-    of unit norm over the material. ``captured``: share of its energy that the automatically found
-    family holds. ``likeness``: |<mode, mode of the reference>| of unit norm, on the same mesh but
-    for its size; NaN where it wasn't compared.
-    """
+    """The pattern of one lattice under one loading; labels and units head the table's columns."""
 
     material: str = quantity("material")
     loading: str = quantity("loading")
@@ -62,13 +52,22 @@ class ModeRow:
     found: bool = quantity("critical point found")
     first: float = quantity("first critical or largest strain", "-")
     kind: str = quantity("first critical waves")
+    """What is critical first: "pattern" for (π, π) alone, "long waves", "other waves"; "none" up to
+    the largest load asked for; "path ends" where no equilibrium was found beyond."""
     pattern: float = quantity("critical strain of (pi, pi)", "-")
+    """First load at which (π, π) is critical, whatever else is; NaN if none in the range."""
     state: float = quantity("strain of the mode's state", "-")
+    """Load of the state that the mode belongs to, the first critical one or the last."""
     eigenvalue: float = quantity("eigenvalue at (pi, pi)", "N/mm^4")
     overlap: float = quantity("overlap with Eq. (mode)", "-")
+    """|<numerical, analytic>| of the lowest mode at (π, π) with Eq. (mode), both of unit norm over
+    the material."""
     captured: float = quantity("energy captured by the automatic family", "-")
+    """Share of the mode's energy that the automatically found family holds."""
     waves: int = quantity("its waves", "-")
     likeness: float = quantity("overlap with the reference's mode", "-", default=math.nan)
+    """|<mode, mode of the reference>| of unit norm, on the same mesh but for its size; NaN where it
+    wasn't compared."""
 
     @property
     def key(self) -> Key:
@@ -143,18 +142,18 @@ STUDIED_MATERIALS: dict[str, Material] = {
 
 @dataclass(frozen=True)
 class StudiedLattice:
-    """One lattice of the study: everything that its pattern may depend on.
-
-    ``ratio``: hole diameter over cell size d/l [-]; ``pitch``: unit cell size l [mm];
-    ``divisions``: elements along l; ``largest``: load up to which to look for critical points [-].
-    """
+    """One lattice of the study: everything that its pattern may depend on."""
 
     ratio: float = 0.7895
+    """Hole diameter over cell size d/l [-]."""
     loading: MacroLoading = LOADINGS["uniaxial"]
     material: Material = STUDIED_MATERIALS["two-term I1"]
     pitch: float = 1.9
+    """Unit cell size l [mm]."""
     divisions: int = 13
+    """Elements along l."""
     largest: float = 0.28
+    """Load up to which to look for critical points [-]."""
 
     def __post_init__(self) -> None:
         if not (0 < self.ratio < 1 and self.pitch > 0 and self.divisions > 0 and self.largest > 0):
@@ -170,17 +169,15 @@ class StudiedLattice:
 
 @dataclass(frozen=True, eq=False)
 class PatternMode:
-    """The numerical pattern of a lattice beside the analytic one.
-
-    ``mesh``: the primitive cell, about a hole, a quarter of the pattern's own [mm]. ``shape``,
-    ``analytic``: (n, 2) both modes at its nodes [-]; the mean of their squared length over the
-    material is 1, their product is positive.
-    """
+    """The numerical pattern of a lattice beside the analytic one."""
 
     row: ModeRow
     mesh: Mesh
+    """The primitive cell, about a hole, a quarter of the pattern's own [mm]."""
     shape: FloatArray
     analytic: FloatArray
+    """(n, 2) both modes at its nodes [-]; the mean of their squared length over the material is 1,
+    their product is positive."""
 
 
 def name_of(thing: object, names: Mapping[str, object]) -> str:
@@ -292,34 +289,31 @@ Work = Callable[[StudiedLattice], ModeRow]
 
 @dataclass(frozen=True)
 class FirstModeLimit:
-    """Between which d/l the pattern stops being what buckles first under one loading.
-
-    ``without``, ``with_``: the largest d/l found at which something else comes first, and the
-    smallest at which the pattern does [-]; ``instead``: what comes first below, as in
-    :class:`ModeRow`.
-    """
+    """Between which d/l the pattern stops being what buckles first under one loading."""
 
     loading: str
     without: float
     with_: float
+    """The largest d/l found at which something else comes first, and the smallest at which the
+    pattern does [-]."""
     instead: str
+    """What comes first below, as in :class:`ModeRow`."""
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeModeStudy:
-    """What came out of a study.
-
-    ``ratios``: every hole size under every loading. ``scales``, ``materials``: the reference at
-    other l, and of other materials; each ``likeness`` is the overlap with the reference's own mode.
-    ``limits``: where the pattern stops being the first mode, for each loading where it does.
-    ``overlays``: modes to be laid over the analytic one.
-    """
+    """What came out of a study."""
 
     ratios: tuple[ModeRow, ...] = ()
+    """Every hole size under every loading."""
     scales: tuple[ModeRow, ...] = ()
     materials: tuple[ModeRow, ...] = ()
+    """The reference at other l, and of other materials; each ``likeness`` is the overlap with the
+    reference's own mode."""
     limits: tuple[FirstModeLimit, ...] = ()
+    """Where the pattern stops being the first mode, for each loading where it does."""
     overlays: tuple[PatternMode, ...] = ()
+    """Modes to be laid over the analytic one."""
 
 
 class ModeTable:

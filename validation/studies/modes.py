@@ -44,18 +44,19 @@ BASE = "base"
 
 @dataclass(frozen=True, eq=False)
 class SpecimenPatterns:
-    """A specimen's fields at the nodes of its mesh.
-
-    ``mesh`` of T6 and ``pitch`` [mm]; (n, 2) each [mm]: ``displacement`` and ``found``, the truth
-    and the measurement; ``pattern``, the truth less the best fit's v₀; ``found_pattern``, v₁φ₁.
-    """
+    """A specimen's fields at the nodes of its mesh, (n, 2) each [mm]."""
 
     mesh: Mesh
+    """Of T6 [mm]."""
     pitch: float
+    """Unit cell size l [mm]."""
     displacement: FloatArray
     found: FloatArray
+    """The truth and the measurement."""
     pattern: FloatArray
+    """The truth less the best fit's v₀."""
     found_pattern: FloatArray
+    """v₁φ₁."""
 
     @classmethod
     def read(cls, folder: Path) -> SpecimenPatterns:
@@ -111,29 +112,31 @@ def one_specimen(case: Case, folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SpecimenRow:
-    """What a specimen is, and how it and the infinite lattice of its cells buckle.
-
-    ``ratio``, ``smallest_ratio``, ``largest_ratio``: d/l in the middle, and of its holes.
-    ``first``: what it buckles into, "pattern", "other" or "none"; ``pattern_share``: the pattern's
-    share of that mode. ``critical_strain``, ``strain``: where it buckles and where it is measured,
-    with ``unstable_pivots`` negative pivots. ``lattice_...``: ``kind``, ``pattern``, ``overlap`` of
-    the lattice's :class:`~modeharvest.validation.studies.lattice.ModeRow`, and its a₁.
-    """
+    """What a specimen is, and how it and the infinite lattice of its cells buckle."""
 
     ratio: float
+    """d/l in the middle [-]."""
     smallest_ratio: float
     largest_ratio: float
+    """Of its holes [-]."""
     pitch_mm: float
     first: str
+    """What it buckles into, "pattern", "other" or "none"."""
     pattern_share: float
+    """The pattern's share of that mode [-]."""
     critical_strain: float
     strain: float
+    """Where it buckles and where it is measured [-]."""
     unstable_pivots: int | None
+    """Negative pivots where it is measured."""
     simulation: str
     lattice_first: str
     lattice_pattern_strain: float
     lattice_overlap_ideal: float
+    """``kind``, ``pattern`` and ``overlap`` of the lattice's
+    :class:`~modeharvest.validation.studies.lattice.ModeRow`."""
     lattice_a1: float
+    """a₁ of the lattice."""
 
     @classmethod
     def of(cls, described: SpecimenSpec, solution: Solution, lattice: LatticeMode) -> SpecimenRow:
@@ -207,15 +210,14 @@ def likeness(first: FloatArray, second: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ModesAnalysis:
-    """What the table of measured modes says, each part with a row for each specimen.
-
-    ``ran``: all that succeeded. ``measured``: those whose pattern was there to be measured and was:
-    converged on a pattern. ``sizes``: of these the base and those that differ from it in d/l only.
-    """
+    """What the table of measured modes says, each part with a row for each specimen."""
 
     ran: pd.DataFrame
+    """All that succeeded."""
     measured: pd.DataFrame
+    """Those whose pattern was there to be measured and was: converged on a pattern."""
     sizes: pd.DataFrame
+    """Of these the base and those that differ from it in d/l only."""
 
     @classmethod
     def of(cls, table: pd.DataFrame) -> ModesAnalysis:
@@ -231,14 +233,7 @@ class ModesAnalysis:
 class MeasuredModesStudy(Study[ModesAnalysis]):
     """Measure the mode on specimens that differ from a base in one respect each.
 
-    Each is compressed until its pattern is as strong as the base's, in shares of l.
-
-    ``strain``: of the base's deformed image [-]; it has to be buckled there. ``ratios``: other d/l
-    [-]; ``pitches``: other l [mm], with which specimen, elements and pixels are scaled;
-    ``materials``: names among ``STUDIED_MATERIALS``; ``gradings_x``,
-    ``gradings_y``: change of the diameter along and across the load [mm/mm], each by itself, d at
-    the specimen's centre stays. ``largest``: strain up to which to look for where a specimen
-    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell. InputError if a
+    Each is compressed until its pattern is as strong as the base's, in shares of l. InputError if a
     value is out of its range, or comes twice.
     """
 
@@ -253,13 +248,21 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
     measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
+    """Of the base's deformed image [-]; it has to be buckled there."""
     ratios: tuple[float, ...] = (0.6, 0.65, 0.7, 0.75, 0.85, 0.9, 0.95)
+    """Other d/l [-]."""
     pitches: tuple[float, ...] = (0.95,)
+    """Other l [mm], with which specimen, elements and pixels are scaled."""
     materials: tuple[str, ...] = ("two-term I1", "Ogden m=3, nu=0.40", "Ogden m=3, nu=0.49")
+    """Names among ``STUDIED_MATERIALS``."""
     gradings_x: tuple[float, ...] = (0.02,)
     gradings_y: tuple[float, ...] = (0.02,)
+    """Change of the diameter along and across the load [mm/mm], each by itself; d at the specimen's
+    centre stays."""
     largest: float = 0.28
+    """Strain up to which to look for where a specimen buckles [-]."""
     divisions: int = 13
+    """Elements along l of the infinite lattice's cell."""
 
     def __post_init__(self) -> None:
         if not all(0.0 < r < 1.0 for r in self.ratios):

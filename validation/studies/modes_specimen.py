@@ -98,21 +98,20 @@ class PatternCells:
 
 @dataclass(frozen=True)
 class SpecimenSpec:
-    """All that a specimen's measurement depends on.
-
-    ``experiment``: the compression test, its strains still to be found; ``amplitude``: of the
-    pattern that it is compressed to [mm]; ``largest``: strain up to which to look for where it
-    buckles [-]; ``divisions``: elements along l of the infinite lattice's cell; ``given``: the
-    digest of a solution that is there already, "" to simulate.
-    """
+    """All that a specimen's measurement depends on."""
 
     experiment: Experiment
+    """The compression test, its strains still to be found."""
     amplitude: float
+    """Of the pattern that it is compressed to [mm]."""
     largest: float
+    """Strain up to which to look for where it buckles [-]."""
     divisions: int
+    """Elements along l of the infinite lattice's cell."""
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     given: str = ""
+    """The digest of a solution that is there already, "" to simulate."""
 
     @classmethod
     def of(cls, spec: ImagePairSpec, strain: float, largest: float, divisions: int) -> SpecimenSpec:
@@ -208,12 +207,10 @@ class SpecimenSpec:
 
 @dataclass(frozen=True, eq=False)
 class LatticeMode:
-    """The numerical (π, π) mode of an infinite lattice, and what a mode family makes of it.
-
-    ``mode``: on one cell about a hole, beside Eq. (mode) with its ideal parameters.
-    """
+    """The numerical (π, π) mode of an infinite lattice, and what a mode family makes of it."""
 
     mode: PatternMode
+    """On one cell about a hole, beside Eq. (mode) with its ideal parameters."""
 
     @classmethod
     def of(cls, specimen: Specimen, material: Material, divisions: int) -> LatticeMode:

@@ -106,35 +106,32 @@ def _noise_of_g(like: FloatImage, seed: int) -> Iterator[tuple[FloatImage, Float
 
 @dataclass(frozen=True)
 class Realisation:
-    """What a correlation finds under one realisation of the noise, or without it.
-
-    ``predicted``: standard deviations of the unknowns by the result's own covariance given the
-    noise, followed by those of the fields at :class:`FieldPoints`; without noise a list of them for
-    each of ``COVARIANCES``, for noise of 1. ``curvature_sd_mm``: rms over the points of u's
-    standard deviation by the covariance H⁻¹, without noise and in the first realisation of each
-    level. The rest are errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
-    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`.
-    """
+    """What a correlation finds under one realisation of the noise, or without it."""
 
     outcome: str
     iterations: int
     residual: float
     unknowns: list[float]
     predicted: list[float] | list[list[float]]
+    """Standard deviations of the unknowns by the result's own covariance given the noise, followed
+    by those of the fields at :class:`FieldPoints`; without noise a list of them for each of
+    ``COVARIANCES``, for noise of 1."""
     curvature_sd_mm: float | None = None
+    """Rms over the points of u's standard deviation by the covariance H⁻¹, without noise and in the
+    first realisation of each level [mm]."""
     w_px: float | None = None
     model_error_px: float | None = None
     measurement_error_px: float | None = None
     v1_percent: float | None = None
+    """Errors without noise: :class:`~modeharvest.validation.truth.ErrorParts` and
+    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
 
 
 @dataclass(frozen=True)
 class NoiseStudy(Study[NoiseAnalysis]):
     """Correlate a pair of images under white noise in both, many times.
 
-    ``levels``: standard deviations of the noise [fraction of full scale], 0.01 is 2.6 of 255
-    levels; ``pairs``: of realisations n and -n at each level; ``seed``: of the noise. InputError if
-    a value is out of its range, or a level comes twice.
+    InputError if a value is out of its range, or a level comes twice.
     """
 
     question: ClassVar[str] = (
@@ -147,8 +144,11 @@ class NoiseStudy(Study[NoiseAnalysis]):
 
     strain: float = 0.128
     levels: tuple[float, ...] = (0.002, 0.005, 0.01, 0.02)
+    """Standard deviations of the noise [fraction of full scale]; 0.01 is 2.6 of 255 levels."""
     pairs: int = 25
+    """Of realisations n and -n at each level."""
     seed: int = 0
+    """Of the noise."""
 
     def __post_init__(self) -> None:
         if not self.levels or not all(0.0 < level < 1.0 for level in self.levels):

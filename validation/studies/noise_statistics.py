@@ -27,16 +27,14 @@ PER_CELL = 3
 
 @dataclass(frozen=True, eq=False)
 class FieldPoints:
-    """Where fields are compared.
-
-    ``rows``, ``cols``: axes of the coarse grid, in pixels of the images; ``inside``: (rows, cols)
-    True on material; the points are those, row by row.
-    """
+    """Where fields are compared."""
 
     pair: VirtualImagePair
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
+    """Axes of the coarse grid, in pixels of the images."""
     inside: BoolArray
+    """(rows, cols) True on material; the points are those, row by row."""
 
     @classmethod
     def of(cls, pair: VirtualImagePair) -> FieldPoints:
@@ -104,16 +102,15 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class PairedErrors:
-    """Errors under noise.
-
-    ``errors``, ``predicted``: (pairs, 2, ...) of the realisations n and -n, in any unit, and the
-    standard deviations that each result predicts; ``bound``: (...) the least there can be, 0 for
-    what no noise moves (a mode outside its support), which does not count.
-    """
+    """Errors under noise."""
 
     errors: FloatArray
     predicted: FloatArray
+    """(pairs, 2, ...) of the realisations n and -n, in any unit, and the standard deviations that
+    each result predicts."""
     bound: FloatArray
+    """(...) the least there can be, 0 for what no noise moves (a mode outside its support), which
+    does not count."""
 
     @property
     def counted(self) -> BoolArray:
@@ -281,19 +278,17 @@ def against_bound(levels: Levels, noise_free: NoiseFreeCase, cause: str) -> Leve
 
 @dataclass(frozen=True, eq=False)
 class NoiseAnalysis:
-    """What the table of a noise study says.
-
-    ``by_bound``, ``by_least``, ``by_hessian``: errors against the Cramér–Rao bound, the least of
-    least squares and the Hessian-corrected covariance. ``curvature_sd_ratio``: by level, u's
-    standard deviation by noisy images' own curvature over that of exact ones.
-    """
+    """What the table of a noise study says."""
 
     points: FieldPoints
     noise_free: NoiseFreeCase
     by_bound: Levels
     by_least: Levels
     by_hessian: Levels
+    """Errors against the Cramér–Rao bound, the least of least squares and the Hessian-corrected
+    covariance."""
     curvature_sd_ratio: Mapping[float, float]
+    """By level, u's standard deviation by noisy images' own curvature over that of exact ones."""
     not_converged: int
 
     @classmethod

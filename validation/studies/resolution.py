@@ -149,20 +149,19 @@ def _rms(values: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ResolutionAnalysis:
-    """What the table of a resolution study says.
-
-    ``rows``: the table of what succeeded. ``chosen``: of all degrees the one nearest to the
-    specification's own v0 degree. ``curves``, ``passband``: best fits of waves, and of patterns of
-    other wavelengths. ``subset_px2``: the indicator of an affine subset [px^2].
-    """
+    """What the table of a resolution study says."""
 
     spec: ResolutionSpec
     rows: pd.DataFrame
+    """The table of what succeeded."""
     degrees: list[DegreeResolution]
     chosen: DegreeResolution
+    """Of all degrees the one nearest to the specification's own v0 degree."""
     curves: TransferCurves
     passband: Passband
+    """Best fits of waves, and of patterns of other wavelengths."""
     subset_px2: float
+    """The indicator of an affine subset [px^2]."""
 
     @classmethod
     def of(cls, table: pd.DataFrame, spec: ResolutionSpec, curves: TransferCurves) -> Self:
@@ -178,10 +177,7 @@ class ResolutionAnalysis:
 class ResolutionStudy(Study[ResolutionAnalysis]):
     """Small waves of v0 and v1 on a buckled specimen, and noise, against the polynomial degree.
 
-    ``strain``: nominal compression of the base motion [-]; ``pattern``: its v1, the same everywhere
-    [mm]; ``degrees``: of v0 and v1 alike; ``measured``: those of them that images are measured
-    with, too; ``amplitude_px``: of a wave [px]; ``noise``: standard deviation in each image, of
-    full scale, with so many ``realisations``, from ``seed``. InputError for values out of range.
+    InputError for values out of range.
     """
 
     question: ClassVar[str] = (
@@ -194,12 +190,19 @@ class ResolutionStudy(Study[ResolutionAnalysis]):
     measures_mode: ClassVar[bool] = True
 
     strain: float = 0.128
+    """Nominal compression of the base motion [-]."""
     pattern: float = 7.0
+    """Its v1, the same everywhere [mm]."""
     degrees: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
+    """Of v0 and v1 alike."""
     measured: tuple[int, ...] = (3, 5, 7)
+    """Those of them that images are measured with, too."""
     amplitude_px: float = 0.5
+    """Of a wave [px]."""
     noise: float = 0.01
+    """Standard deviation in each image [fraction of full scale]."""
     realisations: int = 20
+    """Of the noise, from ``seed``."""
     seed: int = 0
 
     def __post_init__(self) -> None:

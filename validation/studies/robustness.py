@@ -52,7 +52,8 @@ class Proportion:
 class GuessStatistics:
     """The paper's numbers and more, of the initial guesses within one radius.
 
-    ``distance``: rms length of the difference of two displacements, from the reference solution's.
+    Distances are the rms length of the difference of two displacements, from the reference
+    solution's.
     """
 
     initial_guesses: int
@@ -94,43 +95,39 @@ class GuessStatistics:
 class RobustnessAnalysis:
     """What the table of a robustness study says.
 
-    ``moved``, ``at_radius``, ``strains``: rows with perturbed mode parameters, all and of the
-    paper's radius, and with a wrong strain; ``same``: whether each is the reference solution's
-    minimum. ``statistics``: of the paper's radius.
+    In its rows ``same`` is whether each is the reference solution's minimum.
     """
 
     moved: pd.DataFrame
     at_radius: pd.DataFrame
+    """Rows with perturbed mode parameters, all and of the paper's radius."""
     strains: pd.DataFrame
+    """Rows with a wrong strain."""
     statistics: GuessStatistics
+    """Of the paper's radius."""
 
 
 @dataclass(frozen=True)
 class GuessResult:
-    """Where an initial guess leads.
-
-    ``distance_px``, ``start_distance_px``: rms length of the difference of the solution's, or the
-    guess', displacement from the reference solution's. ``epsilon_percent``: the paper's, the
-    difference of their norms. The others are of the correlation.
-    """
+    """Where an initial guess leads."""
 
     distance_px: float
     start_distance_px: float
+    """Rms length of the difference of the solution's, or the guess', displacement from the
+    reference solution's [px]."""
     epsilon_percent: float
+    """The paper's, the difference of their norms."""
     outcome: str
     iterations: int
     all_iterations: int
     residual: float
+    """These four are of the correlation."""
 
 
 @dataclass(frozen=True)
 class RobustnessStudy(Study[RobustnessAnalysis]):
     """Correlate from many initial guesses.
 
-    ``initial_guesses`` have mode parameters perturbed by up to ``radius``: a share of 1 for a1 ...
-    a5, of the unit cell for the two phases; the paper: 100 and 0.1. ``radii``, ``per_radius``: for
-    the basin, further radii, and guesses for each. ``strain_errors``: and guesses whose v0 has the
-    applied strain times 1 plus these, with the mode as it is. ``seed``: of the perturbations.
     InputError if a value is out of its range, or one comes twice.
     """
 
@@ -145,11 +142,16 @@ class RobustnessStudy(Study[RobustnessAnalysis]):
 
     strain: float = 0.128
     initial_guesses: int = 100
+    """With mode parameters perturbed by up to ``radius``; 100 in the paper."""
     radius: float = 0.1
+    """A share of 1 for a1 ... a5, of the unit cell for the two phases [-]; 0.1 in the paper."""
     radii: tuple[float, ...] = (0.05, 0.15, 0.2, 0.3, 0.4, 0.5)
     per_radius: int = 20
+    """Further radii, for the basin, and how many guesses of each."""
     strain_errors: tuple[float, ...] = (-1.0, -0.5, -0.2, 0.2, 0.5)
+    """Further guesses: their v0 has the applied strain times 1 plus these, the mode as it is."""
     seed: int = 0
+    """Of the perturbations."""
 
     def __post_init__(self) -> None:
         counts_fit = 1 <= self.initial_guesses <= self.most and 0 <= self.per_radius <= self.most

@@ -42,15 +42,13 @@ from modeharvest.validation.workers import Cases, leave
 
 @dataclass(frozen=True)
 class StudySetting:
-    """How a pair is imaged and correlated.
-
-    ``taper``: width over which the mode fades out beside the cellular part [unit cells]; InputError
-    if it has none.
-    """
+    """How a pair is imaged and correlated."""
 
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     taper: float = 0.5
+    """Width over which the mode fades out beside the cellular part [unit cells]; InputError if it
+    has none."""
 
     def __post_init__(self) -> None:
         if not self.taper > 0.0:
@@ -59,16 +57,14 @@ class StudySetting:
 
 @dataclass(frozen=True, eq=False)
 class ImagePairSpec:
-    """A simulated experiment, and how it is imaged and correlated unless a study says otherwise.
-
-    ``load`` gives the exact displacements; called when they are first needed, because simulating
-    them takes long and not every study asks for them.
-    """
+    """A simulated experiment, and how it is imaged and correlated unless a study says otherwise."""
 
     experiment: Experiment
     imaging: ImagingSpec
     correlation: SquareLatticeOptions
     load: Callable[[], Solution]
+    """Gives the exact displacements; called when they are first needed, because simulating them
+    takes long and not every study asks for them."""
 
     def __post_init__(self) -> None:
         if (specimen := self.experiment.specimen).is_staggered:
@@ -112,10 +108,11 @@ class ImagePairSpec:
 
 @dataclass(frozen=True, eq=False)
 class VirtualImagePair:
-    """A pair of images and how to correlate it; ``strain``: of the deformed image [-]."""
+    """A pair of images and how to correlate it."""
 
     images: ImageSet
     strain: float
+    """Of the deformed image [-]."""
     specimen: Specimen
     setting: StudySetting
 

@@ -38,19 +38,19 @@ def changed(thing: T, options: str, **values: Any) -> T:
 
 @dataclass(frozen=True)
 class VariedFactor:
-    """Something to change.
-
-    ``label``: what it is called, with its unit; ``levels``: what it is changed to unless a study
-    says otherwise, for a choice the numbers of its ``names``; ``change``: the setting with that
-    level; ``base``: the level that a setting has, None where it has none (float images have no
-    bits); ``whole``: whether levels are whole numbers.
-    """
+    """Something to change."""
 
     label: str
+    """What it is called, with its unit."""
     levels: tuple[float, ...]
+    """What it is changed to unless a study says otherwise, for a choice the numbers of its
+    ``names``."""
     change: Callable[[StudySetting, Any], StudySetting]
+    """The setting with that level."""
     base: Callable[[StudySetting], float | None]
+    """The level that a setting has, None where it has none (float images have no bits)."""
     whole: bool = False
+    """Whether levels are whole numbers."""
     names: tuple[str, ...] = ()
 
     @classmethod
@@ -163,47 +163,43 @@ ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 
 @dataclass(frozen=True)
 class LevelResult:
-    """What is found at one level of a factor.
-
-    The errors are :class:`~modeharvest.validation.truth.ErrorParts` and
-    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`. ``pixels_per_ligament``: its width
-    [px]; ``at_junctions_mm``: displacement (x, y) at the junctions between holes [mm].
-    """
+    """What is found at one level of a factor."""
 
     w_px: float
     model_error_px: float
     measurement_error_px: float
     v1_percent: float
+    """The errors: :class:`~modeharvest.validation.truth.ErrorParts` and
+    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
     outcome: str
     iterations: int
     residual: float
     pixels: int
     pixels_per_ligament: float
+    """Its width [px]."""
     at_junctions_mm: list[float]
+    """Displacement (x, y) at the junctions between holes [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SystematicAnalysis:
-    """What the table of a systematic study says.
-
-    ``rows``: what succeeded, errors in pixels of the base; ``moved``: rms per component of a
-    measurement's difference from the base's on the same speckle [px]. ``base``: mean errors over
-    the speckles. ``bases``: each factor's level at the base; None where it has none.
-    """
+    """What the table of a systematic study says."""
 
     rows: pd.DataFrame
+    """What succeeded, errors in pixels of the base; ``moved``: rms per component of a measurement's
+    difference from the base's on the same speckle [px]."""
     base: Mapping[str, float]
+    """Mean errors over the speckles."""
     bases: Mapping[str, float | None]
+    """Each factor's level at the base; None where it has none."""
 
 
 @dataclass(frozen=True)
 class SystematicStudy(Study[SystematicAnalysis]):
     """Correlate exact images with one option changed at a time.
 
-    ``factors``: what to change, names in :data:`FACTORS`; ``levels``: other levels than a factor's
-    own, by its name, numbers or names where it has names; ``seeds_of_speckle``: every level is
-    measured on each of these speckles. InputError if a factor is unknown, levels are given for one
-    that is not asked for, or a value comes twice.
+    InputError if a factor is unknown, levels are given for one that is not asked for, or a value
+    comes twice.
     """
 
     question: ClassVar[str] = (
@@ -215,8 +211,11 @@ class SystematicStudy(Study[SystematicAnalysis]):
 
     strain: float = 0.128
     factors: tuple[str, ...] = tuple(FACTORS)
+    """What to change, names in :data:`FACTORS`."""
     levels: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
+    """Other levels than a factor's own, by its name, numbers or names where it has names."""
     seeds_of_speckle: tuple[int, ...] = (0, 1)
+    """Every level is measured on each of these speckles."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.factors, *self.levels) if name not in FACTORS]
