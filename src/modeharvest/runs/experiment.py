@@ -49,12 +49,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Run(StagedRun[Case]):
-    """The stages of a virtual experiment.
-
-    ``solution``: a solution file to use instead of simulating.
-    """
+    """The stages of a virtual experiment."""
 
     solution: Path | None = None
+    """A solution file to use instead of simulating."""
 
     def fem(self) -> Solution:
         """Simulate the test; leaves ``solution.h5`` and, for ParaView, ``solution.vtu``.

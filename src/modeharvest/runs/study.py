@@ -108,15 +108,13 @@ FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
 
 @dataclass(frozen=True)
 class StudyAnalysis(StagedRun[StudyCase]):
-    """A study's work: images, cases run by ``workers``, findings.
-
-    ``solution``: a solution file to use instead of simulating; ``command``: what makes the report
-    again.
-    """
+    """A study's work: images, cases run by ``workers``, findings."""
 
     workers: Workers = field(default_factory=Workers)
     solution: Path | None = None
+    """A solution file to use instead of simulating."""
     command: str = "modeharvest study STUDY --out DIR"
+    """What makes the report again."""
 
     def subject(self) -> ImagePairSpec:
         """What is measured."""

@@ -180,12 +180,10 @@ _WAVES, _AMPLITUDE, _LENS_PX = 0.01, 0.03, 0.05
 
 @dataclass(frozen=True)
 class TwinRun(StagedRun[Case]):
-    """The stages of a twin: those of its simulation, its photographs, those of their harvest.
-
-    ``solution``: a solution file to use instead of simulating.
-    """
+    """The stages of a twin: those of its simulation, its photographs, those of their harvest."""
 
     solution: Path | None = None
+    """A solution file to use instead of simulating."""
 
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``."""

@@ -14,19 +14,14 @@ _ROUNDING = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class ScaledEigen:
-    """A positive semi-definite matrix, scaled to a unit diagonal and decomposed.
-
-    Parameters
-    ----------
-    scale
-        (n,): square root of the diagonal; infinite where that is nothing but rounding.
-    values, vectors
-        Eigenvalues, ascending, and eigenvectors of the scaled matrix.
-    """
+    """A positive semi-definite matrix, scaled to a unit diagonal and decomposed."""
 
     scale: FloatArray
+    """(n,): square root of the diagonal; infinite where that is nothing but rounding."""
     values: FloatArray
+    """Ascending."""
     vectors: FloatArray
+    """Of the scaled matrix, as are the eigenvalues."""
 
     @classmethod
     def of(cls, matrix: FloatArray) -> ScaledEigen:

@@ -170,13 +170,11 @@ class Stages:
 
 @dataclass(frozen=True)
 class StagedRun(Generic[C]):
-    """What every kind of run has: a case, a folder, stages that are not done twice.
-
-    The folder is made if it does not exist; ``progress`` listens.
-    """
+    """What every kind of run has: a case, a folder, stages that are not done twice."""
 
     case: C
     folder: Path
+    """Made if it does not exist."""
     progress: Progress = silent
 
     @property

@@ -105,19 +105,18 @@ class HexagonalLattice(_HoleStacking):
 
 @dataclass(frozen=True)
 class ChiralLattice:
-    """Rings joined by ligaments that touch them tangentially: ``fem.lattice.cells.chiral``.
-
-    Lengths in mm; ``pitch``: distance of neighbouring rings' centres. Radius and thicknesses are
-    shares of it that ``chiral`` states unless given. ``handedness``: "clockwise" or
-    "counterclockwise".
-    """
+    """Rings joined by ligaments that touch them tangentially: ``fem.lattice.cells.chiral``."""
 
     pitch: float = 1.9
+    """Distance of neighbouring rings' centres [mm]."""
     mesh_size: float = 0.1
+    """[mm]."""
     ring_radius: float | None = None
     ring_thickness: float | None = None
     ligament_thickness: float | None = None
+    """Shares of ``pitch``; those that ``chiral`` states unless given [-]."""
     handedness: str = "clockwise"
+    """Either "clockwise" or "counterclockwise"."""
     ligaments = 4
     symmetry = "square"
 
@@ -144,24 +143,16 @@ class HexachiralLattice(ChiralLattice):
 
 @dataclass(frozen=True)
 class FileLattice:
-    """A cell of one's own, a mesh or a geometry: ``fem.lattice.files.read_cell``.
-
-    Parameters
-    ----------
-    path
-        The file [mm]; in a case file, relative to that file's folder.
-    pitch
-        Unit cell size l [mm], the unit of wave lengths in spectra.
-    vectors
-        a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material.
-    mesh_size
-        Largest edge length [mm] where a geometry is meshed; None for a mesh.
-    """
+    """A cell of one's own, a mesh or a geometry: ``fem.lattice.files.read_cell``."""
 
     path: str
+    """The file [mm]; in a case file, relative to that file's folder."""
     pitch: float
+    """Unit cell size l [mm], the unit of wave lengths in spectra."""
     vectors: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """a1 and a2 as rows [mm]; None: a rectangle along x and y, as large as the material."""
     mesh_size: float | None = None
+    """Largest edge length [mm] where a geometry is meshed; None for a mesh."""
     symmetry = "oblique"
 
     def cell(self) -> UnitCell:
@@ -186,26 +177,18 @@ _ZERO = ((0.0, 0.0), (0.0, 0.0))
 
 @dataclass(frozen=True)
 class Loading:
-    """How the lattice is loaded; the load e multiplies all rates.
-
-    Parameters
-    ----------
-    kind
-        Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
-        lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or
-        "prescribed": the rates below.
-    axis
-        "x" or "y", of the first two kinds.
-    gradient
-        dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only.
-    stress
-        dP̄/de [MPa] where the gradient is free; of "prescribed" only.
-    """
+    """How the lattice is loaded; the load e multiplies all rates."""
 
     kind: Literal["uniaxial", "uniaxial-strain", "equibiaxial", "shear", "prescribed"] = "uniaxial"
+    """Compression by the nominal strain e: "uniaxial" (lateral side free), "uniaxial-strain" (no
+    lateral strain) or "equibiaxial". "shear": planes y = const slide along x by e. Or "prescribed":
+    the rates below."""
     axis: Literal["x", "y"] = "x"
+    """Either "x" or "y", of the first two kinds."""
     gradient: tuple[tuple[Component, Component], tuple[Component, Component]] | None = None
+    """dF̄/de, row by row [-], "free" where the mean stress is prescribed; of "prescribed" only."""
     stress: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """dP̄/de [MPa] where the gradient is free; of "prescribed" only."""
 
     def __post_init__(self) -> None:
         if self.kind == "prescribed" and self.gradient is None:
@@ -269,28 +252,19 @@ class SearchPlan:
 
 @dataclass(frozen=True)
 class DispersionPlan:
-    """Where the lowest eigenvalues are computed.
-
-    Parameters
-    ----------
-    loads
-        [-]; none: 0, half the critical load and the critical one.
-    points
-        Wave vectors along the path.
-    bands
-        Eigenvalues at each of them.
-    map_divisions
-        Of each axis of the zone's map; even, 0 for no map.
-    corners
-        Names and phases [π rad] of the path, such as [["Γ", [0, 0]], ["M", [1, 1]]]; none: a tour
-        that suits the lattice and its load.
-    """
+    """Where the lowest eigenvalues are computed."""
 
     loads: tuple[float, ...] = ()
+    """[-]; none: 0, half the critical load and the critical one."""
     points: int = 60
+    """Wave vectors along the path."""
     bands: int = 3
+    """Eigenvalues at each of them."""
     map_divisions: int = 24
+    """Of each axis of the zone's map; even, 0 for no map."""
     corners: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """Names and phases [π rad] of the path, such as [["Γ", [0, 0]], ["M", [1, 1]]]; none: a tour
+    that suits the lattice and its load."""
 
     def __post_init__(self) -> None:
         _check_loads("dispersion", self.loads)
@@ -322,28 +296,20 @@ class DispersionPlan:
 
 @dataclass(frozen=True)
 class ModesPlan:
-    """Which modes are computed, and which buckled branches are followed.
-
-    Parameters
-    ----------
-    waves
-        Phases [π rad], such as [[1, 1]]; none: those that are critical first.
-    load
-        At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
-        another load than the critical one have no branches.
-    combinations
-        One row of coefficients for each branch to follow, as many as there are modes, in the order
-        of their waves (critical ones by phases, the largest first); none: each mode alone, and
-        the sum of all.
-    branch_loads
-        At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
-        critical load.
-    """
+    """Which modes are computed, and which buckled branches are followed."""
 
     waves: tuple[tuple[float, ...], ...] = ()
+    """Phases [π rad], such as [[1, 1]]; none: those that are critical first."""
     load: float = 0.0
+    """At which the tangent is taken [-]; 0: the critical load, or the largest reached. Modes of
+    another load than the critical one have no branches."""
     combinations: tuple[tuple[float, ...], ...] = ()
+    """One row of coefficients for each branch to follow, as many as there are modes, in the order
+    of their waves (critical ones by phases, the largest first); none: each mode alone, and the sum
+    of all."""
     branch_loads: tuple[float, ...] = ()
+    """At which states of the branches are kept [-]; none: 1.02, 1.1, 1.25 and 1.5 times the
+    critical load."""
 
     def __post_init__(self) -> None:
         _ = self.phases
@@ -378,20 +344,22 @@ class StudyPlan:
 
     Every ratio under every loading, and where the pattern stops being what buckles first; other
     unit cell sizes and materials at the case's own d/l and loading.
-
-    ``ratios``, and ``overlays`` of the pictures of numerical over analytic mode: d/l [-];
-    ``loadings``: "uniaxial", "uniaxial-strain", "equibiaxial"; ``pitches``: other l [mm];
-    ``materials``: names among ``STUDIED_MATERIALS``; ``divisions``: elements along l; ``largest``:
-    load up to which to look for critical points [-].
     """
 
     ratios: tuple[float, ...] = RATIOS
+    """d/l [-]."""
     loadings: tuple[str, ...] = _LOADINGS
+    """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
     pitches: tuple[float, ...] = ()
+    """Other l [mm]."""
     materials: tuple[str, ...] = ()
+    """Names among ``STUDIED_MATERIALS``."""
     overlays: tuple[float, ...] = SHOWN
+    """d/l of the pictures of numerical over analytic mode [-]."""
     divisions: int = 13
+    """Elements along l."""
     largest: float = 0.28
+    """Load up to which to look for critical points [-]."""
 
     def __post_init__(self) -> None:
         for names, known in ((self.loadings, _LOADINGS), (self.materials, STUDIED_MATERIALS)):

@@ -34,9 +34,10 @@ from modeharvest.util.stages import StagedRun, exclusive, stage_key
 
 @dataclass(frozen=True)
 class LatticeAnalysis(StagedRun[LatticeCase]):
-    """The stages of a lattice's analysis; ``source``: name or file of the case, for the report."""
+    """The stages of a lattice's analysis."""
 
     source: str = "CASE"
+    """Name or file of the case, for the report."""
 
     def critical(self) -> CriticalPoint:
         """Find the first critical load over all wave vectors; leaves ``critical.json``.

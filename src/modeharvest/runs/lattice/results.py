@@ -48,23 +48,24 @@ DRAWN_AMPLITUDE = 0.16
 
 @dataclass(frozen=True)
 class CriticalPoint:
-    """Where a lattice first becomes unstable: what ``LatticeCritical`` says, in plain values.
-
-    ``loading`` by its name; ``load`` [-], the largest at which it was found stable where nothing
-    is critical; ``earlier``: waves of the grid that are unstable already below; ``value``: lowest
-    filling · λ / k² at ``load`` [MPa]; ``angle``: direction of long waves [rad], None for others.
-    """
+    """Where a lattice first becomes unstable: what ``LatticeCritical`` says, in plain values."""
 
     loading: str
+    """Its name."""
     load: float
+    """The critical one [-]; the largest at which the lattice was found stable where nothing is
+    critical."""
     found: bool
     outcome: str
     waves: tuple[Wave, ...] = ()
     below: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
     earlier: tuple[Wave, ...] = ()
+    """Waves of the grid that are unstable already below."""
     value: float = 0.0
+    """Lowest filling · λ / k² at ``load`` [MPa]."""
     angle: float | None = None
+    """Direction of long waves [rad], None for others."""
 
     @classmethod
     def of(cls, loading: str, found: LatticeCritical) -> CriticalPoint:
@@ -79,36 +80,25 @@ class CriticalPoint:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PeriodicField:
-    """A periodic field of a lattice, in which a mode family is looked for.
-
-    Parameters
-    ----------
-    file
-        Name of the family's file, such as "family_mode_1.json".
-    name
-        What it is, such as "φ₁ at 8.8 %".
-    mesh, lattice
-        One period [mm], with its (2, 2) lattice vectors as rows [mm].
-    displacement, gradient
-        (n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2).
-    info
-        Load and whatever else must be known of it, as plain JSON values.
-    stable
-        Whether it is an equilibrium that is stable for fields with the period of its cell; None
-        for a mode, which is no equilibrium.
-    energy
-        Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches.
-    """
+    """A periodic field of a lattice, in which a mode family is looked for."""
 
     file: str
+    """Name of the family's file, such as "family_mode_1.json"."""
     name: str
+    """What it is, such as "φ₁ at 8.8 %"."""
     mesh: Mesh
     lattice: FloatArray
+    """One period [mm], with its (2, 2) lattice vectors as rows [mm]."""
     displacement: FloatArray
     gradient: FloatArray
+    """(n, 2) of the nodes, [-] for modes, [mm] otherwise; its affine part has this F̄ (2, 2)."""
     info: Mapping[str, Any]
+    """Load and whatever else must be known of it, as plain JSON values."""
     stable: bool | None = None
+    """Whether it is an equilibrium that is stable for fields with the period of its cell; None for
+    a mode, which is no equilibrium."""
     energy: float = 0.0
+    """Beyond that of the unbuckled lattice, per area [MPa]; 0 for all but branches."""
 
     @classmethod
     def of_mode(cls, modes: ModeSet, k: int, info: Mapping[str, Any]) -> PeriodicField:
@@ -170,29 +160,29 @@ class FoundPattern(PeriodicField):
 
 @dataclass(frozen=True, eq=False)
 class LatticeRun:
-    """All that the report of a lattice shows; what is None or empty is left out.
-
-    ``case``: what was run, as plain values, and ``command``: what makes this page again. ``mesh``,
-    ``lattice``: the primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]; ``pitch``:
-    unit cell size l [mm]. ``patterns`` are on the cell of ``modes``, the first is shown at the top.
-    ``exports``: files beside the page, and what each holds; ``notes``: what a reader should know
-    before trusting the numbers.
-    """
+    """All that the report of a lattice shows; what is None or empty is left out."""
 
     title: str
     case: Mapping[str, Any]
+    """What was run, as plain values."""
     command: str
+    """What makes this page again."""
     mesh: Mesh
     lattice: FloatArray
+    """The primitive cell [mm] and its (2, 2) lattice vectors as rows [mm]."""
     pitch: float
+    """Unit cell size l [mm]."""
     critical: CriticalPoint | None = None
     dispersion: Dispersion | None = None
     modes: ModeSet | None = None
     branches: Sequence[Branch] = ()
     patterns: Sequence[FoundPattern] = ()
+    """On the cell of ``modes``; the first is shown at the top."""
     study: LatticeModeStudy | None = None
     exports: Mapping[str, str] = field(default_factory=dict)
+    """Files beside the page, and what each holds."""
     notes: Sequence[str] = ()
+    """What a reader should know before trusting the numbers."""
     versions: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -25,33 +25,23 @@ LOCAL = ("none", "pyvale", "file")
 
 @dataclass(frozen=True)
 class LocalTable:
-    """The local DIC that spectra and w are taken from.
-
-    Parameters
-    ----------
-    code
-        "none", "pyvale" (an optional package), or "file" for fields of any other code.
-    files
-        A field for each deformed image (CSV, NPZ, HDF5, MAT), with code = "file".
-    unit, y_axis
-        "px" or "mm", and "down" or "up", of the files; "auto" as their columns' names say.
-    first_pixel
-        What the files call the first pixel, 0 or 1.
-    columns
-        Names, or numbers from 1, of the files' columns for "x", "y", "u" and "v", where they
-        can't be known by themselves.
-    subset, step
-        Edge of the subsets, odd, and their distance [px], with code = "pyvale".
-    """
+    """The local DIC that spectra and w are taken from."""
 
     code: str = "none"
+    """Either "none", "pyvale" (an optional package), or "file" for fields of any other code."""
     files: tuple[str, ...] = ()
+    """A field for each deformed image (CSV, NPZ, HDF5, MAT), with code = "file"."""
     unit: str = "auto"
     y_axis: str = "auto"
+    """Of the files, "px" or "mm", and "down" or "up"; "auto" as their columns' names say."""
     first_pixel: int = 0
+    """What the files call the first pixel, 0 or 1."""
     columns: dict[str, str | int] = field(default_factory=dict)
+    """Names, or numbers from 1, of the files' columns for "x", "y", "u" and "v", where they can't
+    be known by themselves."""
     subset: int = 21
     step: int = 5
+    """Edge of the subsets, odd, and their distance [px], with code = "pyvale"."""
 
     def __post_init__(self) -> None:
         if self.code not in LOCAL:
@@ -72,13 +62,11 @@ class LocalTable:
 
 @dataclass(frozen=True)
 class NoiseTable:
-    """The camera's noise.
-
-    ``sd``: standard deviation [grey levels of the files]; measured from the repeated exposures
-    otherwise, or estimated from the reference image.
-    """
+    """The camera's noise."""
 
     sd: float | None = None
+    """Standard deviation [grey levels of the files]; measured from the repeated exposures
+    otherwise, or estimated from the reference image."""
 
     def __post_init__(self) -> None:
         if self.sd is not None:
@@ -87,16 +75,15 @@ class NoiseTable:
 
 @dataclass(frozen=True)
 class Images:
-    """The photographs.
-
-    ``reference``: file of the undeformed state; ``deformed``: files of the deformed states in the
-    order of the test, a name may have wildcards, whose matches come in the order of their names;
-    ``repeats``: further exposures of the undeformed state, from which the noise is measured.
-    """
+    """The photographs."""
 
     reference: str = ""
+    """File of the undeformed state."""
     deformed: tuple[str, ...] = ()
+    """Files of the deformed states in the order of the test; a name may have wildcards, whose
+    matches come in the order of their names."""
     repeats: tuple[str, ...] = ()
+    """Further exposures of the undeformed state, from which the noise is measured."""
 
     def __post_init__(self) -> None:
         if not self.reference or not self.deformed:
@@ -108,14 +95,14 @@ class Images:
 
 @dataclass(frozen=True)
 class ImageScale:
-    """How large a pixel is: ``pixel_size`` [mm/px], or a line in the reference and its length [mm].
-
-    ``line``: its two ends ((column, row), (column, row)) [px].
-    """
+    """How large a pixel is: its size, or a line in the reference and its length."""
 
     pixel_size: float | None = None
+    """[mm/px]."""
     line: Corners | None = None
+    """Its two ends ((column, row), (column, row)) [px]."""
     length: float | None = None
+    """Of the line [mm]."""
 
     def __post_init__(self) -> None:
         drawn = self.line is not None and self.length is not None
@@ -140,22 +127,15 @@ class ImageScale:
 
 @dataclass(frozen=True)
 class DistortionTable:
-    """The optics' distortion S of the paper's Eq. (r2); none by default.
-
-    Parameters
-    ----------
-    file
-        A distortion written by modeharvest (JSON).
-    calibration
-        Images of a speckle target under rigid shifts of the stage; the first is the one that
-        the others are shifted from. Names may have wildcards.
-    shifts
-        Their shifts (along columns, along rows) [px], if known, the first (0, 0) included.
-    """
+    """The optics' distortion S of the paper's Eq. (r2); none by default."""
 
     file: str = ""
+    """A distortion written by modeharvest (JSON)."""
     calibration: tuple[str, ...] = ()
+    """Images of a speckle target under rigid shifts of the stage; the first is the one that the
+    others are shifted from. Names may have wildcards."""
     shifts: Corners = ()
+    """Their shifts (along columns, along rows) [px], if known, the first (0, 0) included."""
 
     def __post_init__(self) -> None:
         if self.file and self.calibration:

@@ -58,9 +58,10 @@ class _StartRecord:
 
 @dataclass(frozen=True)
 class HarvestRun(StagedRun[PhotographCase]):
-    """The stages of a harvest; ``source``: the case's file, for the report."""
+    """The stages of a harvest."""
 
     source: str = "EXPERIMENT.toml"
+    """The case's file, for the report."""
 
     @cached_property
     def optics(self) -> Optics:

@@ -50,21 +50,21 @@ PREPARED_FILE = "prepared.json"
 
 @dataclass(frozen=True, eq=False)
 class PreparedPhotographs:
-    """Photographs on the ideal grid, in a folder; read when asked for.
-
-    ``folder`` has the files, and the rest in its ``prepared.json``: ``names`` of the deformed
-    images that can be used, in the order of the test; ``skipped``: the name of each file that can't
-    be used, and why; ``grid``: the ideal pixels, the physical origin is the middle of the image;
-    ``full_scale``: the camera's largest grey level; ``notes``: what was done to the photographs.
-    """
+    """Photographs on the ideal grid, in a folder; read when asked for."""
 
     folder: Path
+    """Has the files, and the rest in its ``prepared.json``."""
     names: tuple[str, ...]
+    """Of the deformed images that can be used, in the order of the test."""
     skipped: tuple[tuple[str, str], ...]
+    """The name of each file that can't be used, and why."""
     noise: CameraNoise
     grid: PixelGrid
+    """The ideal pixels; the physical origin is the middle of the image."""
     full_scale: float
+    """The camera's largest grey level."""
     notes: tuple[str, ...] = ()
+    """What was done to the photographs."""
 
     @classmethod
     def read(cls, folder: Path) -> PreparedPhotographs:
@@ -164,10 +164,12 @@ def require_inputs(case: PhotographCase) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """The lens: S of the paper's Eq. (r2), None for none; how it was found, if it wasn't given."""
+    """The lens."""
 
     distortion: Distortion | None = None
+    """S of the paper's Eq. (r2); None for none."""
     calibration: Calibration | None = None
+    """How it was found, if it wasn't given."""
 
 
 _ARRAYS = "shifts shifts_sd angles angles_sd matches covariance"

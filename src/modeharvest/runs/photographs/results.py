@@ -34,62 +34,53 @@ from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
 
 @dataclass(frozen=True, eq=False)
 class PartSpectrum:
-    """Spectrum, and the pattern read off it, of a part of the specimen that has modes of its own.
-
-    Of the displacement there without its affine part.
-    """
+    """Spectrum of a part of the specimen that has modes of its own, and the pattern read off it."""
 
     name: str
     spectrum: Spectrum
+    """Of the displacement there without its affine part."""
     pattern: WavePattern
 
 
 @dataclass(frozen=True, eq=False)
 class HarvestedFrame:
-    """What was found in one deformed photograph; ``name`` differs from all others'.
-
-    Parameters
-    ----------
-    strain_x, strain_y
-        Mean nominal compression of the cellular part [-].
-    image, mask
-        (rows, cols) the photograph, free from distortion [grey levels], and True on its material;
-        None if not known. May be memory-mapped.
-    error_x, error_y
-        (p,) and (q,) axes [mm] of the error bars.
-    by_noise, by_model_error
-        Error bars on these axes, arrays (q, p, ...), by the images' noise and by model error; the
-        latter None if they can't be had.
-    noise_covariance, model_error_covariance
-        (n, n) of the unknowns: those that the error bars are made of.
-    spectrum, pattern
-        Of the displacement without its affine part, and what is read off it.
-    parts
-        The same of every part that has modes of its own, in one order for all photographs.
-    start_text, warnings
-        Where the correlation started from, and what a user should know.
-    """
+    """What was found in one deformed photograph."""
 
     name: str
+    """Differs from all others'."""
     strain_x: float
     strain_y: float
+    """Mean nominal compression of the cellular part [-]."""
     image: FloatImage
     mask: BoolArray | None
+    """(rows, cols) the photograph, free from distortion [grey levels], and True on its material;
+    None if not known. May be memory-mapped."""
     result: Result
     identifiability: Identifiability
     residual_test: ResidualTest
     error_x: FloatArray
     error_y: FloatArray
+    """(p,) and (q,) axes [mm] of the error bars."""
     by_noise: FieldErrors
+    """Error bars on these axes by the images' noise, arrays (q, p, ...)."""
     noise_covariance: FloatArray
+    """(n, n) of the unknowns, which these error bars are made of."""
     by_model_error: FieldErrors | None = None
+    """Error bars by model error, likewise; None if they can't be had."""
     model_error_covariance: FloatArray | None = None
+    """(n, n) of the unknowns, which those error bars are made of."""
     spectrum: Spectrum | None = None
+    """Of the displacement without its affine part."""
     pattern: WavePattern | None = None
+    """What is read off the spectrum."""
     parts: tuple[PartSpectrum, ...] = ()
+    """Spectrum and pattern of every part that has modes of its own, in one order for all
+    photographs."""
     local: LocalField | None = None
     start_text: tuple[str, ...] = ()
+    """Where the correlation started from."""
     warnings: tuple[str, ...] = ()
+    """What a user should know."""
 
     @property
     def modes(self) -> range:
@@ -99,99 +90,81 @@ class HarvestedFrame:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """What was obtained against what is expected, both in ``unit`` ("" for none) or in words.
-
-    ``ok``: whether the first is as good as the second asks for.
-    """
+    """What was obtained against what is expected, both in ``unit`` or in words."""
 
     quantity: str
     obtained: float | str
     expected: float | str
     ok: bool
+    """Whether the first is as good as the second asks for."""
     unit: str = ""
+    """Empty for none."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """The truth of one frame, in the reference frame.
-
-    ``displacement``: (rows, cols, 2) [mm], NaN off the material, may be memory-mapped; ``best``:
-    the best fit of the frame's ansatz to it.
-    """
+    """The truth of one frame, in the reference frame."""
 
     displacement: NDArray[Any]
+    """(rows, cols, 2) [mm], NaN off the material; may be memory-mapped."""
     best: Result
+    """The best fit of the frame's ansatz to it."""
 
 
 @dataclass(frozen=True, eq=False)
 class HarvestTruth:
-    """The truth of photographs that were made by a simulation.
-
-    ``frames`` by their names, some may be missing; ``distortion`` of the optics; ``rows``: what was
-    found against what is true.
-    """
+    """The truth of photographs that were made by a simulation."""
 
     frames: Mapping[str, FrameTruth]
+    """By their names, some may be missing."""
     distortion: Distortion | None = None
+    """Of the optics."""
     rows: tuple[TruthCheck, ...] = ()
+    """What was found against what is true."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harvest:
-    """All that the report of a harvest shows; what is None or empty is left out.
-
-    Parameters
-    ----------
-    experiment
-        The experiment, as plain values.
-    grid
-        The pixels of the ideal images.
-    reference, mask
-        (rows, cols) the photograph of the undeformed state, free from distortion [grey levels],
-        and where it shows material.
-    cellular, domain
-        The part that has holes, and the box of the material [mm].
-    frames, timeline
-        In the order of the test.
-    noise_sd, noise_source
-        Of each photograph [grey levels], and where that is known from.
-    lattice
-        The holes that were found and the lattice fitted to them.
-    skipped
-        Names of photographs that were not used, and why.
-    buckling
-        When the pattern appeared.
-    calibration, lens
-        Of the optics; the lens alone if it was given.
-    full_scale
-        Largest grey level of the camera; None if not known.
-    text
-        What was done to the photographs and found in them, in words.
-    command, toml
-        That make this page again; the experiment's values are shown if ``toml`` is empty.
-    """
+    """All that the report of a harvest shows; what is None or empty is left out."""
 
     title: str
     experiment: Mapping[str, Any]
+    """The experiment, as plain values."""
     grid: PixelGrid
+    """The pixels of the ideal images."""
     reference: FloatImage
     mask: BoolArray
+    """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels], and
+    where it shows material."""
     cellular: Box
+    """The part that has holes [mm]."""
     domain: Box
+    """The box of the material [mm]."""
     frames: tuple[HarvestedFrame, ...]
+    """In the order of the test."""
     noise_sd: float
+    """Of each photograph [grey levels]."""
     noise_source: str
+    """Where that is known from."""
     lattice: HoleLattice | None = None
+    """The holes that were found and the lattice fitted to them."""
     skipped: tuple[tuple[str, str], ...] = ()
+    """Names of photographs that were not used, and why."""
     timeline: Sequence[ImageAmplitude] = ()
+    """In the order of the test."""
     buckling: Buckling | None = None
+    """When the pattern appeared."""
     calibration: Calibration | None = None
     lens: Distortion | None = None
+    """Both of the optics; the lens alone if it was given."""
     full_scale: float | None = None
+    """Largest grey level of the camera; None if not known."""
     text: tuple[str, ...] = ()
+    """What was done to the photographs and found in them, in words."""
     truth: HarvestTruth | None = None
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
+    """Both make this page again; the experiment's values are shown if ``toml`` is empty."""
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
