@@ -83,55 +83,54 @@ Cell = str | float | int | None | Mark | Measured
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """One of the up to six numbers at the top of a page.
-
-    ``name``, ``value``, ``unit``: what it is, its value as a reader wants it or None, and its unit
-    (may be empty). ``remark``: what to compare it with.
-    """
+    """One of the up to six numbers at the top of a page."""
 
     name: str
     value: str | float | None
+    """As a reader wants it, or None."""
     unit: str = ""
+    """May be empty."""
     remark: str = ""
+    """What to compare it with."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReportFigure:
-    """A figure, drawn when the page is written.
-
-    ``name``: its anchor, unique in the page. ``label``: what is written above it; may be empty.
-    ``draw``: draws it, in the style of :mod:`modeharvest.report.figures.style`. ``numbers``: one
-    line of numbers below it. ``wide``: whether it takes the whole width of its card. ``exact``:
-    whether every pixel is kept: for fields as fine as the pixels. ``late``: whether it is drawn
-    after the others, as what it shows may still be computed.
-    """
+    """A figure, drawn when the page is written."""
 
     name: str
+    """Its anchor, unique in the page."""
     label: str
+    """Written above it; may be empty."""
     draw: Callable[[], Figure]
+    """Draws it, in the style of :mod:`modeharvest.report.figures.style`."""
     numbers: str = ""
+    """One line of numbers below it."""
     wide: bool = False
+    """Whether it takes the whole width of its card."""
     exact: bool = False
+    """Whether every pixel is kept: for fields as fine as the pixels."""
     late: bool = False
+    """Whether it is drawn after the others, as what it shows may still be computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReportTable:
-    """A table.
-
-    ``title``: what it holds. ``columns``: headings with their units; the first column names the
-    rows. ``rows``: as many cells each as there are columns. ``name``: its anchor; none if empty.
-    ``file``: a CSV file beside the page that holds the same. ``folded``: whether the reader has to
-    unfold it. ``on_terminal``: whether it is printed, too.
-    """
+    """A table."""
 
     title: str
     columns: Sequence[str]
+    """Headings with their units; the first column names the rows."""
     rows: Sequence[Sequence[Cell]]
+    """As many cells each as there are columns."""
     name: str = ""
+    """Its anchor; none if empty."""
     file: str = ""
+    """A CSV file beside the page that holds the same."""
     folded: bool = False
+    """Whether the reader has to unfold it."""
     on_terminal: bool = False
+    """Whether it is printed, too."""
 
     @classmethod
     def of(cls, title: str, table: pd.DataFrame, **more: Any) -> ReportTable:
@@ -149,24 +148,23 @@ class ReportTable:
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """What belongs together on a page: figures side by side, tables, text.
-
-    ``title``: its heading. ``figures``, ``tables``: the same quantity at several states, for
-    example; in this order. ``text``: statements, as a list; by headings, side by side, where it is
-    a mapping. ``caption``: what is shown, below. ``name``: its anchor; none if empty. ``symbol``,
-    ``paper``: beside the heading: of the quantity, and its figure in the paper. ``wide``: whether
-    it takes the whole width of the page.
-    """
+    """What belongs together on a page: figures side by side, tables, text."""
 
     title: str
     figures: Sequence[ReportFigure] = ()
     tables: Sequence[ReportTable] = ()
+    """The same quantity at several states, for example; in this order."""
     text: Sequence[str] | Mapping[str, Sequence[str]] = ()
+    """Statements, as a list; by headings, side by side, where it is a mapping."""
     caption: str = ""
+    """What is shown, below."""
     name: str = ""
+    """Its anchor; none if empty."""
     symbol: str = ""
     paper: str = ""
+    """Beside the heading: of the quantity, and its figure in the paper."""
     wide: bool = False
+    """Whether it takes the whole width of the page."""
 
     @classmethod
     def single(
@@ -211,36 +209,40 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """All that a reader sees of a run.
-
-    ``kind``, ``title``, ``lead``: of which kind of run; what it is called; a paragraph on what the
-    page is about. ``findings``: what was found, in sentences, the most important first; also on the
-    terminal. ``keys``: up to six numbers to begin with. ``sections``: figures and tables; empty
-    ones are left out. ``warnings``: what to beware of; also on the terminal. ``notes``: what to
-    know before trusting the numbers. ``command``, ``remark``: what makes it again, and a word on
-    that. ``case``: what was run: plain values, or TOML text. ``files``: what lies beside the page,
-    and what each file holds. ``costs``, ``versions``: of the run, and of libraries. ``hero``,
-    ``hero_caption``: a figure at the top. ``brief``: a table for the terminal alone.
-    """
+    """All that a reader sees of a run."""
 
     kind: str
+    """Of which kind of run it is."""
     title: str
     lead: str = ""
+    """A paragraph on what the page is about."""
     findings: Sequence[str] = ()
+    """What was found, in sentences, the most important first; also on the terminal."""
     keys: Sequence[KeyNumber] = ()
+    """Up to six numbers to begin with."""
     sections: Sequence[Section] = ()
+    """Figures and tables; empty ones are left out."""
     warnings: Sequence[str] = ()
+    """What to beware of; also on the terminal."""
     notes: Sequence[str] = ()
+    """What to know before trusting the numbers."""
     command: str = ""
     remark: str = ""
+    """What makes the page again, and a word on that."""
     case: Mapping[str, Any] = field(default_factory=dict)
     toml: str = ""
+    """What was run: plain values, or TOML text."""
     files: Mapping[str, str] = field(default_factory=dict)
+    """What lies beside the page, and what each file holds."""
     costs: Mapping[str, str] = field(default_factory=dict)
+    """Of the run."""
     versions: Mapping[str, str] = field(default_factory=dict)
+    """Of libraries."""
     hero: ReportFigure | None = None
     hero_caption: str = ""
+    """A figure at the top, and its caption."""
     brief: ReportTable | None = None
+    """A table for the terminal alone."""
 
     @property
     def cards(self) -> Iterator[Card]:
@@ -262,20 +264,19 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a study's table of cases shows.
-
-    ``numbers``: the study's results as plain values, with their units in the names. ``sentences``:
-    the same in sentences, the most important first. ``keys``: up to six numbers to begin with.
-    ``figures``, ``tables``: of the page. ``attachments``: tables that are files only: too long for
-    the page, or one of its tables in numbers.
-    """
+    """What a study's table of cases shows."""
 
     numbers: Mapping[str, Any]
+    """The study's results as plain values, with their units in the names."""
     sentences: Sequence[str]
+    """The same in sentences, the most important first."""
     keys: Sequence[KeyNumber] = ()
+    """Up to six numbers to begin with."""
     figures: Sequence[Card] = ()
     tables: Sequence[ReportTable] = ()
+    """Both of the page."""
     attachments: Sequence[ReportTable] = ()
+    """Tables that are files only: too long for the page, or one of its tables in numbers."""
 
 
 def study_report(

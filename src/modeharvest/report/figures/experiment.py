@@ -22,21 +22,20 @@ from modeharvest.validation.truth import Comparison, lengths, pattern_field
 
 @dataclass(frozen=True, eq=False)
 class ExperimentData:
-    """What the figures of a virtual experiment are drawn from.
-
-    ``solution``, ``images``: of the run. ``strains``, ``results``: of each snapshot its nominal
-    strain [-] and what was found, by ascending strain. ``comparisons``: of each snapshot with the
-    truth; may still be computed. ``spectra``: of each its spectral densities and what is read off
-    them; may still be computed. ``pitch``: unit cell size l [mm].
-    """
+    """What the figures of a virtual experiment are drawn from, snapshots by ascending strain."""
 
     solution: Solution
     images: ImageSet
     strains: Sequence[float]
+    """Nominal strain of each snapshot [-]."""
     results: Sequence[Result]
+    """What was found in each."""
     comparisons: Sequence[Comparison]
+    """Of each with the truth; may still be computed."""
     spectra: Sequence[tuple[Spectrum, WavePattern]]
+    """Of each its spectral densities and what is read off them; may still be computed."""
     pitch: float
+    """Unit cell size l [mm]."""
 
     @cached_property
     def states(self) -> list[SnapshotState]:

@@ -40,16 +40,15 @@ UM = 1e3  # micrometres in a millimetre
 
 @dataclass(frozen=True, eq=False)
 class SpecimenView:
-    """The specimen that the maps of all states are drawn on.
-
-    ``outline``: of the material in the reference. ``grid``, ``mask``: the images' pixels, and
-    (rows, cols) which of the reference's show material. ``pitch``: unit cell size l [mm].
-    """
+    """The specimen that the maps of all states are drawn on."""
 
     outline: MeshBoundary
+    """Of the material in the reference."""
     grid: PixelGrid
     mask: BoolArray
+    """The images' pixels, and (rows, cols) which of the reference's show material."""
     pitch: float
+    """Unit cell size l [mm]."""
     _frames: dict[int, MapFrame] = field(default_factory=dict, repr=False)
 
     def map_frame(self, cells: int = SMOOTH) -> MapFrame:
@@ -68,18 +67,17 @@ class SpecimenView:
 
 @dataclass(frozen=True, eq=False)
 class FittedState:
-    """A deformed state and what was fitted to its image.
-
-    ``name``, ``label``: ending of its pictures' anchors, and what is written above them. ``view``:
-    the specimen. ``result``: of its correlation. ``densities``: gives the spectral densities of the
-    displacement, what is read off them, and where their colours end [mm⁶], the same for all states.
-    """
+    """A deformed state and what was fitted to its image."""
 
     name: str
     label: str
+    """Ending of its pictures' anchors, and what is written above them."""
     view: SpecimenView
     result: Result
+    """Of its correlation."""
     densities: Callable[[], tuple[Spectrum, WavePattern, float]]
+    """Gives the spectral densities of the displacement, what is read off them, and where their
+    colours end [mm⁶], the same for all states."""
 
     def motion(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """The measured displacement [mm]."""
@@ -118,24 +116,24 @@ def always(state: FittedState) -> bool:
 
 @dataclass(frozen=True)
 class Panel(Generic[S]):
-    """A quantity that is drawn for every state.
-
-    ``section``, ``key``: where on the page it is, and its anchor there. ``draw``: draws it of a
-    state. ``shows``: whether there is something to draw. ``title``, ``symbol``, ``paper``,
-    ``caption``: its words, and the panel in the paper or "". ``exact``: whether the picture's
-    pixels are kept exactly. ``late``: whether what it shows may still be computed meanwhile.
-    """
+    """A quantity that is drawn for every state."""
 
     section: str
     key: str
+    """Where on the page it is, and its anchor there."""
     draw: Callable[[S], Figure]
+    """Draws it of a state."""
     shows: Callable[[S], bool] = always
+    """Whether there is something to draw."""
     title: str = ""
     symbol: str = ""
     paper: str = ""
+    """The panel in the paper; empty for none."""
     caption: str = ""
     exact: bool = False
+    """Whether the picture's pixels are kept exactly."""
     late: bool = False
+    """Whether what it shows may still be computed meanwhile."""
 
     @classmethod
     def of(

@@ -32,16 +32,15 @@ DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """What all maps of a specimen share, so that they can be laid over each other.
-
-    ``outline``: of the specimen. ``grid``: the images' pixels, ``factor`` of them joined in each
-    direction to the cells that are drawn. ``limits``: (left, right, bottom, top) of every map [mm].
-    """
+    """What all maps of a specimen share, so that they can be laid over each other."""
 
     outline: MeshBoundary
+    """Of the specimen."""
     grid: PixelGrid
     factor: int
+    """The images' pixels, so many of them joined in each direction to the cells that are drawn."""
     limits: tuple[float, float, float, float]
+    """(left, right, bottom, top) of every map [mm]."""
 
     @classmethod
     def of(cls, outline: MeshBoundary, grid: PixelGrid, cells: int = 360) -> MapFrame:
@@ -98,19 +97,18 @@ _GAP, _BAR, _POINTED = 0.05, 0.072, 0.05  # before a colour bar, its width, its 
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Colours for values.
-
-    ``low``, ``high``: ends of the colour map, in ``unit``, which is written above the colour bar;
-    "" for a number without one. ``extend``: whether values lie beyond the ends: "neither", "min",
-    "max" or "both". ``is_log``: for values of many orders of magnitude.
-    """
+    """Colours for values."""
 
     colours: Colormap
     low: float
     high: float
+    """Ends of the colour map, in ``unit``."""
     unit: str = ""
+    """Written above the colour bar; empty for a number without one."""
     extend: str = "neither"
+    """Whether values lie beyond the ends: "neither", "min", "max" or "both"."""
     is_log: bool = False
+    """For values of many orders of magnitude."""
 
     @classmethod
     def signed(cls, values: FloatArray, unit: str, share: float = 1.0) -> ColourScale:

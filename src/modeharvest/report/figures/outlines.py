@@ -19,15 +19,13 @@ from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class MeshBoundary:
-    """The edges that belong to one element only, in closed loops.
-
-    ``nodes``: (n, 2) node positions of the mesh [mm]. ``loops``: for each loop (m, 3) node numbers:
-    first corner, mid-side, second corner of each edge, material on the left. Without mid-side
-    nodes, the second column repeats the first.
-    """
+    """The edges that belong to one element only, in closed loops."""
 
     nodes: FloatArray
+    """(n, 2) node positions of the mesh [mm]."""
     loops: tuple[IntArray, ...]
+    """For each loop (m, 3) node numbers: first corner, mid-side, second corner of each edge,
+    material on the left. Without mid-side nodes, the second column repeats the first."""
 
     @classmethod
     def of(cls, mesh: Mesh) -> MeshBoundary:
@@ -115,22 +113,21 @@ _SPARE = 0.15  # of the window: how much further the copies reach, for what a de
 
 @dataclass(frozen=True, eq=False)
 class LatticePatch:
-    """Copies of a cell, joined where they touch.
-
-    ``mesh``: of all copies together, undeformed [mm]. ``outline``: its outline: holes and the
-    ragged outer edge, which the window cuts off. ``lattice``: (2, 2) lattice vectors of the cell as
-    rows [mm]. ``node``, ``copy``: (N,) which node of the cell each node is, and (N, 2) in which
-    copy. ``centre``: (2,) middle of the cell and of the window [mm]. ``window``: (2,) width and
-    height [mm].
-    """
+    """Copies of a cell, joined where they touch."""
 
     mesh: Mesh
+    """Of all copies together, undeformed [mm]."""
     outline: MeshBoundary
+    """Holes and the ragged outer edge, which the window cuts off."""
     lattice: FloatArray
+    """(2, 2) lattice vectors of the cell as rows [mm]."""
     node: IntArray
     copy: IntArray
+    """(N,) which node of the cell each node is, and (N, 2) in which copy."""
     centre: FloatArray
+    """(2,) middle of the cell and of the window [mm]."""
     window: FloatArray
+    """(2,) width and height [mm]."""
 
     @classmethod
     def of(cls, mesh: Mesh, lattice: FloatArray, window: tuple[float, float]) -> LatticePatch:

@@ -84,15 +84,12 @@ def grey_levels(image: NDArray[Any], levels: tuple[float, float]) -> NDArray[np.
 
 @dataclass(frozen=True, eq=False)
 class PhotographState(fits.FittedState):
-    """A deformed photograph.
-
-    ``harvest``, ``frame``: the test, and what was found in this photograph. ``levels``: grey levels
-    that are drawn black and white.
-    """
+    """A deformed photograph."""
 
     harvest: Harvest
     frame: HarvestedFrame
     levels: tuple[float, float]
+    """Grey levels that are drawn black and white."""
 
 
 def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[PhotographState]:
