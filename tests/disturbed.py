@@ -1,17 +1,14 @@
-"""A command run again and again, disturbed each time, until it succeeds; in one way after another.
+"""Commands run again and again, disturbed each time, until they succeed; in one way after another.
 
-::
-
-    python disturbed.py WAYS OUT COMMAND...
-
-``WAYS`` is a JSON list of [folder, way, number, ...], each begun in its own folder::
+Each line of stdin is a JSON list [WAYS, OUT, COMMAND]. ``WAYS`` is a list of [folder, way, number,
+...], each begun in its own folder::
 
     [FOLDER, "kill", SEED]          killed while it writes a file; undisturbed with a seed of 0
     [FOLDER, "disk", BYTES, STEP]   on a disk of BYTES, and STEP more each time
 
-``OUT`` is what the command leaves there. Prints a JSON object for each attempt: ``folder``,
-``code``, its exit code or minus the signal that ended it, ``said``, what it wrote to stderr, and
-``files``, the digests of what is there afterwards.
+``OUT`` is what the command, a list of words, leaves there. Prints a JSON object for each attempt:
+``folder``, ``code``, its exit code or minus the signal that ended it, ``said``, what it wrote to
+stderr, and ``files``, the digests of what is there afterwards; and after the last one an exit code.
 
 Each attempt is a fork of this process, which has imported what takes long and computed nothing.
 """
@@ -32,6 +29,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numba
+
 NO_DISK = 77
 _MODULES = (
     "runs.experiment",
@@ -41,7 +40,7 @@ _MODULES = (
     "cli.root",
 )
 _NEW_USER, _NEW_MOUNTS, _REMOUNT = 0x10000000, 0x00020000, 0x20
-_ATTEMPTS = 60
+_ATTEMPTS, _LONGEST_S = 60, 600
 _DANGER = 0.3
 """Probability to be killed at a write."""
 
@@ -112,6 +111,7 @@ def attempt(command: list[str], out: Path, prepare: Callable[[], None]) -> int:
     with tempfile.TemporaryFile() as said:
         child = os.fork()
         if child == 0:
+            signal.alarm(_LONGEST_S)  # ends what hangs
             os.dup2(said.fileno(), 2)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             sys.argv = ["modeharvest", *command]
@@ -162,20 +162,27 @@ def disturb(out: Path, command: list[str], way: str, first: int, step: int = 0) 
     sys.exit("it never succeeded")
 
 
-def main() -> None:
-    ways, out, *command = sys.argv[1:]
-    for module in _MODULES:
-        importlib.import_module(f"modeharvest.{module}")
-    assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
-    for folder, *way in json.loads(ways):
-        child = os.fork()  # a disk of one's own is for good
+def disturb_all(ways: list[list[Any]], out: str, command: list[str]) -> int:
+    """Each way in a fork, since a disk of one's own is for good; the exit code of the first bad."""
+    for folder, *way in ways:
+        child = os.fork()
         if child == 0:
             os.chdir(folder)
             disturb(Path(out).absolute(), command, *way)
-            return
+            sys.exit()
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if code:
-            sys.exit(code)
+            return code
+    return 0
+
+
+def main() -> None:
+    for module in _MODULES:
+        importlib.import_module(f"modeharvest.{module}")
+    numba.njit(lambda x: x)(0)  # has the compiler import the rest of itself; begins no threads
+    assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
+    while line := sys.stdin.readline():
+        print(disturb_all(*json.loads(line)), flush=True)
 
 
 if __name__ == "__main__":
