@@ -21,7 +21,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.gauss_newton import Outcome
-from modeharvest.idic.solver.passes import accumulate
+from modeharvest.idic.solver.passes import accumulate, runs_of
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -136,6 +136,13 @@ def test_however_arrays_are_kept_no_kernel_is_compiled_anew(
     f, g = (view(image.astype(np.float32)) for image in images())
     correlated(f, g, view(mask()))
     assert signatures() == before
+
+
+def test_no_pixel_and_many_are_of_one_type() -> None:
+    """numpy takes a cut of one element or none for contiguous, which is a type of its own."""
+    row = np.zeros(GRID.shape, dtype=np.bool_)
+    row[50, 40:70] = True
+    assert len({numba.typeof(runs_of(pixels)) for pixels in (row & ~row, row, mask())}) == 1
 
 
 def signatures() -> dict[str, int]:

@@ -164,8 +164,9 @@ def runs_of(mask: BoolArray) -> Runs:
     # Where runs begin and end, in turns; of a flat array numpy tells several times faster.
     row, column = np.divmod(np.flatnonzero(edges), edges.shape[1])
     per_row = np.bincount(row[::2], minlength=len(mask))
-    limits = column.astype(np.int32)
-    return Runs(limits[::2], limits[1::2], np.concatenate([[0], np.cumsum(per_row)]))
+    # Contiguous, as no or one run would be without: kernels are compiled for either.
+    first, stop = (np.ascontiguousarray(column[k::2], np.int32) for k in (0, 1))
+    return Runs(first, stop, np.concatenate([[0], np.cumsum(per_row)]))
 
 
 def tables_of(ansatz: Ansatz, grid: PixelGrid, a: FloatArray) -> Tables:

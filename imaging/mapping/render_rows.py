@@ -7,13 +7,11 @@ nothing is kept but grey levels.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.element_table import ElementTable, Pixels, bands, tabulate_elements
 from modeharvest.imaging.mapping.elements import polynomials
-from modeharvest.imaging.mapping.isoparametric import in_turn
 from modeharvest.imaging.mapping.rasterise import fill
 from modeharvest.imaging.speckle.periodic_spline import (
     BLOCK,
@@ -23,7 +21,7 @@ from modeharvest.imaging.speckle.periodic_spline import (
     workspace,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel
 
 _BAND = 16  # rows
 
@@ -52,13 +50,12 @@ def render_rows_average(
         moved = PixelGrid(*grid.shape, h, float(grid.x0 + h * right), float(grid.y0 - h * down))
         elements = tabulate_elements(nodes, mesh.cells, mesh.element, moved)
         start, visits = bands(elements, grid.rows, _BAND)
-        order = in_turn(start.size - 1)
-        _add(elements, place, pattern.table, background, start, visits, order,
-             float(weight), np.ascontiguousarray(selected), total)  # fmt: skip
+        in_parallel(_add, elements, place, pattern.table, background, start, visits,
+                    float(weight), np.ascontiguousarray(selected), total)  # fmt: skip
     return total
 
 
-@compiled(parallel=True)
+@compiled()
 def _add(
     elements: ElementTable,
     place: FloatArray,
@@ -66,15 +63,16 @@ def _add(
     background: float,
     start: IntArray,
     visits: IntArray,
-    order: IntArray,
     weight: float,
     selected: BoolArray,
     total: FloatArray,
+    thread: int,
+    threads: int,
 ) -> None:
     """``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are."""
-    for i in prange(order.size):
-        visited = visits[start[order[i]] : start[order[i] + 1]]
-        _add_band(elements, place, pattern, background, visited, order[i], weight, selected, total)
+    for band in range(thread, start.size - 1, threads):
+        visited = visits[start[band] : start[band + 1]]
+        _add_band(elements, place, pattern, background, visited, band, weight, selected, total)
 
 
 @compiled()
