@@ -27,7 +27,7 @@ from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.errors import InputError
 
-PIXEL, NOISE = 0.04, 0.01
+PIXEL, NOISE = 0.05, 0.01
 EXPERIMENT = f"""
 title = "A test"
 [images]
@@ -96,9 +96,9 @@ def test_the_pattern_is_found_with_no_number_typed(harvested: Path, images: Imag
     found = Result.read(harvested / "results" / "frame_2.json")
     mask = images.mask()
     w = (images.truth(0.128).displacement - found.displacement())[mask] / PIXEL
-    # The best fit of the paper's ansatz leaves 2.0 px per component at 0.01 mm/px, so 0.50 here;
+    # The best fit of the paper's ansatz leaves 2.0 px per component at 0.01 mm/px, so 0.40 here;
     # the IDIC is 0.12 times that away from it.
-    assert np.sqrt(np.nanmean(w**2)) < 0.56
+    assert np.sqrt(np.nanmean(w**2)) < 0.45
 
 
 def test_the_noise_is_measured(harvested: Path) -> None:
@@ -160,8 +160,8 @@ def test_the_updated_formulation_agrees_with_the_total_one(
     results = HarvestRun(updated, tmp_path).results()
     first = Result.read(harvested / "results" / "frame_2.json")
     apart = (results["frame_2"].result.displacement() - first.displacement()) / PIXEL
-    # It inherits what the frame before couldn't describe: w of 0.26 px rms there.
-    assert 0 < np.sqrt(np.mean(apart[150:-150, 112:-112] ** 2)) < 0.26
+    # It inherits what the frame before couldn't describe: w of 0.21 px rms there.
+    assert 0 < np.sqrt(np.mean(apart[120:-120, 90:-90] ** 2)) < 0.21
 
 
 @pytest.mark.parametrize(

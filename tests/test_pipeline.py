@@ -33,7 +33,7 @@ mesh_size = 0.5
 holes_x = 4
 holes_y = 6
 [imaging]
-pixel_size = 0.05
+pixel_size = 0.08
 [imaging.speckle]
 seed = 3
 """
