@@ -23,8 +23,13 @@ from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOpti
 from modeharvest.imaging.distortion.calibration.pair import recover_camera
 from modeharvest.imaging.distortion.calibration.result import Calibration
 from modeharvest.imaging.distortion.files import read_distortion
-from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
+from modeharvest.imaging.distortion.lens import (
+    CameraDistortion,
+    Distortion,
+    PolynomialDistortion,
+    undistorted,
+    undistorted_mask,
+)
 from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.sensor import quantise
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec

@@ -33,8 +33,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.render import ImagedState, render_deformed
 from modeharvest.imaging.sensor import Aperture
-from modeharvest.imaging.speckle.layer import Layer
-from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import Layer, Speckle, SpeckleSpec
 from modeharvest.runs.case import shipped_solution
 
 STRAIN = 0.128

@@ -26,7 +26,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.photograph.measure import image_noise
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, field_errors
-from modeharvest.imaging.distortion.undistort import undistorted
+from modeharvest.imaging.distortion.lens import undistorted
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase

@@ -22,8 +22,7 @@ from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.imaging.distortion.calibration.result import sampled_correlations
-from modeharvest.imaging.distortion.lens import CameraDistortion
-from modeharvest.imaging.distortion.undistort import undistorted
+from modeharvest.imaging.distortion.lens import CameraDistortion, undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec

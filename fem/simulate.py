@@ -15,9 +15,14 @@ from modeharvest.fem.experiment import BRANCHES, Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.materials import material_table
 from modeharvest.fem.meshing import mesh_specimen, perturb
-from modeharvest.fem.path.branching import PATTERN_TOLERANCE, follow_branch, follow_to_pattern
+from modeharvest.fem.path.bifurcation import (
+    PATTERN_TOLERANCE,
+    Critical,
+    follow_branch,
+    follow_to_pattern,
+    locate_critical,
+)
 from modeharvest.fem.path.continuation import PathFollower, State
-from modeharvest.fem.path.critical import Critical, locate_critical
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
 from modeharvest.fem.path.stability import Mode
 from modeharvest.util import __version__

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from modeharvest.imaging.distortion.undistort import Positions, ideal_points
+from modeharvest.imaging.distortion.lens import Positions, ideal_points
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.imaging.render import ImagedState, Rendering, render_observed
 from modeharvest.imaging.sensor import EDGE_POINTS, Aperture

@@ -4,6 +4,9 @@ The reference image shows the speckle itself. A pixel x of a deformed image show
 reference point X, with X + u(X) = x solved by the inverse isoparametric mapping, so neither image
 is interpolated from the other. Through a lens a pixel p shows the ideal point phi_S^-1(p): that is
 found exactly, then the material there and its reference point. No image is resampled.
+
+Averages over pixels are made in passes over the image's rows: a thread takes a band of rows at a
+time, whose mapping fits into its cache; of the whole image nothing is kept but grey levels.
 """
 
 from __future__ import annotations
@@ -13,15 +16,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeharvest.fem.field import Mesh
-from modeharvest.imaging.distortion.undistort import Positions
+from modeharvest.imaging.distortion.lens import Positions
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping import elements
-from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
-from modeharvest.imaging.mapping.pointwise import locate_points
-from modeharvest.imaging.mapping.render_rows import render_rows_average
+from modeharvest.imaging.mapping.element_table import ElementTable, Pixels, bands, tabulate_elements
+from modeharvest.imaging.mapping.elements import (
+    bezier_matrix,
+    monomial_gradients,
+    polynomials,
+    reference_element,
+    require_positive_jacobian,
+)
+from modeharvest.imaging.mapping.isoparametric import (
+    Located,
+    interpolate,
+    locate,
+    locate_points,
+)
+from modeharvest.imaging.mapping.rasterise import fill
 from modeharvest.imaging.pair import Truth
 from modeharvest.imaging.speckle.pattern import Speckle
-from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
+from modeharvest.imaging.speckle.periodic_spline import (
+    BLOCK,
+    PeriodicSpline,
+    SplineTable,
+    sample,
+    workspace,
+)
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage, IntArray
+from modeharvest.util.compiled import compiled, in_parallel
+
+_BAND = 16  # rows that a thread averages at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +75,10 @@ class ImagedState:
         if self.displacement is None:
             return 1.0
         mesh = self.mesh
-        middle = elements.reference_element(mesh.element).middle
-        slopes = elements.monomial_gradients((middle, middle))
-        before = elements.polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
-        after = elements.polynomials(mesh.element, mesh.cells, self.nodes) @ slopes
+        middle = reference_element(mesh.element).middle
+        slopes = monomial_gradients((middle, middle))
+        before = polynomials(mesh.element, mesh.cells, mesh.nodes) @ slopes
+        after = polynomials(mesh.element, mesh.cells, self.nodes) @ slopes
         stretches = np.linalg.svd(after @ np.linalg.inv(before), compute_uv=False)
         return float(1.0 / stretches.min())
 
@@ -64,18 +88,18 @@ class ImagedState:
         ``offsets`` (p, 2) are (row, col) [px]. InputError if an element is inside out.
         """
         mesh, nodes = self.mesh, self.nodes
-        elements.require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
+        require_positive_jacobian(nodes, mesh.cells, mesh.element, self.where)
         reach = float(np.abs(offsets).max(initial=0.0))
         near = Mesh(mesh.nodes, mesh.cells[self._reaching(nodes, selected, reach)], mesh.element)
-        total = render_rows_average(
+        total = _average_rows(
             near, nodes, self.grid, self.speckle.spline, self.background, selected, offsets, weights
         )
         return total[selected]
 
     def _reaching(self, nodes: FloatArray, selected: BoolArray, reach: float) -> BoolArray:
         """(m,) True for elements that may hold a point within ``reach`` px of a selected pixel."""
-        element, shape = elements.reference_element(self.mesh.element), self.grid.shape
-        control = elements.bezier_matrix(element.triangular) @ element.coefficients
+        element, shape = reference_element(self.mesh.element), self.grid.shape
+        control = bezier_matrix(element.triangular) @ element.coefficients
         position = np.stack(self.grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)[self.mesh.cells]
         hull = np.einsum("pk,mki->mpi", control, position)
         low = np.clip(np.floor(hull.min(axis=1) - reach), 0, shape).astype(np.int64)
@@ -149,3 +173,109 @@ def render_observed(state: ImagedState, points: Positions) -> Rendering:
     image = np.full(mask.shape, state.background, dtype=np.float32)
     image[mask] = state.speckle(row, col)
     return Rendering(image, mask)
+
+
+def _average_rows(
+    mesh: Mesh,
+    nodes: FloatArray,
+    grid: PixelGrid,
+    pattern: PeriodicSpline,
+    background: float,
+    selected: BoolArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """(rows, cols) weighted sum of grey levels at selected pixels moved by offsets; else wrong.
+
+    mesh, nodes : the undeformed mesh, whose Jacobians are proved positive in the state with the
+        node positions ``nodes`` (n, 2) [mm].
+    grid, pattern, background : the pixels, also the pattern's; intensity of material and around.
+    selected, offsets, weights : (rows, cols) True where to sum; (k, 2) (row, col) [px] and (k,).
+    """
+    total = np.zeros(grid.shape)
+    position = np.stack(grid.to_px(mesh.nodes[:, 0], mesh.nodes[:, 1]), axis=1)
+    place, h = polynomials(mesh.element, mesh.cells, position), grid.pixel_size
+    for (down, right), weight in zip(offsets, weights, strict=True):
+        moved = PixelGrid(*grid.shape, h, float(grid.x0 + h * right), float(grid.y0 - h * down))
+        elements = tabulate_elements(nodes, mesh.cells, mesh.element, moved)
+        start, visits = bands(elements, grid.rows, _BAND)
+        in_parallel(_add, elements, place, pattern.table, background, start, visits,
+                    float(weight), np.ascontiguousarray(selected), total)  # fmt: skip
+    return total
+
+
+@compiled()
+def _add(
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
+    start: IntArray,
+    visits: IntArray,
+    weight: float,
+    selected: BoolArray,
+    total: FloatArray,
+    thread: int,
+    threads: int,
+) -> None:
+    """``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are."""
+    for band in range(thread, start.size - 1, threads):
+        visited = visits[start[band] : start[band + 1]]
+        _add_band(elements, place, pattern, background, visited, band, weight, selected, total)
+
+
+@compiled()
+def _add_band(
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
+    visited: IntArray,
+    band: int,
+    weight: float,
+    selected: BoolArray,
+    total: FloatArray,
+) -> None:
+    rows, cols = total.shape
+    top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
+    sums = total[top:bottom].ravel()
+    if not selected[top:bottom].any():
+        return
+    grey = _render_pixels(
+        elements, place, pattern, background, selected.ravel(), visited, top, bottom, cols
+    )
+    for k in range(grey.size):  # of others, too: what they get is not looked at
+        sums[k] += weight * grey[k]
+
+
+@compiled()
+def _render_pixels(
+    elements: ElementTable,
+    place: FloatArray,
+    pattern: SplineTable,
+    background: float,
+    selected: BoolArray,
+    visited: IntArray,
+    top: int,
+    bottom: int,
+    cols: int,
+) -> FloatArray:
+    """Grey levels of the pixels of some rows."""
+    size = (bottom - top) * cols
+    element, at, grey = np.empty(size, dtype=np.int32), np.empty((2, size)), np.empty(size)
+    pixels = Pixels(element, at, np.empty(0, dtype=np.float32), top, cols, 0.0, 0.0, 1.0)
+    fill(elements, place, pixels, selected, visited, top, bottom)
+    where, row, col = np.empty(BLOCK, dtype=np.int64), np.empty(BLOCK), np.empty(BLOCK)
+    shown, work = np.empty(BLOCK), workspace()
+    grey[:] = background
+    count = 0
+    for k in range(size):
+        if element[k] >= 0:
+            where[count], row[count], col[count] = k, at[0, k], at[1, k]
+            count += 1
+        if count == BLOCK or (k == size - 1 and count > 0):
+            sample(pattern, row[:count], col[:count], shown[:count], work)
+            for n in range(count):
+                grey[where[n]] = shown[n]
+            count = 0
+    return grey

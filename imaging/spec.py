@@ -9,8 +9,7 @@ import numpy as np
 
 from modeharvest.fem.field import Solution
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion
-from modeharvest.imaging.distortion.lens import CameraDistortion
-from modeharvest.imaging.distortion.undistort import without_affine
+from modeharvest.imaging.distortion.lens import CameraDistortion, without_affine
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
@@ -48,7 +47,7 @@ class ImagingSpec:
         stays on the ideal grid, that of the images once undistorted.
     affine_distortion
         False takes the distortion's affine part away
-        (:func:`modeharvest.imaging.distortion.undistort.without_affine`): it is no more than
+        (:func:`modeharvest.imaging.distortion.lens.without_affine`): it is no more than
         another pixel size, unobservable in images of a target whose shifts are unknown.
     """
 

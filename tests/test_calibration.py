@@ -15,8 +15,7 @@ from undistortion_noise import undistorted_noise
 
 from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
 from modeharvest.imaging.distortion.calibration.result import Calibration, sampled_noise
-from modeharvest.imaging.distortion.lens import PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import undistorted
+from modeharvest.imaging.distortion.lens import PolynomialDistortion, undistorted
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.photographs.prepare import calibration_text
 from modeharvest.util.errors import InputError

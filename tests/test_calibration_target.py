@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
+from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion, ideal_points
 from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
-from modeharvest.imaging.distortion.undistort import ideal_points
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.imaging.distortion.files import write_distortion
-from modeharvest.imaging.distortion.lens import CameraDistortion, PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import (
+from modeharvest.imaging.distortion.lens import (
+    CameraDistortion,
+    PolynomialDistortion,
     ideal_points,
     undistorted,
     undistorted_mask,

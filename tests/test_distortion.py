@@ -15,8 +15,9 @@ from modeharvest.imaging.distortion.lens import (
     Distortion,
     PolynomialDistortion,
     SampledDistortion,
+    undistorted,
+    undistorted_mask,
 )
-from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.errors import InputError
 

@@ -15,11 +15,9 @@ from petsc4py import PETSc
 from modeharvest.fem.experiment import PathOptions
 from modeharvest.fem.materials import Material, Ogden
 from modeharvest.fem.meshing import mesh_specimen
-from modeharvest.fem.path.branching import follow_branch
-from modeharvest.fem.path.continuation import PathFollower, State
-from modeharvest.fem.path.critical import Critical, locate_critical
+from modeharvest.fem.path.bifurcation import Critical, follow_branch, locate_critical
+from modeharvest.fem.path.continuation import PathFollower, State, hermite_weights
 from modeharvest.fem.path.equilibrium import EdgeCompression, Structure
-from modeharvest.fem.path.predictor import hermite_weights
 from modeharvest.fem.path.stability import lowest_modes
 from modeharvest.fem.specimen import Specimen
 

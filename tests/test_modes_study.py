@@ -246,7 +246,7 @@ def test_a_specimen_is_compressed_to_the_pattern_asked_for() -> None:
     """Its critical strain is that of another walk; the pattern is as large as asked."""
     from mpi4py import MPI
 
-    from modeharvest.fem.path.branching import PATTERN_TOLERANCE
+    from modeharvest.fem.path.bifurcation import PATTERN_TOLERANCE
     from modeharvest.fem.simulate import simulate
 
     specimen = Specimen(2, 2, diameter=1.6, bulk_x=0.9, bulk_y=0.9)

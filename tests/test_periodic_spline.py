@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from modeharvest.imaging.speckle.layer import TOLERANCE
-from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import TOLERANCE, Speckle, SpeckleSpec
 from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
 
 FloatArray = NDArray[np.float64]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from test_isoparametric import ELEMENTS, FILLING, patch, single, textbook
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.mapping.isoparametric import locate
-from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.imaging.mapping.isoparametric import locate, locate_points
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]

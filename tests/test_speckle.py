@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from modeharvest.imaging.speckle.layer import TOLERANCE, Layer, gaussian_field
-from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
+from modeharvest.imaging.speckle.pattern import (
+    TOLERANCE,
+    Ink,
+    Layer,
+    Speckle,
+    SpeckleSpec,
+    gaussian_field,
+)
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]

@@ -18,7 +18,7 @@ from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.lattice.cell import Amplitude, CellPath, CellState, Failure, PeriodicCell
 from modeharvest.fem.lattice.options import CENTRE, BranchOptions
 from modeharvest.fem.lattice.periodicity import overlaps
-from modeharvest.fem.path.predictor import BranchPoint, amplitude_at, load_at, value_at
+from modeharvest.fem.path.continuation import BranchPoint, amplitude_at, load_at, value_at
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent

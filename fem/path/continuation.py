@@ -1,24 +1,88 @@
-"""The primary path, followed by nominal strain: equilibria, their stability, the next step.
+"""Continuation of a path: predictors by tangent or cubic, and the primary path by nominal strain.
 
-On a mesh with the specimen's symmetries the first bifurcation is a pitchfork: the primary
-path keeps the symmetry and goes on, unstable; two branches that break it leave sideways.
-``critical`` finds that point, ``branching`` follows the branches.
+A predictor extrapolates the tangent of one point, or the cubic through two; ``newton`` corrects.
+On a mesh with the specimen's symmetries the first bifurcation is a pitchfork: the primary path
+keeps the symmetry and goes on, unstable; two branches that break it leave sideways
+(``bifurcation``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.optimize import brentq
 
 from modeharvest.fem.experiment import SMALLEST_STEP, PathOptions
 from modeharvest.fem.path.equilibrium import Structure
 from modeharvest.fem.path.newton import Constraint, Linearisation, correct, path_tangent
-from modeharvest.fem.path.predictor import extrapolate
 from modeharvest.fem.path.stability import Mode, lowest_modes
 from modeharvest.util.progress import Progress, silent
+
+
+def hermite_weights(a: float, b: float, at: float) -> tuple[float, float, float, float]:
+    """Weights of value and slope at ``a``, value and slope at ``b``."""
+    h = b - a
+    t = (at - a) / h
+    before, after = (1 - t) ** 2, t**2
+    return (1 + 2 * t) * before, h * t * before, after * (3 - 2 * t), h * after * (t - 1)
+
+
+def extrapolate(points: Sequence[tuple[float, Any, Any]], at: float) -> Any:
+    """The value at a parameter, from (parameter, value, rate) of one point or of the last two.
+
+    Values may be numbers, arrays or PETSc vectors: anything with sums and multiples.
+    """
+    b, value, rate = points[-1]
+    if len(points) == 1:
+        return _combined((1.0, float(at - b)), (value, rate))
+    a, before, rate_before = points[-2]
+    weights = hermite_weights(float(a), float(b), float(at))
+    return _combined(weights, (before, rate_before, value, rate))
+
+
+def _combined(weights: Sequence[float], values: Sequence[Any]) -> Any:
+    total = weights[0] * values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        if hasattr(total, "axpy"):  # PETSc's, in place
+            total.axpy(weight, value)
+        else:
+            total = total + weight * value
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class BranchPoint:
+    """A point of a branch by its mode's amplitude; the rates are derivatives by that."""
+
+    amplitude: float
+    """[mm]."""
+    load: float
+    """[-]."""
+    load_rate: float
+    value: Any
+    """Of the state, such as displacements [mm]."""
+    rate: Any
+
+
+def load_at(points: Sequence[BranchPoint], amplitude: float) -> float:
+    """The load expected at an amplitude, from one point or the last two."""
+    known = [(p.amplitude, p.load, p.load_rate) for p in points[-2:]]
+    return float(extrapolate(known, amplitude))
+
+
+def value_at(points: Sequence[BranchPoint], amplitude: float) -> Any:
+    """The state expected at an amplitude, from one point or the last two."""
+    return extrapolate([(p.amplitude, p.value, p.rate) for p in points[-2:]], amplitude)
+
+
+def amplitude_at(points: Sequence[BranchPoint], load: float, low: float, high: float) -> float:
+    """Where ``load_at`` meets a load that lies between its values at two amplitudes."""
+    return float(brentq(lambda amplitude: load_at(points, amplitude) - load, low, high))
+
 
 _MISS = 0.2  # of a step, by which a prediction may be off on a path without a bifurcation
 _STRETCH = 0.1  # of a step, by which steps may be longer if one is saved

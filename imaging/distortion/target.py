@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.imaging.distortion.undistort import Positions
+from modeharvest.imaging.distortion.lens import Positions
 from modeharvest.imaging.sensor import Sensor
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util.arrays import FloatArray

@@ -1,27 +1,51 @@
-"""The inverse isoparametric mapping: which element covers a pixel, and where in it.
+"""The inverse isoparametric mapping: which element covers a pixel or a point, and where in it.
 
-For each pixel centre x of an image, find the element e and the local coordinates xi with
-sum_a N_a(xi) x_a = x, where x_a are the element's node positions in the state the image shows.
-The paper inverts the same mapping to make its virtual images (section "Virtual Experiments").
+For each position x, find the element e and the local coordinates xi with sum_a N_a(xi) x_a = x,
+where x_a are the element's node positions in the state the image shows. The paper inverts the same
+mapping to make its virtual images (section "Virtual Experiments").
+
+:func:`locate` fills a regular grid of pixels element by element. :func:`locate_points` finds the
+element for each of many scattered points, as a lens shows them at its pixels: the plane is cut into
+buckets that list the elements reaching into them; an element that may hold a point by its Bézier
+control points' box is inverted by Newton's method, and only where no element is found to hold the
+point, exhaustively.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numba import prange
+from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping import rasterise
-from modeharvest.imaging.mapping.element_table import Pixels, bands, tabulate_elements
+from modeharvest.imaging.mapping.element_table import (
+    ElementTable,
+    Pixels,
+    bands,
+    fill_buckets,
+    tabulate_elements,
+)
 from modeharvest.imaging.mapping.elements import (
     polynomials,
     reference_element,
     require_positive_jacobian,
 )
+from modeharvest.imaging.mapping.inversion import (
+    ON_EDGE,
+    Coefficients,
+    coefficients,
+    outside,
+    search,
+    value,
+    value_and_slopes,
+)
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.compiled import compiled
 from modeharvest.util.errors import InputError
 
 
@@ -107,8 +131,165 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
     """
     if nodal.ndim != 2:
         raise InputError(f"expected a nodal field of shape (n, c), got {nodal.shape}")
-    coefficients = polynomials(element, cells, np.asarray(nodal, dtype=np.float64))
-    out = np.empty((coefficients.shape[1], *located.element.shape))
+    fields = polynomials(element, cells, np.asarray(nodal, dtype=np.float64))
+    out = np.empty((fields.shape[1], *located.element.shape))
     curved = not reference_element(element).triangular
-    rasterise.evaluate(coefficients, curved, located.element, located.xi, out)
+    rasterise.evaluate(fields, curved, located.element, located.xi, out)
     return out
+
+
+_BUCKET_PX = 16
+_BLOCK = 1024  # points that one thread takes at a time
+_STEPS = 20
+_SETTLED = 1e-8  # in xi, eta: Newton's error is squared by a step, so this one left rounding
+_RUNAWAY = 10.0  # in xi, eta: no root inside is reached from so far outside
+_SLACK_PX = 1e-7
+
+
+class _Buckets(NamedTuple):
+    """Which elements may hold the points of a square of the image plane."""
+
+    boxes: FloatArray
+    """(m, 4) each element's least row and column, greatest row and column [px]."""
+    start: IntArray
+    members: IntArray
+    """members[start[b]:start[b + 1]] are the elements of bucket b, ascending."""
+    top: float
+    left: float
+    """Where the first bucket begins [px]."""
+    rows: int
+    cols: int
+    """How many buckets."""
+
+
+def locate_points(
+    nodes: FloatArray,
+    cells: IntArray,
+    element: str,
+    grid: PixelGrid,
+    row: ArrayLike,
+    col: ArrayLike,
+    where: str = "mesh",
+) -> Located:
+    """Find element and local coordinates of points given by their image positions.
+
+    Points beside the mesh, and NaN, belong to no element; how many lie inside more than one is not
+    counted. InputError if a Jacobian isn't positive everywhere in some element.
+
+    nodes, cells, element, where : as for :func:`locate`.
+    grid : what positions in px mean; they need not lie on it.
+    row, col : positions of the points [px], of shapes that broadcast to two dimensions.
+    """
+    require_positive_jacobian(nodes, cells, element, where)
+    row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+    elements = tabulate_elements(nodes, cells, element, grid)
+    owner, residual = np.empty(row.size, dtype=np.int32), np.empty(row.size, dtype=np.float32)
+    xi = np.empty((row.size, 2))
+    frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
+    points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
+    _locate(elements, _buckets(elements), *points, frame, owner, xi, residual)
+    shape, values = row.shape, np.moveaxis(xi.reshape(*row.shape, 2), -1, 0)
+    return Located(owner.reshape(shape), values, residual.reshape(shape))
+
+
+def _buckets(elements: ElementTable) -> _Buckets:
+    control = elements.polynomials @ elements.bezier.T
+    low = elements.centres + control.min(axis=2) - _SLACK_PX
+    high = elements.centres + control.max(axis=2) + _SLACK_PX
+    top, left = low.min(axis=0)
+    first, last = (((at - [top, left]) // _BUCKET_PX).astype(np.int64) for at in (low, high))
+    rows, cols = (int(n) for n in last.max(axis=0) + 1)
+    start, members = fill_buckets(np.hstack([first, last + 1]), rows, cols)
+    boxes = np.hstack([low, high])
+    return _Buckets(boxes, start, members, float(top), float(left), rows, cols)
+
+
+@compiled(parallel=True)
+def _locate(
+    elements: ElementTable,
+    buckets: _Buckets,
+    row: FloatArray,
+    col: FloatArray,
+    frame: tuple[float, float, float],
+    owner: NDArray[np.int32],
+    xi: FloatArray,
+    residual: NDArray[np.float32],
+) -> None:
+    """Fill owner, xi and residual; a thread writes its own points only."""
+    for block in prange((row.size + _BLOCK - 1) // _BLOCK):
+        for k in range(block * _BLOCK, min((block + 1) * _BLOCK, row.size)):
+            e, s, t = _owner(elements, buckets, row[k], col[k])
+            owner[k], xi[k, 0], xi[k, 1], residual[k] = e, s, t, np.nan
+            if e >= 0:
+                residual[k] = _residual(elements, e, s, t, row[k], col[k], frame)
+
+
+@compiled()
+def _owner(
+    elements: ElementTable, buckets: _Buckets, row: float, col: float
+) -> tuple[int, float, float]:
+    """(element, xi, eta) of a point: first by Newton's method alone, then exhaustively."""
+    i = np.floor((row - buckets.top) / _BUCKET_PX)
+    j = np.floor((col - buckets.left) / _BUCKET_PX)
+    if not (0 <= i < buckets.rows and 0 <= j < buckets.cols):
+        return -1, np.nan, np.nan
+    bucket = int(i) * buckets.cols + int(j)
+    triangular, middle = elements.triangular, elements.middle
+    for exhaustively in (False, True):
+        for e in buckets.members[buckets.start[bucket] : buckets.start[bucket + 1]]:
+            box = buckets.boxes[e]
+            if not (box[0] <= row <= box[2] and box[1] <= col <= box[3]):
+                continue
+            polynomial = elements.polynomials[e]
+            down, right = row - elements.centres[e, 0], col - elements.centres[e, 1]
+            if exhaustively:
+                found, s, t = search(
+                    polynomial, elements.bezier, elements.quarters, triangular, down, right
+                )
+            else:
+                a, b = coefficients(polynomial[0]), coefficients(polynomial[1])
+                found, s, t = _newton(a, b, not triangular, down, right, middle)
+            if found and outside(triangular, s, t) <= ON_EDGE:
+                return e, s, t
+    return -1, np.nan, np.nan
+
+
+@compiled()
+def _newton(
+    a: Coefficients, b: Coefficients, curved: bool, row: float, col: float, middle: float
+) -> tuple[bool, float, float]:
+    """Solve position(s, t) = (row, col) from the middle; (converged, s, t)."""
+    s = t = middle
+    for _ in range(_STEPS):
+        p, p_s, p_t = value_and_slopes(a, curved, s, t)
+        q, q_s, q_t = value_and_slopes(b, curved, s, t)
+        determinant = p_s * q_t - p_t * q_s
+        if determinant == 0.0:
+            return False, s, t
+        ds = (p_t * (q - col) - q_t * (p - row)) / determinant
+        dt = (q_s * (p - row) - p_s * (q - col)) / determinant
+        s += ds
+        t += dt
+        if max(abs(ds), abs(dt)) < _SETTLED:
+            return True, s, t
+        if max(abs(s), abs(t)) > _RUNAWAY:
+            return False, s, t
+    return False, s, t
+
+
+@compiled(inline=True)
+def _residual(
+    elements: ElementTable,
+    e: int,
+    s: float,
+    t: float,
+    row: float,
+    col: float,
+    frame: tuple[float, float, float],
+) -> float:
+    """Distance of the mapped (s, t) from the point, in the physical plane [px]."""
+    x0, y0, h = frame
+    x, y = coefficients(elements.absolute[e, 0]), coefficients(elements.absolute[e, 1])
+    right = x0 + h * col - value(x, not elements.triangular, s, t)
+    down = y0 - h * row - value(y, not elements.triangular, s, t)
+    return float(np.sqrt(right * right + down * down) / h)

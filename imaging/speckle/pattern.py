@@ -1,25 +1,197 @@
 """A speckle pattern that is known exactly everywhere: one layer, or dots of ink on it.
 
-The one layer is a thresholded and blurred Gaussian field (see ``layer``). The second is ink that an
-air brush leaves on a powdered surface, as on the specimen of the paper's section "Real
-Experiments": the ink's own field i, 0 ... 1, darkens what it lies on, I = p (1 - darkness i). Both
-are trigonometric polynomials, hence their product is; it is evaluated factor by factor.
+A layer is a stationary Gaussian random field (M. Grigoriu, Stochastic Calculus, Birkhäuser 2002,
+section 5.3.1.2) with a radially symmetric normal spectral density, thresholded and blurred by a
+Gaussian. The samples blurred by the *continuous* Gaussian are a trigonometric polynomial
+
+    I(row, col) = sum_k  c_k exp(2 pi i (k_row row / rows + k_col col / cols)),
+
+because the Gaussian's transfer function at the samples' Nyquist frequency is 3e-9 or less: for
+blurs of less than 2 px the samples are finer than pixels. An inverse FFT gives it at whole pixels,
+a non-uniform FFT (Barnett, Magland & af Klinteberg, SIAM J. Sci. Comput. 41 (2019) C479,
+doi:10.1137/18M120885X) at any other point, both to rounding. Where millions of points are needed, a
+B-spline of its waves is twenty times faster, and its error is proved to be small.
+
+A second layer is ink that an air brush leaves on a powdered surface, as on the specimen of the
+paper's section "Real Experiments": the ink's own field i, 0 ... 1, darkens what it lies on,
+I = p (1 - darkness i). Both are trigonometric polynomials, hence their product is; it is evaluated
+factor by factor.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
+import finufft
+import numba
 import numpy as np
+import scipy.fft
 from numpy.typing import ArrayLike
+from scipy.stats import norm
 
-from modeharvest.imaging.speckle.layer import BinaryField, Layer
 from modeharvest.imaging.speckle.periodic_spline import PeriodicSpline
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import ComplexArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
+
+TOLERANCE = 2.0**-24
+"""Proved bound of the error between pixels [fraction of full scale]: float32's own rounding."""
+NARROWEST = 2.0
+"""Least blur, in samples: the transfer function at Nyquist is exp(-pi^2 b^2 / 2) = 3e-9."""
+
+
+def gaussian_field(
+    standard_deviation: float, seed: int | Sequence[int], period: tuple[int, int]
+) -> FloatArray:
+    """One realisation of the Gaussian field, periodic with ``period`` (rows, cols) [samples].
+
+    White noise is filtered by the square root of the spectral density, of that standard deviation
+    [cycles/sample]. The sample's mean is 0; in expectation the variance is 1 and the median 0.
+    """
+    noise = np.random.default_rng(seed).standard_normal(period)
+    amplitude = np.exp(-_squared_frequency(period) / (4.0 * standard_deviation**2))
+    amplitude[0, 0] = 0.0
+    multiplicity = np.full(amplitude.shape[1], 2.0)
+    multiplicity[0] = 1.0
+    if period[1] % 2 == 0:
+        multiplicity[-1] = 1.0
+    amplitude /= math.sqrt(float((amplitude**2 @ multiplicity).sum()) / math.prod(period))
+    spectrum = scipy.fft.rfft2(noise)
+    spectrum *= amplitude
+    return np.asarray(scipy.fft.irfft2(spectrum, s=period), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class BinaryField:
+    """A thresholded Gaussian field of two phases, and its blur: what a layer looks like."""
+
+    cycles_per_px: float
+    """Standard deviation of the Gaussian field's spectral density [cycles/px]."""
+    blur_px: float
+    """Standard deviation of the Gaussian blur [px]."""
+    levels: tuple[float, float]
+    """Values outside and inside the second phase, before the blur."""
+    coverage: float
+    """Share of the area of the second phase [-]."""
+    seed: int | tuple[int, ...]
+
+    @property
+    def finer(self) -> int:
+        """Samples a pixel, along either axis, that hold the pattern."""
+        return max(1, math.ceil(NARROWEST / self.blur_px))
+
+
+class Layer:
+    """One realisation of a blurred binary field: exact at whole pixels and anywhere between.
+
+    field : its phases and its blur.
+    shape : (rows, cols) of the image to cover [px]. The pattern is periodic with the next sizes
+        that suit an FFT; the realisation depends on them, hence on ``shape``.
+    period, samples : (rows, cols) of the period [px], of samples in it.
+    """
+
+    def __init__(self, field: BinaryField, shape: tuple[int, int]) -> None:
+        self.field, self.shape = field, shape
+        rows, cols = (int(scipy.fft.next_fast_len(n, real=True)) for n in shape)
+        self.period, self.samples = (rows, cols), (field.finer * rows, field.finer * cols)
+        blur = field.finer * field.blur_px
+        transfer = np.exp(-2.0 * (math.pi * blur) ** 2 * _squared_frequency(self.samples))
+        self._spectrum: ComplexArray = scipy.fft.rfft2(self.binary())
+        self._spectrum *= transfer / math.prod(self.samples)
+
+    def binary(self) -> FloatArray:
+        """(rows, cols) of the samples: the two levels before the blur."""
+        field = self.field
+        values = gaussian_field(field.cycles_per_px / field.finer, field.seed, self.samples)
+        outside, inside = field.levels
+        return np.where(values > norm.isf(field.coverage), inside, outside)
+
+    def image(self, transfer: Callable[[ArrayLike], FloatArray] | None = None) -> FloatArray:
+        """(rows, cols) exact values at whole pixels, after a filter such as an aperture's.
+
+        ``transfer`` maps frequencies along an axis [cycles/px] to a factor; a plane wave is
+        multiplied by those of its row and its column frequency.
+        """
+        spectrum = self._spectrum * math.prod(self.samples)
+        finer = self.field.finer
+        if transfer is not None:
+            spectrum *= transfer(finer * np.fft.fftfreq(self.samples[0]))[:, None]
+            spectrum *= transfer(finer * np.fft.rfftfreq(self.samples[1]))
+        whole = scipy.fft.irfft2(spectrum, s=self.samples)[::finer, ::finer]
+        return np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]])
+
+    def __call__(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """Values at image positions (row, col) [px], off by at most ``spline.bound``."""
+        finer = self.field.finer
+        if finer == 1:
+            return self.spline(row, col)
+        return self.spline(np.multiply(finer, row), np.multiply(finer, col))
+
+    @cached_property
+    def spline(self) -> PeriodicSpline:
+        """The pattern as a spline of positions in samples, made when first asked for."""
+        return PeriodicSpline.of(self._spectrum, self.samples, TOLERANCE)
+
+    def exact(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
+        """Exact values at positions (row, col) [px]; ``eps``: the FFT's relative precision."""
+        return np.asarray(self._evaluate(row, col, eps, gradient=False)[0])
+
+    def gradient(self, row: ArrayLike, col: ArrayLike, eps: float = 1e-12) -> FloatArray:
+        """(2, ...) exact derivatives along (row, col) at image positions (row, col) [1/px]."""
+        return self._evaluate(row, col, eps, gradient=True)
+
+    def _evaluate(
+        self, row: ArrayLike, col: ArrayLike, eps: float, *, gradient: bool
+    ) -> FloatArray:
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        scale = 2.0 * math.pi / np.asarray(self.period)
+        row_angle, col_angle = scale[0] * row.ravel(), scale[1] * col.ravel()
+        modes, k_row, k_col = self._modes(eps)
+        along_row, along_col = 1j * scale[0] * k_row[:, None], 1j * scale[1] * k_col[None, :]
+        modes = np.stack([along_row * modes, along_col * modes]) if gradient else modes[None]
+        if row_angle.size == 0:
+            return np.zeros((len(modes), *row.shape))
+        values = finufft.nufft2d2(
+            row_angle, col_angle, modes, eps=eps, isign=1,
+            nthreads=numba.get_num_threads(), showwarn=0,
+        )  # fmt: skip
+        # The library's columns run from -n/2; ours from 0: a shift theorem makes up for it.
+        shift = k_col.size // 2
+        values = values.reshape(len(modes), -1) * np.exp(1j * shift * col_angle)
+        return np.ascontiguousarray(values.real).reshape(len(modes), *row.shape)
+
+    def _modes(self, eps: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """Pick the non-negligible modes of a real image, wave numbers k_row centred, k_col >= 0.
+
+        What is left out sums to at most ``eps`` of the image's mean in absolute value.
+        """
+        rows = self.samples[0]
+        size = np.abs(self._spectrum)
+        allowed = 0.25 * eps * size[0, 0]
+        by_row = size.sum(axis=1)
+        by_row = by_row[: rows // 2 + 1] + np.roll(by_row[::-1], 1)[: rows // 2 + 1]
+        row_cut, col_cut = _cut(by_row, allowed), _cut(size.sum(axis=0), allowed)
+        row_cut = min(row_cut, (rows - 1) // 2)
+        k_row = np.arange(-row_cut, row_cut + 1)
+        modes = self._spectrum[k_row, : col_cut + 1]
+        modes[:, 1:] *= 2.0
+        return modes, k_row.astype(np.float64), np.arange(col_cut + 1, dtype=np.float64)
+
+
+def _squared_frequency(period: tuple[int, int]) -> FloatArray:
+    """|f|^2 [cycles^2/px^2] in the layout of a real FFT."""
+    f_row, f_col = np.fft.fftfreq(period[0]), np.fft.rfftfreq(period[1])
+    return np.asarray(f_row[:, None] ** 2 + f_col[None, :] ** 2)
+
+
+def _cut(size: FloatArray, allowed: float) -> int:
+    """Find the last index to keep so that what follows sums to at most ``allowed``."""
+    tail = np.cumsum(size[::-1])[::-1]
+    return max(1, int(np.count_nonzero(tail > allowed)) - 1)
+
 
 SpectralUnit = Literal["cycles/px", "rad/px"]
 _CYCLES: dict[str, float] = {"cycles/px": 1.0, "rad/px": 1.0 / (2.0 * math.pi)}

@@ -26,8 +26,7 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet
-from modeharvest.imaging.mapping.isoparametric import interpolate, locate
-from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.imaging.mapping.isoparametric import interpolate, locate, locate_points
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util import __version__
 from modeharvest.util import files as disk

@@ -39,19 +39,17 @@ from modeharvest.validation.resolution.grading import (
     star_summary,
 )
 from modeharvest.validation.resolution.star import KEPT
-from modeharvest.validation.scoring.grading import (
+from modeharvest.validation.scoring.score import (
     COMMON,
     EVERYWHERE,
-    Grading,
-    csv_lines,
-    grading_summary,
-)
-from modeharvest.validation.scoring.score import (
     PERCENTILES,
     REGIONS,
     ErrorSpectrum,
+    Grading,
     RegionScore,
     Score,
+    csv_lines,
+    grading_summary,
 )
 
 _CELLS = 300

@@ -35,7 +35,7 @@ from modeharvest.validation.scoring.benchmark import (
 )
 from modeharvest.validation.scoring.conventions import check_conventions
 from modeharvest.validation.scoring.fields import Declared, read_measured
-from modeharvest.validation.scoring.grading import Grading
+from modeharvest.validation.scoring.score import Grading
 
 REACH_CELLS = 0.25
 """How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""

@@ -30,9 +30,8 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
-from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.distortion.lens import Distortion, ideal_points
 from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
-from modeharvest.imaging.distortion.undistort import ideal_points
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
 from modeharvest.imaging.photographs.files import write_image

@@ -22,8 +22,12 @@ from modeharvest.imaging.distortion.calibration.calibrate import calibrate
 from modeharvest.imaging.distortion.calibration.model import PolynomialModel
 from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
-from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
-from modeharvest.imaging.distortion.undistort import undistorted, undistorted_mask
+from modeharvest.imaging.distortion.lens import (
+    Distortion,
+    PolynomialDistortion,
+    undistorted,
+    undistorted_mask,
+)
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.photographs.files import (
