@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from modeharvest.idic.solver.passes import (
     tables_of,
     warp_pass,
 )
-from modeharvest.idic.solver.pixel_blocks import Target
+from modeharvest.idic.solver.pixel_blocks import IMAGES, Target
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import BoolArray, FloatArray
@@ -92,11 +92,6 @@ class Assembly:
         return runs_of(self.mask)
 
     @cached_property
-    def pixels(self) -> int:
-        """How many pixels count."""
-        return int((self.runs.stop - self.runs.first).sum())
-
-    @cached_property
     def _degrees(self) -> list[int]:
         """Total degree of the products that multiply each base field."""
         ansatz = self.ansatz
@@ -106,12 +101,15 @@ class Assembly:
             d += [0, 0, 1] * mode.family.wave_count
         return [*d, *ansatz.brightness.degrees, 0]
 
-    def _pairs(self, with_matrix: bool) -> NDArray[np.int64]:
-        """All pairs of base fields; without the matrix those with the residual alone."""
+    def _pairs(self, with_matrix: bool, component: int) -> NDArray[np.int64]:
+        """All pairs of base fields but zeros; without the matrix those with the residual alone."""
         d = self._degrees
-        last = len(d) - 1
-        pairs = [(e, k) for e in range(len(d)) for k in range(e if with_matrix else last, len(d))]
-        return np.array([(e, k, d[e] + d[k]) for e, k in pairs])
+        last, first_wave = len(d) - 1, 2 + len(self.ansatz.modes)
+        # What is made of the other component's gradient is zero where a displacement is fitted.
+        zero = {1 - component, *range(first_wave + 1 - component, last, 3)}
+        own = [e for e in range(len(d)) if component == IMAGES or e not in zero]
+        pairs = combinations_with_replacement(own, 2)
+        return np.array([(e, k, d[e] + d[k]) for e, k in pairs if with_matrix or k == last])
 
     @cached_property
     def _primitive_slices(self) -> list[slice]:
@@ -150,6 +148,7 @@ class Assembly:
         with_matrix: bool = True,
         instrument: NDArray[Any] | None = None,
         share: float = 1.0,
+        runs: Runs | None = None,
     ) -> NormalEquations:
         """Assemble the normal equations of r = f(x) - g(x + u(x, a)), the paper's Eq. (r).
 
@@ -167,9 +166,11 @@ class Assembly:
             its products with the derivatives of the displacement and of the gain.
         share
             How much of h is the instrument; the rest is g's own [-].
+        runs
+            Of the pixels those that count; by default all.
         """
         target = Target.images(reference, deformed, self.grid, instrument, share)
-        return self._assemble(a, target, with_matrix)
+        return self._assemble(a, target, with_matrix, runs or self.runs)
 
     def displacement(
         self, a: FloatArray, target: NDArray[Any], with_matrix: bool = True
@@ -178,22 +179,22 @@ class Assembly:
 
         The target is a displacement (rows, cols, 2) [mm].
         """
+        known = (np.asarray(target[..., c], dtype=np.float64) for c in (0, 1))
+        along = (Target.along(c, u, self.grid) for c, u in enumerate(known))
+        x, y = (self._assemble(a, field, with_matrix, self.runs) for field in along)
+        return x + y
 
-        def along(component: int) -> NormalEquations:
-            known = np.asarray(target[..., component], dtype=np.float64)
-            return self._assemble(a, Target.along(component, known, self.grid), with_matrix)
-
-        return along(0) + along(1)
-
-    def _assemble(self, a: FloatArray, target: Target, with_matrix: bool) -> NormalEquations:
-        pairs, degrees, runs = self._pairs(with_matrix), self._degrees, self.runs
+    def _assemble(
+        self, a: FloatArray, target: Target, with_matrix: bool, runs: Runs
+    ) -> NormalEquations:
+        pairs, degrees = self._pairs(with_matrix, target.component), self._degrees
         top = max(int(pairs[:, 2].max()), *degrees) + 1
         moments = np.zeros((BANDS, len(pairs), top, top))
         left = np.zeros(BANDS, dtype=np.int64)
         tables = tables_of(self.ansatz, self.grid, self.ansatz.checked(a))
         in_parallel(accumulate, target, runs, tables, pairs, len(degrees), moments, left)
         off = int(left.sum())
-        return self._from_moments(pairs, moments.sum(axis=0), self.pixels - off, off)
+        return self._from_moments(pairs, moments.sum(axis=0), runs.pixels - off, off)
 
     def _from_moments(
         self, pairs: NDArray[np.int64], moments: FloatArray, used: int, off: int

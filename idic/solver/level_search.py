@@ -80,7 +80,7 @@ class LevelSearch:
                 if not self.finest:
                     return rough, some
                 start = rough.unknowns
-                curvature = rough.curvature * (assembly.pixels / some.pixels)
+                curvature = rough.curvature * (assembly.runs.pixels / some.runs.pixels)
         for _ in range(_ROUNDS):
             found = self._minimise(assembly, start, curvature, leads=not self.finest)
             history += found.history
@@ -88,7 +88,7 @@ class LevelSearch:
             if self.pair.valid is None:
                 break
             assembly = self._valid_assembly(start)
-            if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.pixels:
+            if np.count_nonzero(assembly.mask != used.mask) <= _SETTLED * assembly.runs.pixels:
                 break
         return replace(found, history=history), used
 
@@ -132,7 +132,7 @@ class LevelSearch:
 
     def _thinned(self, assembly: Assembly) -> Assembly:
         """One row of a few, if that leaves plenty of pixels."""
-        if assembly.pixels < _STRIDE * _PLENTY * self.ansatz.size:
+        if assembly.runs.pixels < _STRIDE * _PLENTY * self.ansatz.size:
             return assembly
         rows = np.zeros_like(assembly.mask)
         rows[_STRIDE // 2 :: _STRIDE] = assembly.mask[_STRIDE // 2 :: _STRIDE]
@@ -152,8 +152,8 @@ class LevelSearch:
         border and at its holes are not to weigh as if they had left.
         """
         limits, factor = self.options, self.level.factor
-        rows = np.diff(assembly.runs.row_start) > 0 if assembly.pixels else slice(None)
-        kept = (assembly.pixels + assembly.outside) / max(1, self._material[rows].sum())
+        rows = np.diff(assembly.runs.row_start) > 0 if assembly.runs.pixels else slice(None)
+        kept = (assembly.runs.pixels + assembly.outside) / max(1, self._material[rows].sum())
         most = min(1.0, limits.max_outside / kept) if kept > 0 else limits.max_outside
         tolerance = limits.coarse_tolerance_px * factor if leads else limits.tolerance_px
         return minimise(

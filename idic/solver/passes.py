@@ -130,6 +130,17 @@ class Runs(NamedTuple):
     row_start: NDArray[Any]
     """(rows + 1,) number of the first run of each row."""
 
+    @property
+    def pixels(self) -> int:
+        """How many pixels count."""
+        return int((self.stop - self.first).sum())
+
+    def within(self, top: int, left: int, side: int) -> Runs:
+        """Those pixels that lie in a square block; of some runs nothing is left."""
+        begin, end = self.row_start[[top, min(top + side, len(self.row_start) - 1)]]
+        first, stop = (np.clip(k[begin:end], left, left + side) for k in (self.first, self.stop))
+        return Runs(first, stop, np.clip(self.row_start, begin, end) - begin)
+
 
 class Tables(NamedTuple):
     """The ansatz at some unknowns, as one-dimensional tables along the rows and columns."""
@@ -297,6 +308,8 @@ def accumulate(
         product = np.empty(BLOCK)
         row_moments = np.zeros((pairs.shape[0], moments.shape[2]))
         for row in range(band * rows // bands, (band + 1) * rows // bands):
+            if runs.row_start[row] == runs.row_start[row + 1]:
+                continue
             run, begin = start_row(runs, tables, row, block)
             while run < runs.row_start[row + 1]:
                 n, run, begin = take_block(target, runs, tables, row, run, begin, block)

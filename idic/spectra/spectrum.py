@@ -126,6 +126,8 @@ def spectral_density(
     size = grid.pixel_size * inside.shape[1], grid.pixel_size * inside.shape[0]
     u = [np.where(inside, displacement[part][..., c], 0.0) for c in range(2)]
     x, y = grid.x[part[1]], grid.y[part[0]]
+    if not all(np.isfinite(component).all() for component in u):
+        raise InputError("expected finite displacements where the mask is set, got NaN")
     affine = np.stack([_affine(component, inside, x, y) for component in u])
     for component, (constant, along_x, along_y) in zip(u, affine, strict=True):
         plane = (constant + along_x * x)[None, :] + (along_y * y)[:, None]
@@ -191,8 +193,6 @@ def _check(displacement: FloatArray, grid: PixelGrid, mask: BoolArray, pitch: fl
         raise InputError("expected material in the mask, got an all-black mask")
     if not pitch > 2 * grid.pixel_size:
         raise InputError(f"expected a unit cell of more than 2 px, got {pitch} mm")
-    if not np.isfinite(displacement[mask]).all():
-        raise InputError("expected finite displacements where the mask is set, got NaN")
 
 
 ON_GRID = 0.1

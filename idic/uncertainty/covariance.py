@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +29,7 @@ from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.solver.assembly import Assembly, valid_pixels
 from modeharvest.idic.solver.final_smoothing import smoothed_pair
 from modeharvest.idic.solver.noise import ImageNoise
+from modeharvest.idic.solver.passes import Runs, runs_of
 from modeharvest.idic.solver.pyramid import FULL, level_pair
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
@@ -199,18 +201,13 @@ class MatchedImages:
         inverse = self.inverse_hessian if inverse is None else inverse
         return _sandwich(inverse, np.vstack(found)) / len(found)
 
-    def _blocks(self, block: float) -> list[Assembly]:
+    def _blocks(self, block: float) -> list[Runs]:
         """The pixels of each block; InputError if there are fewer than eight."""
-        grid, mask = self.result.grid, self.used
+        grid, runs = self.result.grid, runs_of(self.used)
         side = max(1, round(block / grid.pixel_size))
-        found = []
-        for top in range(0, grid.rows, side):
-            for left in range(0, grid.cols, side):
-                here = (slice(top, top + side), slice(left, left + side))
-                if mask[here].any():
-                    inside = np.zeros_like(mask)
-                    inside[here] = mask[here]
-                    found.append(Assembly(self.result.ansatz, grid, inside))
+        corners = product(range(0, grid.rows, side), range(0, grid.cols, side))
+        blocks = (runs.within(*corner, side) for corner in corners)
+        found = [part for part in blocks if part.pixels]
         if len(found) < _FEWEST_BLOCKS:
             raise InputError(
                 f"expected at least {_FEWEST_BLOCKS} blocks of {block} mm with material, got "
@@ -219,11 +216,12 @@ class MatchedImages:
         return found
 
     def _block_gradients(
-        self, blocks: list[Assembly], f: FloatImage, deformed: FloatImage
+        self, blocks: list[Runs], f: FloatImage, deformed: FloatImage
     ) -> FloatArray:
         """(blocks, n): the derivative of each block's share of the cost."""
         a, g = self.result.unknowns, SplineImage.of(deformed, self.result.order)
-        return np.array([b.images(a, f, g, False).gradient for b in blocks])
+        every = Assembly(self.result.ansatz, self.result.grid, self.used)
+        return np.array([every.images(a, f, g, False, runs=part).gradient for part in blocks])
 
 
 def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:

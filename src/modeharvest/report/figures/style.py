@@ -162,14 +162,14 @@ def to_svg(drawn: Figure, name: str, title: str, *, exact: bool = False) -> str:
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].rstrip()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\bid="(?:figure|axes|patch|line2d|matplotlib|text|xtick|ytick|[A-Za-z]+Coll'
+    svg = re.sub(r' id="(?:figure|axes|patch|line2d|matplotlib|text|xtick|ytick|[A-Za-z]+Coll'
                  r'ection|QuadMesh|LineCollection)[\w.]*"', "", svg)  # fmt: skip
-    svg = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', svg)
+    svg = re.sub(r' id="([^"]+)"', rf' id="{name}-\1"', svg)
     svg = svg.replace("url(#", f"url(#{name}-")
     svg = re.sub(r'xlink:href="#', f'href="#{name}-', svg).replace("xlink:href=", "href=")
     svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # it would be the page's, too
     svg = re.sub(r"font: [^;\"]*?([\d.]+px)[^;\"]*", r"font-size: \1", svg)
-    svg = re.sub(r" ?font-family: [^;\"]*;?", "", svg)
+    svg = re.sub(r"font-family: [^;\"]*;?", "", svg)
     svg = re.sub(r' d="([^"]*)"', _rounded, svg)
     svg = svg.replace(INK, "currentColor").replace(MUTED, "var(--muted)")
     box = re.search(r'viewBox="[^"]*"', svg)
@@ -195,7 +195,7 @@ class _WebPRenderer(RendererSVG):
         width, height = 72 * cols / self.image_dpi, 72 * rows / self.image_dpi
         how = {"lossless": True, "quality": 20} if self.exact else {"quality": QUALITY}
         packed = io.BytesIO()
-        Image.fromarray(im).save(packed, format="webp", method=2, **how)
+        Image.fromarray(np.ascontiguousarray(im)).save(packed, format="webp", method=2, **how)
         place = {"x": x, "y": y + height - self.height, "width": width, "height": height}
         attributes = {name: f"{value:.6f}" for name, value in place.items()}
         attributes["transform"] = f"scale(1 -1) translate(0 {-height:.6f})"
