@@ -110,7 +110,7 @@ def locate(
         np.empty(size, dtype=np.float32), 0, grid.cols, float(grid.x0), float(grid.y0),
         float(grid.pixel_size),
     )  # fmt: skip
-    order = in_turn(start.size - 1)
+    order = _in_turn(start.size - 1)
     overlapping = rasterise.rasterise(elements, fields, pixels, start, visits, order)
     return Located(
         pixels.element.reshape(grid.shape), pixels.values.reshape(-1, *grid.shape),
@@ -118,7 +118,7 @@ def locate(
     )  # fmt: skip
 
 
-def in_turn(bands: int) -> IntArray:
+def _in_turn(bands: int) -> IntArray:
     """Order of the bands that gives each thread as many from every part of the image."""
     threads = numba.get_num_threads()
     return np.concatenate([np.arange(k, bands, threads) for k in range(threads)])
