@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import importlib
+import importlib.util
 import json
 import os
 import random
@@ -33,11 +33,13 @@ import numba
 
 NO_DISK = 77
 _MODULES = (
-    "runs.experiment",
-    "runs.photographs.pipeline",
-    "report.photographs",
-    "runs.study",
-    "cli.root",
+    "modeharvest.runs.experiment",
+    "modeharvest.runs.photographs.pipeline",
+    "modeharvest.report.photographs",
+    "modeharvest.runs.study",
+    "modeharvest.cli.root",
+    "distributed",
+    "gmsh",
 )
 _NEW_USER, _NEW_MOUNTS, _REMOUNT = 0x10000000, 0x00020000, 0x20
 _ATTEMPTS, _LONGEST_S = 60, 600
@@ -178,7 +180,8 @@ def disturb_all(ways: list[list[Any]], out: str, command: list[str]) -> int:
 
 def main() -> None:
     for module in _MODULES:
-        importlib.import_module(f"modeharvest.{module}")
+        if importlib.util.find_spec(module) is not None:  # gmsh may be missing
+            importlib.import_module(module)
     numba.njit(lambda x: x)(0)  # has the compiler import the rest of itself; begins no threads
     assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
     while line := sys.stdin.readline():

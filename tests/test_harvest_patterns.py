@@ -19,7 +19,7 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.util.errors import InputError
 
-PITCH, PIXEL = 1.9, 0.035
+PITCH, PIXEL = 1.9, 0.042
 FloatArray = NDArray[np.float64]
 
 
@@ -63,7 +63,7 @@ def test_three_waves_of_a_hexagonal_lattice_are_three_modes(tmp_path: Path) -> N
     for i, size in enumerate((3.0, -2.2, 2.6)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(vectors, Box.centred(5 * PITCH + 0.1, 6.4 * vectors[1, 1]), (0.0, 0.0))
-    scene = Photographed(PixelGrid.centred(430, 430, PIXEL), domain, holes, 1.4)
+    scene = Photographed(PixelGrid.centred(358, 358, PIXEL), domain, holes, 1.4)
     scene.save(tmp_path, {"frame": of(ansatz, a)})
     run = harvesting(tmp_path, f"polygon = {corners(cellular, scene.grid)}")
     measured = run.results()["frame"]
@@ -97,7 +97,7 @@ def two_patterns() -> tuple[Photographed, Displacement, tuple[Box, Box]]:
     for i, size in enumerate((3.0, 2.5)):
         a[ansatz.v_slice(i)][0] = size
     holes = lattice_points(PITCH * np.eye(2), cellular, (PITCH / 2, PITCH / 2))
-    scene = Photographed(PixelGrid.centred(540, 430, PIXEL), domain, holes, 1.4)
+    scene = Photographed(PixelGrid.centred(450, 358, PIXEL), domain, holes, 1.4)
     return scene, of(ansatz, a), (above, below)
 
 
@@ -189,7 +189,7 @@ def test_a_column_that_leaves_the_image_does_not_move_the_lattice_by_a_cell(
     holes = lattice_points(PITCH * np.eye(2), Box(-5.0, 12.0, -12.0, 12.0), (0.0, 0.0))
     if not edge:
         holes = lattice_points(PITCH * np.eye(2), Box.centred(30.0, 24.0), (0.0, 0.0))
-    scene = Photographed(PixelGrid.centred(330, 400, PIXEL), outline, holes, 1.4)
+    scene = Photographed(PixelGrid.centred(275, 333, PIXEL), outline, holes, 1.4)
 
     def truth(points: FloatArray) -> FloatArray:
         return 0.8 * PITCH * np.array([1.0, 0.0]) - 0.01 * points
