@@ -349,7 +349,7 @@ def test_a_title_may_look_like_markup(capsys: pytest.CaptureFixture[str]) -> Non
     from modeharvest.report.model import Card, Report, ReportTable, Section, print_report
 
     table = ReportTable("[/t]", ["[b]"], [["[/b]"]], on_terminal=True)
-    section = Section("s", "S", [Card.tabular(table)])
+    section = Section("s", "S", Card.tabular(table))
     report = Report("kind", "[/bold] [red]", sections=[section], warnings=["[/x]"])
     print_report(report, Path("out[/bold]"))
     text = capsys.readouterr().out
