@@ -1,0 +1,149 @@
+"""Factorisation of sparse symmetric positive definite matrices of one pattern, by a library.
+
+The first library found of these factorises: MUMPS through petsc4py (beside dolfinx), PARDISO of
+Intel's MKL (``pip install pypardiso``), SuperLU of SciPy, which takes several times as long. The
+order of elimination is found once for all matrices of a pattern.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.sparse import csc_matrix, csr_array, csr_matrix, triu
+from scipy.sparse.linalg import splu
+
+from modeharvest.util.arrays import FloatArray
+
+
+class Factor(Protocol):
+    """A factorised matrix."""
+
+    library: str
+    """What factorised it."""
+
+    def update(self, matrix: csr_array) -> None:
+        """Factorise another matrix of the same pattern."""
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Solve for one right-hand side (n,) or for several (n, k)."""
+
+
+def factorise(matrix: csr_array, library: str | None = None) -> Factor:
+    """Factorise a symmetric positive definite matrix, of sorted indices.
+
+    Parameters
+    ----------
+    matrix
+        (n, n), both triangles.
+    library
+        A name among ``LIBRARIES``; by default the first one that is there.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If the library named isn't there.
+    ArithmeticError
+        If the matrix is singular, here or in an update.
+    """
+    for kind in LIBRARIES.values() if library is None else [LIBRARIES[library]]:
+        try:
+            return kind(matrix)
+        except ModuleNotFoundError:
+            if library is not None:
+                raise
+    raise AssertionError("SciPy is always there")
+
+
+class _Mumps:
+    library = "MUMPS"
+
+    def __init__(self, matrix: csr_array) -> None:
+        from petsc4py import PETSc
+
+        # The arrays are shared, so that new values need no call for each row.
+        self._arrays = (
+            matrix.indptr.astype(PETSc.IntType),
+            matrix.indices.astype(PETSc.IntType),
+            matrix.data.astype(PETSc.ScalarType),
+        )
+        shape = matrix.shape
+        self._matrix = PETSc.Mat().createAIJWithArrays(shape, self._arrays, comm=PETSc.COMM_SELF)
+        self._matrix.setOption(PETSc.Mat.Option.SPD, True)
+        self._pc = PETSc.PC().create(PETSc.COMM_SELF)
+        self._pc.setOperators(self._matrix)
+        self._pc.setType(PETSc.PC.Type.CHOLESKY)
+        self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+        self._pc.setFactorSetUpSolverType()
+        self._factor = self._pc.getFactorMatrix()
+        self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
+        self._factor.setMumpsIcntl(14, 60)  # room for fill-in [%]
+        self._vectors = self._matrix.createVecs()
+        self._set_up()
+
+    def update(self, matrix: csr_array) -> None:
+        self._arrays[2][:] = matrix.data
+        self._matrix.stateIncrease()
+        self._set_up()
+
+    def _set_up(self) -> None:
+        self._pc.setUp()
+        code = self._factor.getMumpsInfog(1)
+        if code < 0:
+            raise ArithmeticError(f"MUMPS failed with INFOG(1) = {code}")
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        from petsc4py import PETSc
+
+        if rhs.ndim == 1:
+            b, x = self._vectors
+            b.array[:] = rhs
+            self._factor.solve(b, x)
+            return np.array(x.array)
+        columns = np.asfortranarray(rhs)
+        b = PETSc.Mat().createDense(rhs.shape, array=columns, comm=PETSc.COMM_SELF)
+        x = b.duplicate()
+        self._factor.matSolve(b, x)
+        return np.array(x.getDenseArray())
+
+
+class _Pardiso:
+    library = "PARDISO"
+
+    def __init__(self, matrix: csr_array) -> None:
+        from pypardiso import PyPardisoSolver
+
+        self._solver = PyPardisoSolver(mtype=2)
+        self._upper = csr_matrix(triu(matrix, format="csr"))
+        self._solver.factorize(self._upper)
+
+    def update(self, matrix: csr_array) -> None:
+        self._upper = csr_matrix(triu(matrix, format="csr"))
+        self._solver.set_phase(22)  # numbers only
+        self._solver._call_pardiso(self._upper, np.zeros((matrix.shape[0], 1)))
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        return np.asarray(self._solver.solve(self._upper, rhs))
+
+
+class _SuperLU:
+    library = "SuperLU"
+
+    def __init__(self, matrix: csr_array) -> None:
+        self.update(matrix)
+
+    def update(self, matrix: csr_array) -> None:
+        try:
+            self._factor: Any = splu(
+                csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise ArithmeticError(f"SuperLU failed: {error}") from error
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        return np.asarray(self._factor.solve(rhs))
+
+
+LIBRARIES: dict[str, Any] = {"mumps": _Mumps, "pardiso": _Pardiso, "superlu": _SuperLU}
+"""In the order in which they are tried."""

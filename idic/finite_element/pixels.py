@@ -1,0 +1,237 @@
+"""Pixels by the elements they lie in, and compiled normal equations of a displacement's nodes.
+
+For every pixel x of the reference that counts, with r = f(x) - g(x + u) and the gradient h that
+weighs it, an element sums N_a N_b h_i h_j and N_a h_i r over its pixels. The elements are dealt to
+the threads and summed in order, so that the result does not depend on how many there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.solver.pyramid import LevelPair
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.spline import sample_points
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.compiled import compiled
+
+_BLOCK = 64
+"""Pixels of an element that are worked on together."""
+
+
+class ElementPixels(NamedTuple):
+    """The pixels that count, element by element.
+
+    Parameters
+    ----------
+    start
+        (m + 1,): those of element e are start[e] ... start[e + 1] - 1.
+    row, col
+        (p,) int32 position [px].
+    xi
+        (2, p) float32 local coordinates [-].
+    grey
+        (p,) float32 f there.
+    slope
+        (2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0).
+    """
+
+    start: NDArray[Any]
+    row: NDArray[Any]
+    col: NDArray[Any]
+    xi: NDArray[Any]
+    grey: NDArray[Any]
+    slope: NDArray[Any]
+
+
+def pixels_of(
+    mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]
+) -> ElementPixels:
+    """Sort the pixels of a mask by the elements of a T6 mesh; those beside the mesh are left out.
+
+    ``image`` (rows, cols) is f.
+    """
+    located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
+    flat = np.flatnonzero(mask & located.mask)
+    element = located.element.ravel()[flat]
+    order = np.argsort(element, kind="stable")
+    flat, element = flat[order], element[order]
+    row, col = np.divmod(flat, grid.cols)
+    start = np.searchsorted(element, np.arange(len(mesh.cells) + 1))
+    xi = located.values.reshape(2, -1)[:, flat].astype(np.float32)
+    grey = np.asarray(image, np.float32).ravel()[flat]
+    none = np.empty((2, 0), np.float32)
+    return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, grey, none)
+
+
+@dataclass(frozen=True, eq=False)
+class NodalEquations:
+    """Normal equations of the nodes' displacements, element by element.
+
+    Parameters
+    ----------
+    blocks
+        (m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2].
+    gradient
+        (m, 6, 2) sums of N_a h_i r [grey levels^2/mm].
+    square_sum, pixels, outside
+        Sum of r^2 [grey levels^2], pixels it is over, and pixels mapped to where g isn't valid.
+    """
+
+    blocks: FloatArray
+    gradient: FloatArray
+    square_sum: float
+    pixels: int
+    outside: int
+
+
+def normal_equations(
+    pixels: ElementPixels, mesh: Mesh, level: LevelPair, u: FloatArray, share: float
+) -> NodalEquations:
+    """Pass over all pixels.
+
+    Parameters
+    ----------
+    pixels
+        Of the level's reference.
+    mesh
+        T6.
+    level
+        Whose deformed image is sampled.
+    u
+        (n, 2) displacement of the nodes [mm].
+    share
+        Of the reference's gradient, pushed forward, in what weighs the residual; the rest is that
+        of the deformed image at x + u [-].
+    """
+    m = len(mesh.cells)
+    blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 3))
+    valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
+    g = level.deformed
+    _accumulate(
+        pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
+        level.grid.pixel_size, share, blocks, gradient, sums,
+    )  # fmt: skip
+    total, count, outside = sums.sum(axis=0)
+    return NodalEquations(blocks, gradient, float(total), int(count), int(outside))
+
+
+@compiled(parallel=True, relaxed=True)
+def _accumulate(
+    pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, pixel_size: float,
+    share: float, blocks: Any, gradient: Any, sums: Any,
+) -> None:  # fmt: skip
+    for e in prange(x.shape[0]):
+        own = np.empty((7, _BLOCK))
+        N = np.empty((6, _BLOCK))
+        h = np.empty((2, _BLOCK))
+        for begin in range(pixels.start[e], pixels.start[e + 1], _BLOCK):
+            n = min(_BLOCK, pixels.start[e + 1] - begin)
+            _shapes(pixels.xi, begin, n, N)
+            _sample(pixels, begin, n, N, u[e], coefficients, order, valid, pixel_size, own, sums[e])
+            if share > 0.0:
+                _push_forward(pixels, begin, n, x[e], u[e], share, own)
+            _add(n, N, own, h, blocks[e], gradient[e])
+        for a in range(6):
+            for b in range(a):
+                for k in range(3):
+                    blocks[e, k, a, b] = blocks[e, k, b, a]
+
+
+@compiled(relaxed=True)
+def _shapes(xi: Any, begin: int, n: int, N: Any) -> None:
+    """Fill the shape functions of a T6 element (6, n)."""
+    for m in range(n):
+        s, t = float(xi[0, begin + m]), float(xi[1, begin + m])
+        r = 1.0 - s - t
+        N[0, m], N[1, m], N[2, m] = r * (2.0 * r - 1.0), s * (2.0 * s - 1.0), t * (2.0 * t - 1.0)
+        N[3, m], N[4, m], N[5, m] = 4.0 * r * s, 4.0 * s * t, 4.0 * t * r
+
+
+@compiled(relaxed=True)
+def _sample(
+    pixels: Any, begin: int, n: int, N: Any, u: Any, coefficients: Any, order: int, valid: Any,
+    pixel_size: float, own: Any, sums: Any,
+) -> None:  # fmt: skip
+    """Fill gradient (2), residual, and weight 1 or 0, of a block; count its pixels."""
+    g_x, g_y, residual, at_row, at_col = own[0], own[1], own[2], own[4], own[5]
+    g, weight, per_px = own[6], own[3], 1.0 / pixel_size
+    for m in range(n):
+        right = up = 0.0
+        for a in range(6):
+            right += N[a, m] * u[a, 0]
+            up += N[a, m] * u[a, 1]
+        at_row[m] = pixels.row[begin + m] - up * per_px
+        at_col[m] = pixels.col[begin + m] + right * per_px
+    sample_points(coefficients, order, at_row, at_col, n, g, g_y, g_x)
+    for m in range(n):
+        counts = not np.isnan(g[m])
+        if counts and valid.size:
+            counts = valid[int(np.rint(at_row[m])), int(np.rint(at_col[m]))]
+        weight[m] = 1.0 if counts else 0.0
+        residual[m] = pixels.grey[begin + m] - g[m] if counts else 0.0
+        g_x[m] = g_x[m] * per_px if counts else 0.0
+        g_y[m] = -g_y[m] * per_px if counts else 0.0
+        sums[0] += residual[m] * residual[m]
+        sums[1] += weight[m]
+        sums[2] += 1.0 - weight[m]
+
+
+@compiled(relaxed=True)
+def _push_forward(
+    pixels: Any, begin: int, n: int, x: Any, u: Any, share: float, own: Any
+) -> None:
+    """Mix F^-T grad f into the gradient of a block."""
+    for m in range(n):
+        s, t = float(pixels.xi[0, begin + m]), float(pixels.xi[1, begin + m])
+        r = 1.0 - s - t
+        d_s = (1.0 - 4.0 * r, 4.0 * s - 1.0, 0.0, 4.0 * (r - s), 4.0 * t, -4.0 * t)
+        d_t = (1.0 - 4.0 * r, 0.0, 4.0 * t - 1.0, -4.0 * s, 4.0 * s, 4.0 * (r - t))
+        X_s = X_t = Y_s = Y_t = x_s = x_t = y_s = y_t = 0.0
+        for a in range(6):
+            X_s += d_s[a] * x[a, 0]
+            X_t += d_t[a] * x[a, 0]
+            Y_s += d_s[a] * x[a, 1]
+            Y_t += d_t[a] * x[a, 1]
+            x_s += d_s[a] * (x[a, 0] + u[a, 0])
+            x_t += d_t[a] * (x[a, 0] + u[a, 0])
+            y_s += d_s[a] * (x[a, 1] + u[a, 1])
+            y_t += d_t[a] * (x[a, 1] + u[a, 1])
+        det = x_s * y_t - x_t * y_s
+        if det > 0.0 and own[3, m] > 0.0:
+            f_x, f_y = float(pixels.slope[0, begin + m]), float(pixels.slope[1, begin + m])
+            f_s, f_t = f_x * X_s + f_y * Y_s, f_x * X_t + f_y * Y_t
+            own[0, m] += share * ((f_s * y_t - f_t * y_s) / det - own[0, m])
+            own[1, m] += share * ((f_t * x_s - f_s * x_t) / det - own[1, m])
+
+
+@compiled(relaxed=True)
+def _add(n: int, N: Any, own: Any, h: Any, blocks: Any, gradient: Any) -> None:
+    """Add a block's products to an element's sums, its upper triangle."""
+    g_x, g_y, residual = own[0], own[1], own[2]
+    for a in range(6):
+        N_a, h_x, h_y = N[a], h[0], h[1]
+        r_x = r_y = 0.0
+        for m in range(n):
+            h_x[m], h_y[m] = N_a[m] * g_x[m], N_a[m] * g_y[m]
+            r_x += h_x[m] * residual[m]
+            r_y += h_y[m] * residual[m]
+        gradient[a, 0] += r_x
+        gradient[a, 1] += r_y
+        for b in range(a, 6):
+            N_b = N[b]
+            xx = xy = yy = 0.0
+            for m in range(n):
+                xx += h_x[m] * g_x[m] * N_b[m]
+                xy += h_x[m] * g_y[m] * N_b[m]
+                yy += h_y[m] * g_y[m] * N_b[m]
+            blocks[0, a, b] += xx
+            blocks[1, a, b] += xy
+            blocks[2, a, b] += yy
