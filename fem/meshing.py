@@ -305,3 +305,46 @@ def _current_block() -> MeshBlock:
     position = dict(zip(tags, coordinates.reshape(-1, 3)[:, :2], strict=True))
     nodes = np.array([position[tag] for tag in used])
     return MeshBlock(nodes, np.searchsorted(used, cells).astype(np.int64))
+
+
+def mesh_outlines(
+    parts: Collection[Collection[Collection[FloatArray]]], size: float
+) -> MeshBlock:
+    """Mesh plane bodies bounded by smooth curves with T6 elements.
+
+    Parameters
+    ----------
+    parts
+        Of each body its loops, the outer one first, then those of holes. A loop is a sequence of
+        curves (k, 2) [any unit], each of which ends where the next one begins; between their ends
+        the curves are splines through their points.
+    size
+        Edge length of the elements [the same unit]; shorter ones where a loop is short.
+    """
+    with quiet_gmsh(), gmsh_options({"Mesh.MeshSizeMax": size}):
+        geo = gmsh.model.geo
+        for loops in parts:
+            tags = [_add_loop(loop, size) for loop in loops]
+            geo.addPlaneSurface(tags)
+        geo.synchronize()
+        gmsh.model.mesh.generate(2)
+        gmsh.model.mesh.setOrder(2)
+        return _current_block()
+
+
+_LEAST_ELEMENTS = 8
+"""Around a loop."""
+
+
+def _add_loop(loop: Collection[FloatArray], size: float) -> int:
+    geo = gmsh.model.geo
+    lengths = [float(np.linalg.norm(np.diff(c, axis=0), axis=1).sum()) for c in loop]
+    size = min(size, sum(lengths) / _LEAST_ELEMENTS)
+    begins = [geo.addPoint(*curve[0], 0.0) for curve in loop]
+    curves = []
+    for k, (curve, length) in enumerate(zip(loop, lengths, strict=True)):
+        inner = [geo.addPoint(*point, 0.0) for point in curve[1:-1]]
+        ends = begins[k], begins[(k + 1) % len(begins)]
+        curves.append(geo.addSpline([ends[0], *inner, ends[1]]))
+        geo.mesh.setTransfiniteCurve(curves[-1], max(1, round(length / size)) + 1)
+    return int(geo.addCurveLoop(curves))

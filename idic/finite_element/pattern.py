@@ -46,6 +46,16 @@ class NodalPattern:
         _scatter(self.indptr, self.indices, nodes, np.ascontiguousarray(blocks), data)
         return data
 
+    def both(self, matrix: csr_array) -> csr_array:
+        """(2 n, 2 n) of a matrix (n, n) of either component, with this pattern."""
+        rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+        own = np.repeat(np.arange(self.indptr.size - 1), np.diff(self.indptr))
+        n = self.indptr.size - 1
+        at = np.searchsorted(own * n + self.indices, rows * n + matrix.indices)
+        parts = np.zeros((3, self.indices.size))
+        parts[0, at] = parts[2, at] = matrix.data
+        return self.matrix(parts)
+
     def matrix(self, parts: FloatArray) -> csr_array:
         """(2 n, 2 n) of nodal parts xx, xy, yy (3, q)."""
         n = self.indptr.size - 1

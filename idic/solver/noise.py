@@ -144,9 +144,6 @@ class NoiseTransfer:
             return cls()
         x, y = grid.x[cols], grid.y[rows]
         u = ansatz.displacement(a, x, y)
-        # Whole pixels make no difference to where between pixels a position is.
-        along, down = (u[some][:, k] / grid.pixel_size % 1.0 for k in (0, 1))
-        (w_x, s_x), (w_y, s_y) = _variances(order, along), _variances(order, down)
         h = 0.5 * grid.pixel_size
         F_x, F_y = (
             (ansatz.displacement(a, x + dx, y + dy) - ansatz.displacement(a, x - dx, y - dy))[some]
@@ -154,6 +151,13 @@ class NoiseTransfer:
             for dx, dy in ((h, 0.0), (0.0, h))
         )
         det = (1.0 + F_x[:, 0]) * (1.0 + F_y[:, 1]) - F_y[:, 0] * F_x[:, 1]
+        return cls.at(u[some] / grid.pixel_size, det, order)
+
+    @classmethod
+    def at(cls, u_px: FloatArray, det: FloatArray, order: int) -> NoiseTransfer:
+        """From displacements (k, 2) of whole pixels [px], det F there (k,), and a spline's order."""
+        # Whole pixels make no difference to where between pixels a position is.
+        (w_x, s_x), (w_y, s_y) = (_variances(order, u_px[:, c] % 1.0) for c in (0, 1))
         return cls(
             float(np.mean(w_x * w_y)),
             float(0.5 * np.mean(s_x * w_y + w_x * s_y)),

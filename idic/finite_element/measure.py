@@ -1,0 +1,390 @@
+"""The whole displacement of a speckled body by regularised finite-element DIC.
+
+Minimises sum (f(x) - g(x + u))^2 + lambda (u - u_0)'R(u - u_0) over the displacements u of the
+nodes of a mesh of the material by Gauss-Newton steps, from blurred images and long cut-off
+wavelengths to the images themselves; R is the smoothness of what is added to the start u_0. The
+last cut-off wavelength is found from the images alone, see ``cutoff``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.cutoff import (
+    Linearised,
+    Risk,
+    best_of,
+    deviations,
+    least_risk,
+    risk,
+)
+from modeharvest.idic.finite_element.images import continued, images_on
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
+from modeharvest.idic.finite_element.pattern import NodalPattern
+from modeharvest.idic.finite_element.pixels import (
+    ElementPixels,
+    NodalEquations,
+    normal_equations,
+    pixels_of,
+)
+from modeharvest.idic.finite_element.result import NodalResult, Step
+from modeharvest.idic.finite_element.smoothness import Rows, add_at, inner_sides, sample, smoothness_rows, summed
+from modeharvest.idic.result import Result
+from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
+from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
+from modeharvest.idic.solver.weighting import best_blur
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.progress import Progress, silent
+
+_FIRST_PX = 20.0
+"""Cut-off wavelength from which on the best one is sought [px]."""
+_ROUNDS = 3
+_SETTLED = 0.25
+"""Relative change of the cut-off wavelength that needs no other round."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage from coarse to fine.
+
+    Parameters
+    ----------
+    level
+        Binning and blur of the images.
+    cutoff_px
+        Wavelength of which the regularisation leaves one half [px].
+    """
+
+    level: Level
+    cutoff_px: float
+
+
+STAGES = (Stage(Level(2, 3.0), 200.0), Stage(Level(2, 1.5), 80.0), Stage(FULL, 40.0))
+
+
+@dataclass(frozen=True)
+class FiniteElementOptions:
+    """How to measure on a mesh.
+
+    Parameters
+    ----------
+    element_px
+        Edge length of the elements where the mesh is to be made [px].
+    stages
+        Before the last one, which has the unfiltered images and ``cutoff_px``.
+    cutoff_px
+        Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk.
+    edge_px
+        Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
+    order
+        Of the spline: 3, 5 or 11; by default as in a correlation.
+    steps
+        Of Gauss-Newton in each stage, at most.
+    tolerance_px
+        A stage ends with a step shorter than that (rms over the nodes), as a share of the last
+        stage's; on earlier stages ten times that [px].
+    longest_step_px
+        Of a node [px].
+    """
+
+    element_px: float = 16.0
+    stages: tuple[Stage, ...] = STAGES
+    cutoff_px: float | None = None
+    edge_px: int = 0
+    order: int | None = None
+    steps: int = 4
+    tolerance_px: float = 2e-3
+    longest_step_px: float = 8.0
+
+    def __post_init__(self) -> None:
+        what = "finite-element DIC: expected"
+        require_within(f"{what} element_px", self.element_px, 4.0)
+        require_within(f"{what} edge_px", self.edge_px, 0)
+        require_within(f"{what} steps", self.steps, 1)
+        require_within(f"{what} longest_step_px", self.longest_step_px, 0.0, above=True)
+        require_within(f"{what} tolerance_px", self.tolerance_px, 0.0, above=True)
+        if self.cutoff_px is not None:
+            require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
+
+
+class Body:
+    """A mesh of the material with what all stages share: patterns, smoothness, the factor."""
+
+    def __init__(self, mesh: Mesh, start: FloatArray) -> None:
+        self.mesh, self.start = mesh, start
+        sides = inner_sides(mesh.cells)
+        pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
+        self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
+        self.rows: tuple[Rows, ...] = smoothness_rows(mesh)
+        self.R = self.pattern.both(summed(self.rows, len(mesh.nodes)))
+        edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
+        self._wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
+        self._waves = _waves(mesh.nodes, self._wavelength)
+        self._factor: Factor | None = None
+
+    @property
+    def library(self) -> str:
+        """What factorises."""
+        return "" if self._factor is None else self._factor.library
+
+    def assembled(self, equations: NodalEquations) -> tuple[csr_array, FloatArray]:
+        """(2 n, 2 n) M and (2 n,) J'r of the nodes."""
+        M = self.pattern.matrix(self.pattern.assembled(self.mesh.cells, equations.blocks))
+        cells, n = self.mesh.cells.ravel(), len(self.mesh.nodes)
+        parts = [np.bincount(cells, equations.gradient[..., c].ravel(), n) for c in (0, 1)]
+        return M, np.stack(parts, axis=1).ravel()
+
+    def weight(self, M: csr_array, cutoff: float) -> float:
+        """The weight lambda of the smoothness for a cut-off wavelength [mm]."""
+        data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, self.R))
+        return (cutoff / self._wavelength) ** 4 * data / smooth
+
+    def factor(self, M: csr_array, weight: float) -> Factor:
+        """Factorise M + lambda R; always the same object."""
+        A = csr_array((M.data + weight * self.R.data, M.indices, M.indptr), shape=M.shape)
+        if self._factor is None:
+            self._factor = factorise(A)
+        else:
+            self._factor.update(A)
+        return self._factor
+
+    def samples(
+        self, blocks: FloatArray, random: np.random.Generator, count: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """(2 n, count) random vectors of the covariances M, given by its blocks, and R."""
+        n, m = len(self.mesh.nodes), len(blocks)
+        M = np.empty((m, 6, 2, 6, 2))
+        for c in (0, 1):
+            for d in (0, 1):
+                M[:, :, c, :, d] = blocks[:, c + d]
+        M = M.reshape(m, 12, 12)
+        # Elements with few pixels have singular blocks.
+        M[:, range(12), range(12)] *= 1.0 + 1e-9
+        M[:, range(12), range(12)] += 1e-12 * M.max()
+        z = np.linalg.cholesky(M) @ random.standard_normal((m, 12, count))
+        data = np.zeros((n, 2 * count))
+        add_at(data, self.mesh.cells, z.reshape(m, 6, 2 * count))
+        smooth = sample(self.rows, n, random, 2 * count)
+        return data.reshape(2 * n, count), smooth.reshape(n, 2, count).reshape(2 * n, count)
+
+
+def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
+    """(2 n, 4) waves along x and y, of displacements along x and y."""
+    waves = np.zeros((len(nodes), 2, 4))
+    for k in range(4):
+        waves[:, k % 2, k] = np.cos(2.0 * np.pi / wavelength * nodes[:, k // 2])
+    return waves.reshape(-1, 4)
+
+
+
+Start = Callable[[FloatArray], FloatArray]
+"""Gives displacements (n, 2) [mm] at points (n, 2) [mm]."""
+
+
+def measure_displacement(
+    pair: ImagePair,
+    start: Result | Start,
+    mesh: Mesh | None = None,
+    *,
+    options: FiniteElementOptions | None = None,
+    progress: Progress = silent,
+) -> NodalResult:
+    """Measure the whole displacement on a mesh of the material.
+
+    Parameters
+    ----------
+    pair
+        Of images. Without a mask every pixel counts.
+    start
+        Where the measurement begins: a correlation's result, or any displacement closer to the
+        truth than about 10 px; what is found is smooth relative to it.
+    mesh
+        T6 or T3, in the reference's frame [mm]; by default made from the pair's mask.
+    options
+        How to measure.
+    progress
+        Listener.
+
+    Raises
+    ------
+    InputError
+        If the mesh is folded or of other elements, covers no more than a part of the mask, or has
+        parts that show no pixels.
+    """
+    options = options or FiniteElementOptions()
+    mesh = mesh_of_mask(*_frame(pair), options.element_px) if mesh is None else quadratic(mesh)
+    begin = start.ansatz.displacement_at(start.unknowns, mesh.nodes) if isinstance(
+        start, Result
+    ) else np.asarray(start(mesh.nodes), dtype=np.float64)
+    if begin.shape != mesh.nodes.shape or not np.isfinite(begin).all():
+        raise InputError(f"expected a finite start at {len(mesh.nodes)} nodes, got {begin.shape}")
+    course = _Course(pair, Body(mesh, begin), options, progress)
+    for stage in options.stages:
+        course.through(stage)
+    tried = course.finish()
+    return course.result(tried)
+
+
+def _frame(pair: ImagePair) -> tuple[BoolArray, PixelGrid]:
+    return pair.masks[0], pair.grid
+
+
+class _Course:
+    """A measurement on its way: the images of a stage, the displacement of the nodes."""
+
+    def __init__(
+        self, pair: ImagePair, body: Body, options: FiniteElementOptions, progress: Progress
+    ) -> None:
+        self.pair, self.body, self.options, self.progress = pair, body, options, progress
+        self.u = body.start.ravel().copy()
+        self.history: list[Step] = []
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+        self._level: Level | None = None
+        self.images: LevelPair
+        self.pixels: ElementPixels
+        self.share = 0.0
+        self.speckle_px = speckle_size(pair.reference, pair.mask)
+        self.order = options.order or (5 if self.speckle_px >= 6.5 else 11)
+
+    def _lap(self, step: str) -> None:
+        now = time.perf_counter()
+        self.laps[step] = self.laps.get(step, 0.0) + now - self._last
+        self._last = now
+
+    def _prepare(self, level: Level) -> None:
+        if level == self._level:
+            return
+        order = self.order if level == FULL else 5
+        self._level, self.images = level, images_on(self.pair, level, self.options.edge_px, order)
+        grid, mask = self.images.grid, self.images.mask
+        self.pixels = pixels_of(self.body.mesh, grid, mask, self.images.reference)
+        self._lap("images")
+
+    def weigh_by_reference(self) -> None:
+        """Weigh the residual from now on by the reference's gradient, blurred as noise asks for."""
+        f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
+        spline = SplineImage.of(continued(f, mask), self.order)
+        _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
+        noise = estimated_noise(f, mask).sd ** 2
+        square = 0.5 * float(np.mean(d_row**2 + d_col**2)) - noise * slope_noise(self.order, 0.0)
+        blur = best_blur(noise / max(square, 0.2 * square), self.speckle_px, self.order)
+        if blur > 0.0:
+            spline = SplineImage.of(smoothed(f, mask, blur), self.order)
+            _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
+        slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
+        self.pixels, self.share, self.blur = self.pixels._replace(slope=slope), 1.0, blur
+        self._lap("images")
+
+    def linearised(self) -> Linearised:
+        nodal = self.u.reshape(-1, 2)
+        found = normal_equations(self.pixels, self.body.mesh, self.images, nodal, self.share)
+        if found.pixels == 0:
+            raise InputError("expected pixels of the material in both images, got none in common")
+        M, gradient = self.body.assembled(found)
+        self._lap("pixels")
+        return Linearised(
+            self.u, M, gradient, found.square_sum, found.pixels, found.blocks
+        )
+
+    def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
+        """Take steps until they are short."""
+        self._prepare(stage.level)
+        px = self.pair.grid.pixel_size
+        if tolerance_px is None:
+            tolerance_px = 10.0 * self.options.tolerance_px
+        for number in range(1, self.options.steps + 1):
+            at = self.linearised()
+            weight = self.body.weight(at.M, stage.cutoff_px * px)
+            smooth = self.body.R @ (at.u - self.body.start.ravel())
+            step = self.body.factor(at.M, weight).solve(at.gradient - weight * smooth)
+            length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
+            share = np.minimum(1.0, self.options.longest_step_px / np.maximum(length, 1e-12))
+            self.u = at.u + step * np.repeat(share, 2)
+            rms = float(np.sqrt(np.mean(length**2)))
+            residual = float(np.sqrt(at.square_sum / at.pixels))
+            self.history.append(
+                Step(stage.level, stage.cutoff_px, number, residual, rms, float(length.max()))
+            )
+            self._lap("factor")
+            if rms < tolerance_px:
+                break
+
+    def finish(self) -> tuple[Risk, ...]:
+        """Find the last cut-off wavelength and what it gives."""
+        px, cutoff = self.pair.grid.pixel_size, self.options.cutoff_px
+        self._prepare(FULL)
+        self.weigh_by_reference()
+        tried: tuple[Risk, ...] = ()
+        if cutoff is None:
+            cutoff = _FIRST_PX
+            for _ in range(_ROUNDS):
+                self.through(Stage(FULL, cutoff))
+                before = cutoff
+                tried = least_risk(self.body, self.linearised(), before, px, self._excess())
+                cutoff = best_of(tried)
+                self._lap("cut-off")
+                if abs(np.log(cutoff / before)) < _SETTLED:
+                    break
+        self.through(Stage(FULL, cutoff), self.options.tolerance_px)
+        self.cutoff_px = cutoff
+        return tried
+
+    def _transfer(self) -> NoiseTransfer:
+        """What of the deformed image's noise reaches the residual, at the elements' middles."""
+        mesh, u = self.body.mesh, self.u.reshape(-1, 2)
+        N, local = (make(mesh.element, np.full((1, 2), 1.0 / 3.0))[0]
+                    for make in (shape_functions, shape_gradients))  # fmt: skip
+        X, x = mesh.nodes[mesh.cells], (mesh.nodes + u)[mesh.cells]
+        det = np.linalg.det(np.einsum("eki,kj->eij", x, local)) / np.linalg.det(
+            np.einsum("eki,kj->eij", X, local)
+        )
+        middle = np.einsum("k,eki->ei", N, u[mesh.cells]) / self.pair.grid.pixel_size
+        return NoiseTransfer.at(middle, det, self.order)
+
+    def _excess(self) -> float:
+        """What noise has at long wavelengths over its variance in the residual [-]."""
+        transfer = self._transfer()
+        return (1.0 + transfer.density) / (1.0 + transfer.value)
+
+    def result(self, tried: tuple[Risk, ...]) -> NodalResult:
+        """Make the result, with its standard deviations."""
+        at, px = self.linearised(), self.pair.grid.pixel_size
+        excess = self._excess()
+        here = risk(self.body, at, self.cutoff_px, px, excess)
+        noise = here.noise * np.sqrt(excess)
+        sd, by_noise = deviations(self.body, at, self.cutoff_px * px)
+        self._lap("standard deviations")
+        outside = int(self.pixels.start[-1]) - at.pixels
+        return NodalResult(
+            mesh=self.body.mesh,
+            displacement=self.u.reshape(-1, 2),
+            start=self.body.start,
+            standard_deviation=noise * sd,
+            noise_deviation=noise * by_noise,
+            grid=self.pair.grid,
+            cutoff_px=self.cutoff_px,
+            tried=tried,
+            residual_rms=float(np.sqrt(at.square_sum / at.pixels)),
+            residual_noise=here.noise,
+            pixels=at.pixels,
+            outside=outside,
+            effective_unknowns=here.unknowns,
+            blur_px=self.blur,
+            library=self.body.library,
+            history=tuple(self.history),
+            timings_s=self.laps,
+        )

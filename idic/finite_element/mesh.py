@@ -1,0 +1,193 @@
+"""A T6 mesh of the material: from a mask alone, or from a mesh that is given.
+
+The outline of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along
+itself, with its corners put back: within 0.2 px of a smooth edge, holes included.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from skimage import measure
+
+from modeharvest.fem.field import Mesh
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.elements import require_positive_jacobian
+from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
+from modeharvest.util.errors import InputError
+
+_BLUR_PX = 1.5
+_ALONG_PX = 2.0
+"""Smoothing of the contour along itself."""
+_CORNER = np.deg2rad(40.0)
+_ARM_PX = 12
+"""How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
+
+
+class Outlines(NamedTuple):
+    """The outlines of the material in a mask.
+
+    Parameters
+    ----------
+    parts
+        For each island its loops, the outer one first; curves (k, 2) of (column, -row) [px], whose
+        corners are where one curve ends.
+    ignored
+        Islands and holes too small for elements, in words.
+    """
+
+    parts: tuple[tuple[tuple[FloatArray, ...], ...], ...]
+    ignored: tuple[str, ...]
+
+
+def mesh_of_mask(mask: BoolArray, grid: PixelGrid, element_px: float) -> Mesh:
+    """Make a T6 mesh [mm] of the material in a mask, elements of so many px.
+
+    Raises
+    ------
+    InputError
+        If there is no island of at least four elements, or gmsh isn't there.
+    """
+    try:
+        from modeharvest.fem.meshing import mesh_outlines
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
+            "mesh"
+        ) from error
+    parts, ignored = outlines(mask, element_px)
+    if not parts:
+        raise InputError(
+            f"expected a mask with material for elements of {element_px:g} px, got "
+            f"{int(mask.sum())} px of it ({'; '.join(ignored) or 'none'}); take smaller elements"
+        )
+    block = mesh_outlines(parts, element_px)
+    x, y = grid.to_mm(-block.nodes[:, 1], block.nodes[:, 0])
+    cells = _counter_clockwise(block.nodes, block.cells)
+    return quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+
+
+def quadratic(mesh: Mesh) -> Mesh:
+    """The mesh itself if it is of T6 elements; T3 elements get mid-side nodes.
+
+    Raises
+    ------
+    InputError
+        If the elements are of another type, or folded.
+    """
+    if mesh.element == "T3":
+        ends = np.sort(mesh.cells[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+        sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+        nodes = np.vstack([mesh.nodes, mesh.nodes[sides].mean(axis=1)])
+        middle = len(mesh.nodes) + number.reshape(-1, 3)
+        mesh = Mesh(nodes, np.hstack([mesh.cells, middle]), "T6")
+    if mesh.element != "T6":
+        raise InputError(
+            f"expected a mesh of T3 or T6 elements to measure on, got {mesh.element}; split them "
+            "into triangles"
+        )
+    require_positive_jacobian(mesh.nodes, mesh.cells, mesh.element, "mesh of the material")
+    return mesh
+
+
+def _counter_clockwise(nodes: FloatArray, cells: IntArray) -> IntArray:
+    a, b, c = (nodes[cells[:, k]] for k in range(3))
+    d, e = b - a, c - a
+    area = d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0]
+    return np.where((area < 0.0)[:, None], cells[:, [0, 2, 1, 5, 4, 3]], cells)
+
+
+def outlines(mask: BoolArray, element_px: float) -> Outlines:
+    """Find the outlines of a mask, for elements of so many px."""
+    inside = np.pad(mask, 8)
+    islands, count = ndimage.label(inside)
+    blurred = ndimage.gaussian_filter(inside.astype(np.float32), _BLUR_PX)
+    # Where both sides are the same island a blur must not close a slit, nor join two islands.
+    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    loops: dict[int, list[tuple[float, FloatArray]]] = {}
+    ignored = []
+    for contour in measure.find_contours(blurred, 0.5):
+        points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
+        along = np.roll(points, -1, axis=0)
+        area = 0.5 * float(np.sum(points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
+        row, col = np.rint(contour[0]).astype(int)
+        island = int(islands[tuple(nearest[:, row, col])])
+        if abs(area) < (4.0 if _is_outer(area) else 0.25) * element_px**2:
+            what = "island" if _is_outer(area) else "hole"
+            ignored.append(f"{what} of {abs(area):.0f} px at row {row - 8}, column {col - 8}")
+            continue
+        loops.setdefault(island, []).append((area, points + [-8.0, 8.0]))
+    parts = []
+    for found in (loops[k] for k in sorted(loops)):
+        outer = max(found, key=lambda loop: abs(loop[0]))
+        if not _is_outer(outer[0]):
+            continue  # a hole of an island that is too small itself
+        others = [loop for loop in found if loop is not outer]
+        parts.append(tuple(_smooth(points, element_px) for _, points in (outer, *others)))
+    return Outlines(tuple(parts), tuple(ignored))
+
+
+def _is_outer(area: float) -> bool:
+    """Whether material lies inside a contour of this signed area, x right and y up."""
+    return area > 0.0
+
+
+def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
+    """Smooth a closed contour between its corners, and sample it twice an element."""
+    length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    total, count = float(length.sum()), max(16, int(length.sum()))
+    at = np.arange(count) * total / count  # one point a pixel
+    s = np.concatenate([[0.0], np.cumsum(length)])
+    closed = np.vstack([points, points[:1]])
+    raw = np.stack([np.interp(at, s, closed[:, k]) for k in (0, 1)], axis=1)
+    smooth = ndimage.gaussian_filter1d(raw, _ALONG_PX, axis=0, mode="wrap")
+    corners = _corners(raw)
+    if not corners.size:
+        k = max(16, round(2.0 * total / element_px))
+        rest = np.rint(np.arange(k + 1) * count / k).astype(int) % count
+        return (smooth[rest],)
+    sharp = {int(k): _intersection(raw, int(k)) for k in corners}
+    curves = []
+    for begin, end in zip(corners, np.roll(corners, -1), strict=True):
+        span = int((end - begin) % count) or count
+        k = max(1, round(2.0 * span / element_px))
+        inner = (begin + np.rint(np.arange(1, k) * span / k).astype(int)) % count
+        far = [p for p in inner if min((p - begin) % count, (end - p) % count) >= _ARM_PX // 2]
+        curves.append(np.vstack([sharp[int(begin)], smooth[far], sharp[int(end)]]))
+    return tuple(curves)
+
+
+def _corners(points: FloatArray) -> IntArray:
+    """Numbers of the points (one a pixel) where a contour turns sharply, ascending."""
+    if len(points) < 4 * _ARM_PX:
+        return np.empty(0, dtype=np.int64)
+    near = _ARM_PX // 3
+    ahead, behind = (np.roll(points, -s * _ARM_PX, axis=0) - np.roll(points, -s * near, axis=0)
+                     for s in (1, -1))  # fmt: skip
+    cross = ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0]
+    turn = np.pi - np.abs(np.arctan2(cross, (ahead * behind).sum(axis=1)))
+    most = ndimage.maximum_filter1d(turn, 2 * _ARM_PX + 1, mode="wrap")
+    # Within its arms a circle turns, too: by 8 px over its radius.
+    peaks = np.flatnonzero((turn == most) & (turn > _CORNER))
+    middle = ndimage.gaussian_filter1d(turn, 2.0, mode="wrap")
+    if peaks.size and not peaks.size < len(points) / (2 * _ARM_PX):
+        return np.empty(0, dtype=np.int64)  # a small circle turns everywhere
+    return np.array(
+        sorted({int((p - 2 + np.argmax(middle[(p + np.arange(-2, 3)) % len(points)]))
+                    % len(points)) for p in peaks}), dtype=np.int64
+    )  # fmt: skip
+
+
+def _intersection(points: FloatArray, corner: int) -> FloatArray:
+    """Where the lines through the two sides of a corner meet."""
+    lines = []
+    for sign in (1, -1):
+        side = points[(corner + sign * np.arange(_ARM_PX // 3, _ARM_PX + 1)) % len(points)]
+        middle = side.mean(axis=0)
+        direction = np.linalg.svd(side - middle)[2][0]
+        normal = np.array([-direction[1], direction[0]])
+        lines.append((normal, float(normal @ middle)))
+    (a, c), (b, d) = lines
+    return np.linalg.solve(np.stack([a, b]), np.array([c, d]))
