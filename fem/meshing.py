@@ -308,7 +308,7 @@ def _current_block() -> MeshBlock:
 
 
 def mesh_outlines(
-    parts: Collection[Collection[Collection[FloatArray]]], size: float
+    parts: Collection[Collection[Collection[FloatArray]]], size: float, edge_size: float
 ) -> MeshBlock:
     """Mesh plane bodies bounded by smooth curves with T6 elements.
 
@@ -318,15 +318,25 @@ def mesh_outlines(
         Of each body its loops, the outer one first, then those of holes. A loop is a sequence of
         curves (k, 2) [any unit], each of which ends where the next one begins; between their ends
         the curves are splines through their points.
-    size
-        Edge length of the elements [the same unit]; shorter ones where a loop is short.
+    size, edge_size
+        Edge length of the elements inside and along the loops [the same unit], growing from one to
+        the other over two elements; shorter ones where a loop is short.
     """
-    with quiet_gmsh(), gmsh_options({"Mesh.MeshSizeMax": size}):
+    grow = {"Mesh.MeshSizeExtendFromBoundary": 0, "Mesh.MeshSizeMax": size}
+    with quiet_gmsh(), gmsh_options(grow):
         geo = gmsh.model.geo
         for loops in parts:
-            tags = [_add_loop(loop, size) for loop in loops]
-            geo.addPlaneSurface(tags)
+            geo.addPlaneSurface([_add_loop(loop, edge_size) for loop in loops])
         geo.synchronize()
+        curves = [tag for _, tag in gmsh.model.getEntities(1)]
+        numbers = {"InField": 1, "SizeMin": edge_size, "SizeMax": size, "DistMax": 2.0 * size}
+        field = gmsh.model.mesh.field
+        field.add("Distance", 1)
+        field.setNumbers(1, "CurvesList", curves)
+        field.add("Threshold", 2)
+        for name, value in numbers.items():
+            field.setNumber(2, name, value)
+        field.setAsBackgroundMesh(2)
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(2)
         return _current_block()

@@ -5,12 +5,15 @@ the smoothness R the residual's sum of squares Q and the effective number of unk
 A = M + lambda R, follow from one factorisation; t by random probes (M. F. Hutchinson, Commun.
 Stat. Simul. Comput. 19 (1990), doi 10.1080/03610919008812866). The weight taken minimises
 
-    Q/(1 - c t/p)^2,
+    Q/(1 - 1.4 c t/p)^2,
 
 generalised cross-validation with p pixels (G. Golub, M. Heath, G. Wahba, Technometrics 21 (1979),
-doi 10.1080/00401706.1979.10489751): but for a constant an unbiased estimate of the error that is
-left in g(x + u). c is what the noise has at the long wavelengths of which displacements are made,
-over its variance at the pixels: interpolated noise is smoother than that of the pixels.
+doi 10.1080/00401706.1979.10489751): without the 1.4, but for a constant, an unbiased estimate of
+the error that is left in g(x + u). The 1.4 keeps it from smoothing too little, which costs more
+than smoothing too much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
+10.1046/j.1369-7412.2003.05316.x. c is what the noise has at the long wavelengths of which
+displacements are made, over its variance at the pixels: interpolated noise is smoother than that of
+the pixels.
 
 The posterior covariance s^2 A^-1 counts noise and smoothing alike, s^2 A^-1 M A^-1 noise alone:
 D. Nychka, J. Am. Stat. Assoc. 83 (1988), doi 10.1080/01621459.1988.10478711.
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from modeharvest.idic.finite_element.measure import Body
 
 _PROBES = 4
+_DEGREES = 1.4
 _STEP = 1.4
 """Between neighbouring cut-off wavelengths."""
 _LEAST_PX, _MOST_PX = 2.0, 400.0
@@ -90,7 +94,7 @@ def risk(body: Body, at: Linearised, cutoff_px: float, pixel_size: float, excess
     step = found[:, 0]
     Q = at.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
-    value = Q / (1.0 - excess * t / at.pixels) ** 2
+    value = Q / (1.0 - _DEGREES * excess * t / at.pixels) ** 2
     return Risk(cutoff_px, value / at.pixels, t, float(np.sqrt(Q / (at.pixels - t))))
 
 
@@ -118,8 +122,8 @@ def best_of(tried: tuple[Risk, ...]) -> float:
     return float(tried[k].cutoff_px * _STEP**shift)
 
 
-_SAMPLES = 32
-"""Of the posterior distribution: its standard deviations are known to 13 %."""
+_SAMPLES = 16
+"""Of the posterior distribution: its standard deviations are known to 18 %."""
 
 
 def deviations(body: Body, at: Linearised, cutoff: float) -> tuple[FloatArray, FloatArray]:

@@ -81,8 +81,8 @@ class FiniteElementOptions:
 
     Parameters
     ----------
-    element_px
-        Edge length of the elements where the mesh is to be made [px].
+    element_px, edge_element_px
+        Edge length of the elements inside and along edges, where the mesh is to be made [px].
     stages
         Before the last one, which has the unfiltered images and ``cutoff_px``.
     cutoff_px
@@ -94,24 +94,26 @@ class FiniteElementOptions:
     steps
         Of Gauss-Newton in each stage, at most.
     tolerance_px
-        A stage ends with a step shorter than that (rms over the nodes), as a share of the last
-        stage's; on earlier stages ten times that [px].
+        The last stage ends with a step shorter than that, earlier ones with ten times that [px];
+        rms over the nodes.
     longest_step_px
         Of a node [px].
     """
 
-    element_px: float = 16.0
+    element_px: float = 24.0
+    edge_element_px: float = 12.0
     stages: tuple[Stage, ...] = STAGES
     cutoff_px: float | None = None
     edge_px: int = 0
     order: int | None = None
     steps: int = 4
-    tolerance_px: float = 2e-3
+    tolerance_px: float = 5e-3
     longest_step_px: float = 8.0
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
         require_within(f"{what} element_px", self.element_px, 4.0)
+        require_within(f"{what} edge_element_px", self.edge_element_px, 4.0)
         require_within(f"{what} edge_px", self.edge_px, 0)
         require_within(f"{what} steps", self.steps, 1)
         require_within(f"{what} longest_step_px", self.longest_step_px, 0.0, above=True)
@@ -225,7 +227,11 @@ def measure_displacement(
         parts that show no pixels.
     """
     options = options or FiniteElementOptions()
-    mesh = mesh_of_mask(*_frame(pair), options.element_px) if mesh is None else quadratic(mesh)
+    if mesh is None:
+        mesh = mesh_of_mask(
+            pair.masks[0], pair.grid, options.element_px, options.edge_element_px
+        )
+    mesh = quadratic(mesh)
     begin = start.ansatz.displacement_at(start.unknowns, mesh.nodes) if isinstance(
         start, Result
     ) else np.asarray(start(mesh.nodes), dtype=np.float64)
@@ -236,10 +242,6 @@ def measure_displacement(
         course.through(stage)
     tried = course.finish()
     return course.result(tried)
-
-
-def _frame(pair: ImagePair) -> tuple[BoolArray, PixelGrid]:
-    return pair.masks[0], pair.grid
 
 
 class _Course:
@@ -272,10 +274,12 @@ class _Course:
         self._level, self.images = level, images_on(self.pair, level, self.options.edge_px, order)
         grid, mask = self.images.grid, self.images.mask
         self.pixels = pixels_of(self.body.mesh, grid, mask, self.images.reference)
+        if level == FULL:
+            self._weigh_by_reference()
         self._lap("images")
 
-    def weigh_by_reference(self) -> None:
-        """Weigh the residual from now on by the reference's gradient, blurred as noise asks for."""
+    def _weigh_by_reference(self) -> None:
+        """Weigh the residual by the reference's gradient, blurred as noise asks for."""
         f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
         spline = SplineImage.of(continued(f, mask), self.order)
         _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
@@ -287,7 +291,6 @@ class _Course:
             _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
         self.pixels, self.share, self.blur = self.pixels._replace(slope=slope), 1.0, blur
-        self._lap("images")
 
     def linearised(self) -> Linearised:
         nodal = self.u.reshape(-1, 2)
@@ -327,7 +330,6 @@ class _Course:
         """Find the last cut-off wavelength and what it gives."""
         px, cutoff = self.pair.grid.pixel_size, self.options.cutoff_px
         self._prepare(FULL)
-        self.weigh_by_reference()
         tried: tuple[Risk, ...] = ()
         if cutoff is None:
             cutoff = _FIRST_PX

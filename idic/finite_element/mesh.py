@@ -42,7 +42,9 @@ class Outlines(NamedTuple):
     ignored: tuple[str, ...]
 
 
-def mesh_of_mask(mask: BoolArray, grid: PixelGrid, element_px: float) -> Mesh:
+def mesh_of_mask(
+    mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float | None = None
+) -> Mesh:
     """Make a T6 mesh [mm] of the material in a mask, elements of so many px.
 
     Raises
@@ -57,13 +59,14 @@ def mesh_of_mask(mask: BoolArray, grid: PixelGrid, element_px: float) -> Mesh:
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
         ) from error
-    parts, ignored = outlines(mask, element_px)
+    edge = edge_element_px or element_px
+    parts, ignored = outlines(mask, edge)
     if not parts:
         raise InputError(
             f"expected a mask with material for elements of {element_px:g} px, got "
             f"{int(mask.sum())} px of it ({'; '.join(ignored) or 'none'}); take smaller elements"
         )
-    block = mesh_outlines(parts, element_px)
+    block = mesh_outlines(parts, element_px, edge)
     x, y = grid.to_mm(-block.nodes[:, 1], block.nodes[:, 0])
     cells = _counter_clockwise(block.nodes, block.cells)
     return quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))

@@ -1,0 +1,178 @@
+"""The whole displacement by finite-element DIC against the truth, up to the edges of the holes.
+
+On the images of a virtual experiment (``modeharvest run paper-virtual --out FOLDER``), at every
+noise: the rms error per component of all material pixels, within 10 px of an edge, of ligaments
+and of the bulk; the longest error; how far the unknowns refitted to the measured displacement are
+from the best fit; how often 95 % intervals hold the truth; the cut-off wavelength that was found,
+and what others would have left.
+
+Run: scripts/env python benchmarks/whole_field.py FOLDER [--strain 0.128] [--noise 0 0.01 0.02]
+     [--seeds 1] [--mesh mask|specimen] [--others 0.7 1.4 2] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from modeharvest.fem.meshing import mesh_specimen
+from modeharvest.fem.specimen import Specimen
+from modeharvest.idic.correlate import best_fit, fit_displacement
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.result import Result
+from modeharvest.imaging.imageset import ImageSet
+from modeharvest.imaging.pair import ImagePair
+
+EDGE_PX = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Where errors are counted: (rows, cols) each."""
+
+    all: NDArray[np.bool_]
+    edges: NDArray[np.bool_]
+    ligaments: NDArray[np.bool_]
+    bulk: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, pair: ImagePair, specimen: Specimen) -> Regions:
+        """Of a specimen whose middle is the origin."""
+        mask = pair.masks[0]
+        edges = mask & (ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] <= EDGE_PX)
+        a, b = specimen.cellular_half_size
+        outside = (abs(pair.grid.x)[None] > a) | (abs(pair.grid.y)[:, None] > b)
+        return cls(mask, edges, mask & ~edges & ~outside, mask & ~edges & outside)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Errors of one measurement [px]; of vectors, per component."""
+
+    noise: float
+    seed: int
+    cutoff_px: float
+    all: float
+    edges: float
+    ligaments: float
+    bulk: float
+    longest: float
+    refit: float
+    covered: dict[str, float] = field(default_factory=dict)
+    unknowns: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    gigabytes: float = 0.0
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--strain", type=float, default=0.128)
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.01, 0.02])
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--mesh", choices=["mask", "specimen"], default="mask")
+    parser.add_argument("--others", type=float, nargs="*", default=[])
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    images = ImageSet.read(given.folder / "images")
+    start = Result.read(given.folder / f"correlation/result_{round(1e4 * given.strain):04d}.json")
+    specimen = specimen_of(images)
+    truth = images.pair(given.strain).truth
+    assert truth is not None
+    best = best_fit(truth, start)
+    rows, head = [], "noise seed  cut-off     all   edges  ligam.    bulk longest   refit"
+    print(f"{head}  covered (all, edges)  seconds (CPU)   GB  unknowns")
+    for noise in given.noise:
+        for seed in range(given.seeds):
+            pair = noisy(images, given.strain, noise, seed)
+            row = measured(pair, start, best, specimen, noise, seed, given.mesh, None)
+            rows.append(row)
+            show(row)
+            for share in given.others:
+                cutoff = share * row.cutoff_px
+                show(measured(pair, start, best, specimen, noise, seed, given.mesh, cutoff))
+    if given.json:
+        given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), "utf-8")
+
+
+def specimen_of(images: ImageSet) -> Specimen:
+    """The specimen that the images show."""
+    table: dict[str, Any] = dict(images.info["solution"]["specimen"])
+    return Specimen(**table)
+
+
+def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair:
+    """8-bit images, or such with white noise, a fraction of full scale, in both."""
+    pair = images.pair(strain, camera=noise == 0.0)
+    if noise == 0.0:
+        return pair
+    random = np.random.default_rng(seed)
+    f, g = (
+        (image + noise * random.standard_normal(image.shape)).astype(np.float32)
+        for image in (pair.reference, pair.deformed)
+    )
+    return pair.with_images(f, g)
+
+
+def measured(
+    pair: ImagePair, start: Result, best: Result, specimen: Specimen, noise: float, seed: int,
+    kind: str, cutoff_px: float | None,
+) -> Row:  # fmt: skip
+    """Measure, and set it against the truth."""
+    options = FiniteElementOptions(cutoff_px=cutoff_px)
+    px = pair.grid.pixel_size
+    mesh = mesh_specimen(specimen, 16.0 * px) if kind == "specimen" else None
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = measure_displacement(pair, start, mesh, options=options)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    assert pair.truth is not None
+    u = result.displacement_on(pair.grid)
+    error = (u - pair.truth.displacement) / px
+    regions = Regions.of(pair, specimen)
+    rms = {name: float(np.sqrt(np.mean(error[there] ** 2))) for name, there in vars(regions).items()}
+    longest = float(np.linalg.norm(error[regions.all], axis=1).max())
+    fit = fit_displacement(u, pair.grid, start.ansatz, start.unknowns, pair.mask)
+    refit = (fit.displacement() - best.displacement())[regions.all] / px
+    return Row(
+        noise, seed, result.cutoff_px, **rms, longest=longest,
+        refit=float(np.sqrt(np.mean(refit**2))), covered=covered(result, error, regions),
+        unknowns=result.unknowns, seconds=wall, cpu_seconds=cpu, gigabytes=used,
+        timings_s=dict(result.timings_s),
+    )  # fmt: skip
+
+
+def covered(result: NodalResult, error: NDArray[Any], regions: Regions) -> dict[str, float]:
+    """Share of the components in their 95 % intervals."""
+    sd = result.on_pixels(result.standard_deviation) / result.grid.pixel_size
+    return {
+        name: float(np.mean(np.abs(error[there]) < 1.96 * sd[there]))
+        for name, there in vars(regions).items()
+    }
+
+
+def show(row: Row) -> None:
+    """Print a line of the table."""
+    print(
+        f"{row.noise:5.3f} {row.seed:4d} {row.cutoff_px:8.1f} {row.all:7.4f} {row.edges:7.4f} "
+        f"{row.ligaments:7.4f} {row.bulk:7.4f} {row.longest:7.3f} {row.refit:7.4f}  "
+        f"{row.covered['all']:8.3f} {row.covered['edges']:8.3f}     "
+        f"{row.seconds:6.1f} ({row.cpu_seconds:.1f}) {row.gigabytes:6.2f} {row.unknowns:8d}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
