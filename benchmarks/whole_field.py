@@ -142,7 +142,9 @@ def measured(
     u = result.displacement_on(pair.grid)
     error = (u - pair.truth.displacement) / px
     regions = Regions.of(pair, specimen)
-    rms = {name: float(np.sqrt(np.mean(error[there] ** 2))) for name, there in vars(regions).items()}
+    rms = {
+        name: float(np.sqrt(np.mean(error[there] ** 2))) for name, there in vars(regions).items()
+    }
     longest = float(np.linalg.norm(error[regions.all], axis=1).max())
     fit = fit_displacement(u, pair.grid, start.ansatz, start.unknowns, pair.mask)
     refit = (fit.displacement() - best.displacement())[regions.all] / px
@@ -156,7 +158,7 @@ def measured(
 
 def covered(result: NodalResult, error: NDArray[Any], regions: Regions) -> dict[str, float]:
     """Share of the components in their 95 % intervals."""
-    sd = result.on_pixels(result.standard_deviation) / result.grid.pixel_size
+    sd = result.standard_deviation_on() / result.grid.pixel_size
     return {
         name: float(np.mean(np.abs(error[there]) < 1.96 * sd[there]))
         for name, there in vars(regions).items()

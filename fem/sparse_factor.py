@@ -48,7 +48,8 @@ def factorise(matrix: csr_array, library: str | None = None) -> Factor:
     """
     for kind in LIBRARIES.values() if library is None else [LIBRARIES[library]]:
         try:
-            return kind(matrix)
+            found: Factor = kind(matrix)
+            return found
         except ModuleNotFoundError:
             if library is not None:
                 raise

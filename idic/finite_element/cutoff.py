@@ -15,22 +15,20 @@ than smoothing too much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
 displacements are made, over its variance at the pixels: interpolated noise is smoother than that of
 the pixels.
 
-The posterior covariance s^2 A^-1 counts noise and smoothing alike, s^2 A^-1 M A^-1 noise alone:
-D. Nychka, J. Am. Stat. Assoc. 83 (1988), doi 10.1080/01621459.1988.10478711.
+The covariance by noise is s^2 A^-1 M A^-1. What smoothing takes away is estimated by what a cut-off
+wavelength 1.4 times as long changes, in the mean square around each node.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
 
+from modeharvest.idic.finite_element.body import Body
+from modeharvest.idic.finite_element.smoothness import add_at
 from modeharvest.util.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from modeharvest.idic.finite_element.measure import Body
 
 _PROBES = 4
 _DEGREES = 1.4
@@ -123,20 +121,33 @@ def best_of(tried: tuple[Risk, ...]) -> float:
 
 
 _SAMPLES = 16
-"""Of the posterior distribution: its standard deviations are known to 18 %."""
+"""Of the distribution of noise: its standard deviations are known to 18 %."""
+
+
+def newton_step(body: Body, at: Linearised, cutoff: float) -> FloatArray:
+    """(2 n,) Gauss-Newton step for a cut-off wavelength [mm]."""
+    weight = body.weight(at.M, cutoff)
+    smooth = body.R @ (at.u - body.start.ravel())
+    return body.factor(at.M, weight).solve(at.gradient - weight * smooth)
 
 
 def deviations(body: Body, at: Linearised, cutoff: float) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) standard deviations of u by noise and smoothing, and by noise alone, for s = 1.
+    """Standard deviations by noise, and bias by smoothing, of u.
 
-    Samples of A^-1 (e + d) and of A^-1 e, e and d being of the covariances M and lambda R: those of
-    M from its diagonal blocks, element by element.
+    Returns
+    -------
+    by_noise
+        (n, 2) for noise of standard deviation 1 [mm]: the rms of A^-1 e for random e of the
+        covariance M.
+    bias
+        (n, 2) rms around each node [mm].
     """
-    weight = body.weight(at.M, cutoff)
-    random = np.random.default_rng(0)
-    e, d = body.samples(at.blocks, random, _SAMPLES)
-    factor = body.factor(at.M, weight)
-    noise = factor.solve(e)
-    both = noise + factor.solve(np.sqrt(weight) * d)
-    sd, by_noise = (np.sqrt(np.mean(x**2, axis=1)).reshape(-1, 2) for x in (both, noise))
-    return sd, by_noise
+    longer = newton_step(body, at, _STEP * cutoff)
+    change = (longer - newton_step(body, at, cutoff)).reshape(-1, 2)
+    found = body.factor(at.M, body.weight(at.M, cutoff)).solve(body.samples(at.blocks, _SAMPLES))
+    by_noise = np.sqrt(np.mean(found**2, axis=1)).reshape(-1, 2)
+    cells = body.mesh.cells
+    around, count = np.zeros_like(change), np.zeros((len(change), 1))
+    add_at(around, cells, np.repeat((change[cells] ** 2).mean(axis=1, keepdims=True), 6, axis=1))
+    add_at(count, cells, np.ones((*cells.shape, 1)))
+    return by_noise, np.sqrt(around / np.maximum(count, 1.0))

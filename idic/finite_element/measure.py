@@ -13,39 +13,35 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.body import Body
 from modeharvest.idic.finite_element.cutoff import (
     Linearised,
     Risk,
     best_of,
     deviations,
     least_risk,
+    newton_step,
     risk,
 )
 from modeharvest.idic.finite_element.images import continued, images_on
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
-from modeharvest.idic.finite_element.pattern import NodalPattern
 from modeharvest.idic.finite_element.pixels import (
     ElementPixels,
-    NodalEquations,
     normal_equations,
     pixels_of,
 )
 from modeharvest.idic.finite_element.result import NodalResult, Step
-from modeharvest.idic.finite_element.smoothness import Rows, add_at, inner_sides, sample, smoothness_rows, summed
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
 from modeharvest.idic.solver.weighting import best_blur
-from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, silent
 
@@ -122,76 +118,6 @@ class FiniteElementOptions:
             require_within(f"{what} cutoff_px", self.cutoff_px, 0.0, above=True)
 
 
-class Body:
-    """A mesh of the material with what all stages share: patterns, smoothness, the factor."""
-
-    def __init__(self, mesh: Mesh, start: FloatArray) -> None:
-        self.mesh, self.start = mesh, start
-        sides = inner_sides(mesh.cells)
-        pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
-        self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
-        self.rows: tuple[Rows, ...] = smoothness_rows(mesh)
-        self.R = self.pattern.both(summed(self.rows, len(mesh.nodes)))
-        edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
-        self._wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
-        self._waves = _waves(mesh.nodes, self._wavelength)
-        self._factor: Factor | None = None
-
-    @property
-    def library(self) -> str:
-        """What factorises."""
-        return "" if self._factor is None else self._factor.library
-
-    def assembled(self, equations: NodalEquations) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) M and (2 n,) J'r of the nodes."""
-        M = self.pattern.matrix(self.pattern.assembled(self.mesh.cells, equations.blocks))
-        cells, n = self.mesh.cells.ravel(), len(self.mesh.nodes)
-        parts = [np.bincount(cells, equations.gradient[..., c].ravel(), n) for c in (0, 1)]
-        return M, np.stack(parts, axis=1).ravel()
-
-    def weight(self, M: csr_array, cutoff: float) -> float:
-        """The weight lambda of the smoothness for a cut-off wavelength [mm]."""
-        data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, self.R))
-        return (cutoff / self._wavelength) ** 4 * data / smooth
-
-    def factor(self, M: csr_array, weight: float) -> Factor:
-        """Factorise M + lambda R; always the same object."""
-        A = csr_array((M.data + weight * self.R.data, M.indices, M.indptr), shape=M.shape)
-        if self._factor is None:
-            self._factor = factorise(A)
-        else:
-            self._factor.update(A)
-        return self._factor
-
-    def samples(
-        self, blocks: FloatArray, random: np.random.Generator, count: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """(2 n, count) random vectors of the covariances M, given by its blocks, and R."""
-        n, m = len(self.mesh.nodes), len(blocks)
-        M = np.empty((m, 6, 2, 6, 2))
-        for c in (0, 1):
-            for d in (0, 1):
-                M[:, :, c, :, d] = blocks[:, c + d]
-        M = M.reshape(m, 12, 12)
-        # Elements with few pixels have singular blocks.
-        M[:, range(12), range(12)] *= 1.0 + 1e-9
-        M[:, range(12), range(12)] += 1e-12 * M.max()
-        z = np.linalg.cholesky(M) @ random.standard_normal((m, 12, count))
-        data = np.zeros((n, 2 * count))
-        add_at(data, self.mesh.cells, z.reshape(m, 6, 2 * count))
-        smooth = sample(self.rows, n, random, 2 * count)
-        return data.reshape(2 * n, count), smooth.reshape(n, 2, count).reshape(2 * n, count)
-
-
-def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
-    """(2 n, 4) waves along x and y, of displacements along x and y."""
-    waves = np.zeros((len(nodes), 2, 4))
-    for k in range(4):
-        waves[:, k % 2, k] = np.cos(2.0 * np.pi / wavelength * nodes[:, k // 2])
-    return waves.reshape(-1, 4)
-
-
-
 Start = Callable[[FloatArray], FloatArray]
 """Gives displacements (n, 2) [mm] at points (n, 2) [mm]."""
 
@@ -228,13 +154,13 @@ def measure_displacement(
     """
     options = options or FiniteElementOptions()
     if mesh is None:
-        mesh = mesh_of_mask(
-            pair.masks[0], pair.grid, options.element_px, options.edge_element_px
-        )
+        mesh = mesh_of_mask(pair.masks[0], pair.grid, options.element_px, options.edge_element_px)
     mesh = quadratic(mesh)
-    begin = start.ansatz.displacement_at(start.unknowns, mesh.nodes) if isinstance(
-        start, Result
-    ) else np.asarray(start(mesh.nodes), dtype=np.float64)
+    begin = (
+        start.ansatz.displacement_at(start.unknowns, mesh.nodes)
+        if isinstance(start, Result)
+        else np.asarray(start(mesh.nodes), dtype=np.float64)
+    )
     if begin.shape != mesh.nodes.shape or not np.isfinite(begin).all():
         raise InputError(f"expected a finite start at {len(mesh.nodes)} nodes, got {begin.shape}")
     course = _Course(pair, Body(mesh, begin), options, progress)
@@ -299,9 +225,7 @@ class _Course:
             raise InputError("expected pixels of the material in both images, got none in common")
         M, gradient = self.body.assembled(found)
         self._lap("pixels")
-        return Linearised(
-            self.u, M, gradient, found.square_sum, found.pixels, found.blocks
-        )
+        return Linearised(self.u, M, gradient, found.square_sum, found.pixels, found.blocks)
 
     def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
         """Take steps until they are short."""
@@ -311,9 +235,7 @@ class _Course:
             tolerance_px = 10.0 * self.options.tolerance_px
         for number in range(1, self.options.steps + 1):
             at = self.linearised()
-            weight = self.body.weight(at.M, stage.cutoff_px * px)
-            smooth = self.body.R @ (at.u - self.body.start.ravel())
-            step = self.body.factor(at.M, weight).solve(at.gradient - weight * smooth)
+            step = newton_step(self.body, at, stage.cutoff_px * px)
             length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
             share = np.minimum(1.0, self.options.longest_step_px / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
@@ -368,15 +290,16 @@ class _Course:
         excess = self._excess()
         here = risk(self.body, at, self.cutoff_px, px, excess)
         noise = here.noise * np.sqrt(excess)
-        sd, by_noise = deviations(self.body, at, self.cutoff_px * px)
+        by_noise, bias = deviations(self.body, at, self.cutoff_px * px)
+        by_noise = noise * by_noise
         self._lap("standard deviations")
         outside = int(self.pixels.start[-1]) - at.pixels
         return NodalResult(
             mesh=self.body.mesh,
             displacement=self.u.reshape(-1, 2),
             start=self.body.start,
-            standard_deviation=noise * sd,
-            noise_deviation=noise * by_noise,
+            standard_deviation=np.hypot(by_noise, bias),
+            noise_deviation=by_noise,
             grid=self.pair.grid,
             cutoff_px=self.cutoff_px,
             tried=tried,

@@ -6,7 +6,7 @@ itself, with its corners put back: within 0.2 px of a smooth edge, holes include
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +17,8 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import require_positive_jacobian
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
+
+find_contours: Any = measure.find_contours
 
 _BLUR_PX = 1.5
 _ALONG_PX = 2.0
@@ -105,13 +107,13 @@ def _counter_clockwise(nodes: FloatArray, cells: IntArray) -> IntArray:
 def outlines(mask: BoolArray, element_px: float) -> Outlines:
     """Find the outlines of a mask, for elements of so many px."""
     inside = np.pad(mask, 8)
-    islands, count = ndimage.label(inside)
+    islands = ndimage.label(inside)[0]
     blurred = ndimage.gaussian_filter(inside.astype(np.float32), _BLUR_PX)
     # Where both sides are the same island a blur must not close a slit, nor join two islands.
     nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
     loops: dict[int, list[tuple[float, FloatArray]]] = {}
     ignored = []
-    for contour in measure.find_contours(blurred, 0.5):
+    for contour in find_contours(blurred, 0.5):
         points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
         along = np.roll(points, -1, axis=0)
         area = 0.5 * float(np.sum(points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
@@ -121,7 +123,7 @@ def outlines(mask: BoolArray, element_px: float) -> Outlines:
             what = "island" if _is_outer(area) else "hole"
             ignored.append(f"{what} of {abs(area):.0f} px at row {row - 8}, column {col - 8}")
             continue
-        loops.setdefault(island, []).append((area, points + [-8.0, 8.0]))
+        loops.setdefault(island, []).append((area, points + np.array([-8.0, 8.0])))
     parts = []
     for found in (loops[k] for k in sorted(loops)):
         outer = max(found, key=lambda loop: abs(loop[0]))

@@ -51,9 +51,7 @@ class ElementPixels(NamedTuple):
     slope: NDArray[Any]
 
 
-def pixels_of(
-    mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]
-) -> ElementPixels:
+def pixels_of(mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
     """Sort the pixels of a mask by the elements of a T6 mesh; those beside the mesh are left out.
 
     ``image`` (rows, cols) is f.
@@ -185,9 +183,7 @@ def _sample(
 
 
 @compiled(relaxed=True)
-def _push_forward(
-    pixels: Any, begin: int, n: int, x: Any, u: Any, share: float, own: Any
-) -> None:
+def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, share: float, own: Any) -> None:
     """Mix F^-T grad f into the gradient of a block."""
     for m in range(n):
         s, t = float(pixels.xi[0, begin + m]), float(pixels.xi[1, begin + m])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
@@ -115,9 +117,7 @@ class NodalResult:
             raise InputError(f"expected points of shape (k, 2), got {points.shape}")
         mesh, nodal = self.mesh, self.displacement if nodal is None else nodal
         row, col = self.grid.to_px(points[:, 0], points[:, 1])
-        found = locate_points(
-            mesh.nodes, mesh.cells, mesh.element, self.grid, row[None], col[None]
-        )
+        found = locate_points(mesh.nodes, mesh.cells, mesh.element, self.grid, row[None], col[None])
         element, xi = found.element[0], found.xi[0]
         values = np.full((len(points), nodal.shape[1]), np.nan)
         there = element >= 0
@@ -128,6 +128,11 @@ class NodalResult:
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) u at pixels [mm]."""
         return self.on_pixels(self.displacement, grid)
+
+    def standard_deviation_on(self, grid: PixelGrid | None = None) -> FloatArray:
+        """(rows, cols, 2) standard deviation of u at pixels [mm]."""
+        smallest = 1e-12 * self.grid.pixel_size
+        return np.exp(self.on_pixels(np.log(np.maximum(self.standard_deviation, smallest)), grid))
 
     @property
     def deformation_gradient(self) -> FloatArray:
@@ -140,20 +145,20 @@ class NodalResult:
         total, count = np.zeros((len(mesh.nodes), 2, 2)), np.zeros(len(mesh.nodes))
         np.add.at(total, mesh.cells, gradient)
         np.add.at(count, mesh.cells, 1.0)
-        return np.eye(2) + total / np.maximum(count, 1.0)[:, None, None]
+        return np.asarray(np.eye(2) + total / np.maximum(count, 1.0)[:, None, None])
 
     @property
     def green_lagrange(self) -> FloatArray:
         """(n, 2, 2) E = (F'F - I)/2 at the nodes [-]."""
         F = self.deformation_gradient
-        return 0.5 * (np.einsum("nki,nkj->nij", F, F) - np.eye(2))
+        return np.asarray(0.5 * (np.einsum("nki,nkj->nij", F, F) - np.eye(2)))
 
     @property
     def logarithmic_strain(self) -> FloatArray:
         """(n, 2, 2) Hencky's strain ln U at the nodes, U^2 = F'F [-]."""
         stretch, direction = np.linalg.eigh(np.eye(2) + 2.0 * self.green_lagrange)
         half_log = 0.5 * np.log(np.maximum(stretch, 1e-12))
-        return np.einsum("nik,nk,njk->nij", direction, half_log, direction)
+        return np.asarray(np.einsum("nik,nk,njk->nij", direction, half_log, direction))
 
 
 _NODES = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]], dtype=np.float64)
@@ -178,10 +183,10 @@ def _continue(
 def located_at(
     mesh: Mesh,
     grid: PixelGrid,
-    near: tuple[FloatArray, ...],
-    elements: FloatArray,
-    at: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
+    near: tuple[NDArray[Any], ...],
+    elements: NDArray[Any],
+    at: tuple[NDArray[Any], NDArray[Any]],
+) -> tuple[NDArray[Any], FloatArray]:
     """Elements and local coordinates, outside their element, of pixels beside the mesh."""
     element = elements[near]
     target = np.stack(grid.to_mm(*at), axis=1)

@@ -13,9 +13,6 @@ Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9435-9.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
-
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -82,56 +79,24 @@ def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, Float
     return nodes, np.concatenate(parts, axis=2), weights
 
 
-class Rows(NamedTuple):
-    """Rows of a matrix G whose square G'G is a sum over groups of nodes.
-
-    Parameters
-    ----------
-    nodes
-        (m, k) of each group.
-    rows
-        (m, q, k) entries of its rows.
-    """
-
-    nodes: IntArray
-    rows: FloatArray
-
-
-def smoothness_rows(mesh: Mesh) -> tuple[Rows, Rows]:
-    """G of R = G'G [1/mm], for one component (n,) on a T6 mesh: in elements, and across sides."""
-    second, weights = second_gradients(mesh)
-    xx, xy, yy = second[..., 0, 0], np.sqrt(2.0) * second[..., 0, 1], second[..., 1, 1]
-    inside = np.sqrt(weights)[:, :, None, None] * np.stack([xx, xy, yy], axis=2)
+def smoothness_matrix(mesh: Mesh) -> csr_array:
+    """(n, n) R of one component [1/mm^2], for nodal values (n,) on a T6 mesh; sorted indices."""
+    gradients, weights = second_gradients(mesh)
+    inside = np.einsum("eq,eqkij,eqlij->ekl", weights, gradients, gradients, optimize=True)
     nodes, jumps, shares = side_jumps(mesh, inner_sides(mesh.cells))
-    across = np.sqrt(_PENALTY * shares)[:, :, None, None] * np.moveaxis(jumps, 2, 3)
-    return tuple(
-        Rows(own, rows.reshape(len(own), -1, own.shape[1]))
-        for own, rows in ((mesh.cells, inside), (nodes, across))
-    )  # type: ignore[return-value]
-
-
-def summed(parts: Iterable[Rows], n: int) -> csr_array:
-    """(n, n) R of rows, with sorted indices."""
+    across = _PENALTY * np.einsum("sg,sgki,sgli->skl", shares, jumps, jumps, optimize=True)
+    n = len(mesh.nodes)
     total = csr_array((n, n))
-    for nodes, rows in parts:
-        k = nodes.shape[1]
-        at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
-        total = total + csr_array((np.einsum("eqk,eql->ekl", rows, rows).ravel(), at), shape=(n, n))
+    for groups, blocks in ((mesh.cells, inside), (nodes, across)):
+        k = groups.shape[1]
+        at = np.repeat(groups, k, axis=1).ravel(), np.tile(groups, (1, k)).ravel()
+        total = total + csr_array((blocks.ravel(), at), shape=(n, n))
     total.sort_indices()
     return total
 
 
-def sample(parts: Iterable[Rows], n: int, random: np.random.Generator, count: int) -> FloatArray:
-    """(n, count) random vectors of covariance R."""
-    total = np.zeros((n, count))
-    for nodes, rows in parts:
-        z = random.standard_normal((*rows.shape[:2], count))
-        add_at(total, nodes, np.einsum("eqk,eqs->eks", rows, z, optimize=True))
-    return total
-
-
 def add_at(total: FloatArray, nodes: IntArray, values: FloatArray) -> None:
-    """Add values (m, k, s) to rows (n, s) given by their numbers (m, k)."""
+    """Add values (m, k, s) to the rows of (n, s) whose numbers are (m, k)."""
     flat = nodes.ravel()
     ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (len(total), flat.size))
     total += ones @ values.reshape(flat.size, -1)

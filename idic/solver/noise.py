@@ -151,11 +151,11 @@ class NoiseTransfer:
             for dx, dy in ((h, 0.0), (0.0, h))
         )
         det = (1.0 + F_x[:, 0]) * (1.0 + F_y[:, 1]) - F_y[:, 0] * F_x[:, 1]
-        return cls.at(u[some] / grid.pixel_size, det, order)
+        return cls.at(np.asarray(u[some] / grid.pixel_size), np.asarray(det), order)
 
     @classmethod
     def at(cls, u_px: FloatArray, det: FloatArray, order: int) -> NoiseTransfer:
-        """From displacements (k, 2) of whole pixels [px], det F there (k,), and a spline's order."""
+        """Of whole pixels displaced by (k, 2) [px], det F there (k,), and a spline's order."""
         # Whole pixels make no difference to where between pixels a position is.
         (w_x, s_x), (w_y, s_y) = (_variances(order, u_px[:, c] % 1.0) for c in (0, 1))
         return cls(
