@@ -31,6 +31,7 @@ from modeharvest.idic.finite_element.pixels import (
     ElementPixels,
     normal_equations,
     pixels_of,
+    require_cover,
 )
 from modeharvest.idic.finite_element.result import NodalResult, Step
 from modeharvest.idic.result import Result
@@ -162,7 +163,10 @@ def measure_displacement(
         else np.asarray(start(mesh.nodes), dtype=np.float64)
     )
     if begin.shape != mesh.nodes.shape or not np.isfinite(begin).all():
-        raise InputError(f"expected a finite start at {len(mesh.nodes)} nodes, got {begin.shape}")
+        raise InputError(
+            f"expected a start of finite displacements {mesh.nodes.shape} at the nodes, got "
+            f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
+        )
     course = _Course(pair, Body(mesh, begin), options, progress)
     for stage in options.stages:
         course.through(stage)
@@ -200,6 +204,7 @@ class _Course:
         self._level, self.images = level, images_on(self.pair, level, self.options.edge_px, order)
         grid, mask = self.images.grid, self.images.mask
         self.pixels = pixels_of(self.body.mesh, grid, mask, self.images.reference)
+        require_cover(self.pixels, mask)
         if level == FULL:
             self._weigh_by_reference()
         self._lap("images")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.solver.pyramid import LevelPair
@@ -21,6 +22,7 @@ from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.spline import sample_points
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.compiled import compiled
+from modeharvest.util.errors import InputError
 
 _BLOCK = 64
 """Pixels of an element that are worked on together."""
@@ -67,6 +69,26 @@ def pixels_of(mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any])
     grey = np.asarray(image, np.float32).ravel()[flat]
     none = np.empty((2, 0), np.float32)
     return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, grey, none)
+
+
+_BEYOND_PX = 2.0
+"""How far from the mesh the edge of a mask may be."""
+
+
+def require_cover(pixels: ElementPixels, mask: BoolArray) -> None:
+    """Raise InputError if pixels of a mask lie farther than 2 px from those in elements."""
+    if pixels.row.size == mask.sum():
+        return
+    there = np.zeros_like(mask)
+    there[pixels.row, pixels.col] = True
+    far = mask & (ndimage.distance_transform_edt(~there) > _BEYOND_PX)
+    if far.any():
+        row, col = np.argwhere(far)[0]
+        raise InputError(
+            f"expected a mesh that covers the mask, got one that leaves out {int(far.sum())} of "
+            f"{int(mask.sum())} px, the first at row {row}, column {col}; give the mesh of the "
+            "whole body, or a mask of what it covers"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
 from modeharvest.imaging.mapping.pointwise import locate_points
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
 _BEYOND_PX = 2.0
@@ -198,15 +198,3 @@ def located_at(
         xi -= np.linalg.solve(F, off[..., None])[..., 0]
         xi = np.clip(xi, -1.0, 2.0)
     return element, xi
-
-
-def require_cover(result_mask: BoolArray, mask: BoolArray, grid: PixelGrid) -> None:
-    """Raise InputError if pixels of a mask lie farther than 2 px from what a mesh covers."""
-    far = mask & (ndimage.distance_transform_edt(~result_mask) > _BEYOND_PX)
-    if far.any():
-        row, col = np.argwhere(far)[0]
-        raise InputError(
-            f"expected a mesh that covers the mask, got one that leaves out {int(far.sum())} of "
-            f"{int(mask.sum())} px, the first at row {row}, column {col}; give the mesh of the "
-            "whole body, or a mask of what it covers"
-        )

@@ -1,0 +1,141 @@
+"""Parts of finite-element DIC: smoothness, normal equations, factorisation, continued images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from perforated import OBLIQUE, holed_cell
+from plate_with_hole import GRID, is_material, plate_pair, quadratic_field
+from scipy.sparse import csr_array, diags_array
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.sparse_factor import LIBRARIES, factorise
+from modeharvest.idic.finite_element.body import Body
+from modeharvest.idic.finite_element.images import continued, images_on
+from modeharvest.idic.finite_element.pixels import normal_equations, pixels_of
+from modeharvest.idic.finite_element.smoothness import inner_sides, smoothness_matrix
+from modeharvest.idic.solver.pyramid import FULL
+
+
+@pytest.fixture(scope="module")
+def mesh() -> Mesh:
+    return holed_cell(OBLIQUE, 6)
+
+
+def straight(mesh: Mesh) -> Mesh:
+    nodes = mesh.nodes.copy()
+    for k in range(3):
+        ends = mesh.cells[:, [k, (k + 1) % 3]]
+        nodes[mesh.cells[:, 3 + k]] = nodes[ends].mean(axis=1)
+    return Mesh(nodes, mesh.cells, "T6")
+
+
+def test_smoothness_vanishes_for_affine_fields_alone(mesh: Mesh) -> None:
+    R = smoothness_matrix(mesh).toarray()
+    values, vectors = np.linalg.eigh(R)
+    assert (values[:3] < 1e-9 * values[-1]).all()
+    assert values[3] > 1e4 * abs(values[:3]).max()
+    affine = np.column_stack([np.ones(len(mesh.nodes)), mesh.nodes])
+    inside = np.linalg.lstsq(vectors[:, :3], affine, rcond=None)[0]
+    np.testing.assert_allclose(vectors[:, :3] @ inside, affine, atol=1e-6)
+
+
+def test_smoothness_of_a_quadratic_is_its_second_gradients(mesh: Mesh) -> None:
+    mesh = straight(mesh)
+    x, y = mesh.nodes.T
+    u = 1.5 * x**2 + 2.0 * x * y - 0.5 * y**2
+    a, b, c = (mesh.nodes[mesh.cells[:, k]] for k in range(3))
+    area = 0.5 * abs(np.linalg.det(np.stack([b - a, c - a], axis=1))).sum()
+    assert u @ smoothness_matrix(mesh) @ u == pytest.approx((9.0 + 2 * 4.0 + 1.0) * area, rel=1e-9)
+
+
+def test_every_side_inside_has_two_cells(mesh: Mesh) -> None:
+    sides = inner_sides(mesh.cells)
+    for cell, k, other, m in sides:
+        ends = mesh.cells[cell, [k, (k + 1) % 3]], mesh.cells[other, [m, (m + 1) % 3]]
+        assert set(ends[0]) == set(ends[1])
+    corners = len(np.unique(mesh.cells[:, :3]))
+    # Euler: corners - sides + cells = 0 for a plate with one hole.
+    assert corners - (3 * len(mesh.cells) - len(sides)) + len(mesh.cells) == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_gradient_against_finite_differences(share: float) -> None:
+    pair = plate_pair(quadratic_field)
+    body = Body(plate_mesh(), np.zeros((len(plate_mesh().nodes), 2)))
+    level = images_on(pair, FULL, 4, 5)
+    pixels = pixels_of(body.mesh, level.grid, level.mask, level.reference)
+    if share:
+        _, d_row, d_col = images_on(
+            type(pair)(pair.deformed, pair.reference, GRID, pair.deformed_mask, pair.mask),
+            FULL, 0, 5,
+        ).deformed.sample(pixels.row, pixels.col)  # fmt: skip
+        slope = np.stack([d_col, -d_row]).astype(np.float32) / GRID.pixel_size
+        pixels = pixels._replace(slope=slope)
+    random = np.random.default_rng(1)
+    u = quadratic_field(body.mesh.nodes)
+    there = normal_equations(pixels, body.mesh, level, u, share)
+    M, gradient = body.assembled(there)
+    assert there.outside == 0
+    if share:
+        # At the truth both gradients are the same, but for what splines make of the images.
+        other, _ = body.assembled(normal_equations(pixels, body.mesh, level, u, 0.0))
+        assert abs(M - other).max() < 2e-3 * abs(other).max()
+        return
+    step = 1e-6 * random.standard_normal(u.shape)
+    squares = [
+        normal_equations(pixels, body.mesh, level, u + s * step, 0.0).square_sum for s in (1, -1)
+    ]
+    slope = -(squares[0] - squares[1]) / 4.0
+    expected = gradient @ step.ravel()
+    scale = np.sqrt(there.square_sum * (step.ravel() @ (M @ step.ravel())))
+    assert slope == pytest.approx(expected, abs=1e-4 * scale)
+    assert abs(M - M.T).max() <= 1e-12 * abs(M).max()
+
+
+def plate_mesh() -> Mesh:
+    from modeharvest.fem.meshing import rectangle
+
+    block = rectangle(2.2, 0.5, 10, 3)
+    return Mesh(block.nodes + np.array([-1.1, 0.38]), block.cells, "T6")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_factor_solves_and_takes_new_values(library: str) -> None:
+    pytest.importorskip({"mumps": "petsc4py", "pardiso": "pypardiso", "superlu": "scipy"}[library])
+    n = 40
+    matrix = csr_array(diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(n, n)))
+    matrix.sort_indices()
+    factor = factorise(matrix, library)
+    right = np.random.default_rng(0).standard_normal((n, 3))
+    np.testing.assert_allclose(matrix @ factor.solve(right), right, atol=1e-12)
+    factor.update(2.0 * matrix)
+    np.testing.assert_allclose(2.0 * matrix @ factor.solve(right[:, 0]), right[:, 0], atol=1e-12)
+
+
+def test_libraries_agree() -> None:
+    n = 30
+    matrix = csr_array(diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(n, n)))
+    right = np.arange(float(n))
+    np.testing.assert_allclose(
+        factorise(matrix).solve(right), factorise(matrix, "superlu").solve(right), rtol=1e-10
+    )
+
+
+def test_continued_image_follows_a_smooth_pattern() -> None:
+    at = np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1)
+    mask = is_material(at)
+    smooth = (np.sin(4.0 * at[..., 0]) + np.cos(3.0 * at[..., 1])).astype(np.float32)
+    found = continued(np.where(mask, smooth, 0.0).astype(np.float32), mask)
+    np.testing.assert_array_equal(found[mask], smooth[mask])
+    near = images_border(mask)
+    # 0.04/px is the slope: a constant continuation would be off by that.
+    assert abs(found - smooth)[near].max() < 0.004
+
+
+def images_border(mask: np.ndarray) -> np.ndarray:
+    """Pixels beside the mask."""
+    beside = np.zeros_like(mask)
+    beside[1:] |= mask[:-1]
+    beside[:-1] |= mask[1:]
+    return beside & ~mask

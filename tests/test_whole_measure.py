@@ -1,0 +1,154 @@
+"""The whole displacement of a plate with a hole, measured on a mesh of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from manufactured import speckle
+from plate_with_hole import GRID, plate_pair, quadratic_field
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.util.errors import InputError
+
+pytest.importorskip("gmsh")
+
+COARSE = FiniteElementOptions(element_px=30.0, edge_element_px=15.0)
+
+
+def at_rest(points: np.ndarray) -> np.ndarray:
+    return np.zeros_like(points)
+
+
+def wavy_field(points: np.ndarray) -> np.ndarray:
+    """A quadratic field and a wave of 80 px with an amplitude of 1 px."""
+    x, y = np.moveaxis(points, -1, 0)
+    wave = 0.01 * np.stack([np.sin(2 * np.pi * y / 0.8), np.sin(2 * np.pi * x / 0.8)], axis=-1)
+    return quadratic_field(points) + wave
+
+
+def error_px(pair: ImagePair, result: NodalResult) -> np.ndarray:
+    assert pair.truth is not None
+    return ((result.displacement_on() - pair.truth.displacement) / GRID.pixel_size)[pair.masks[0]]
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[ImagePair, NodalResult]:
+    pair = plate_pair(wavy_field, 0.02)
+    return pair, measure_displacement(pair, at_rest, options=COARSE)
+
+
+def test_quadratic_field_from_rest() -> None:
+    pair = plate_pair(quadratic_field)
+    result = measure_displacement(pair, at_rest, options=COARSE)
+    error = error_px(pair, result)
+    # What the spline does to exact images: 1e-3 px, and more beside edges.
+    assert np.sqrt(np.mean(error**2)) < 3e-3
+    assert abs(error).max() < 0.1
+    F = result.deformation_gradient
+    x, y = result.mesh.nodes.T
+    expected = np.stack([0.97 + 0.01 * y, 0.01 + 0.01 * x, -0.016 * x, 1.02 + 0 * x], axis=-1)
+    assert np.sqrt(np.mean((F.reshape(-1, 4) - expected) ** 2)) < 2e-3
+
+
+def test_start_that_is_right_stays() -> None:
+    pair = plate_pair(quadratic_field)
+    result = measure_displacement(pair, quadratic_field, options=COARSE)
+    assert np.sqrt(np.mean(error_px(pair, result) ** 2)) < 3e-3
+
+
+def test_wave_under_noise(noisy: tuple[ImagePair, NodalResult]) -> None:
+    pair, result = noisy
+    error = error_px(pair, result)
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert 10.0 < result.cutoff_px < 80.0
+    # 2 % in both images, that of g interpolated.
+    assert result.residual_noise == pytest.approx(0.02 * np.sqrt(1.0 + 0.8), rel=0.1)
+    sd = (result.standard_deviation_on() / GRID.pixel_size)[pair.masks[0]]
+    assert 0.88 < np.mean(abs(error) < 1.96 * sd) < 0.995
+
+
+def test_found_cutoff_is_nearly_the_best(noisy: tuple[ImagePair, NodalResult]) -> None:
+    pair, result = noisy
+    rms = [
+        np.sqrt(np.mean(error_px(pair, measure_displacement(
+            pair, at_rest, result.mesh,
+            options=FiniteElementOptions(cutoff_px=share * result.cutoff_px),
+        )) ** 2))
+        for share in (0.5, 0.7, 1.0, 1.4, 2.0)
+    ]  # fmt: skip
+    assert rms[2] < 1.25 * min(rms)
+
+
+def test_no_displacement_where_there_is_none() -> None:
+    pair = plate_pair(at_rest, 0.02)
+    result = measure_displacement(pair, at_rest, options=COARSE)
+    error = error_px(pair, result)
+    sd = (result.standard_deviation_on() / GRID.pixel_size)[pair.masks[0]]
+    assert np.sqrt(np.mean(error**2)) < 1.2 * np.sqrt(np.mean(sd**2))
+    assert abs(error.mean(axis=0)).max() < 0.01
+
+
+def test_values_at_points_and_pixels_agree(noisy: tuple[ImagePair, NodalResult]) -> None:
+    _, result = noisy
+    rows, cols = np.array([30, 110, 180]), np.array([40, 60, 200])
+    points = np.stack(GRID.to_mm(rows, cols), axis=1)
+    np.testing.assert_allclose(result.at(points), result.displacement_on()[rows, cols], atol=1e-12)
+    assert np.isnan(result.at(np.zeros((1, 2)))).all()  # in the hole
+
+
+def test_strains_of_a_rotation_and_a_stretch(noisy: tuple[ImagePair, NodalResult]) -> None:
+    _, result = noisy
+    turn, stretch = np.array([[0.8, -0.6], [0.6, 0.8]]), np.diag([1.2, 0.9])
+    u = result.mesh.nodes @ (turn @ stretch - np.eye(2)).T
+    known = replace(result, displacement=u)
+    np.testing.assert_allclose(
+        known.green_lagrange, np.broadcast_to(0.5 * (stretch**2 - np.eye(2)), (len(u), 2, 2)),
+        atol=1e-10,
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        known.logarithmic_strain, np.broadcast_to(np.diag(np.log([1.2, 0.9])), (len(u), 2, 2)),
+        atol=1e-10,
+    )  # fmt: skip
+
+
+def test_mesh_of_a_part_is_refused() -> None:
+    pair = plate_pair(quadratic_field)
+    corner = Mesh([[-1.1, -0.9], [0.0, -0.9], [-1.1, 0.0]], [[0, 1, 2]], "T3")
+    with pytest.raises(InputError, match="expected a mesh that covers the mask"):
+        measure_displacement(pair, at_rest, corner)
+
+
+def test_starts_that_are_no_displacement() -> None:
+    pair = plate_pair(quadratic_field)
+    with pytest.raises(InputError, match="expected a start"):
+        measure_displacement(pair, lambda x: x[:, 0], options=COARSE)
+    with pytest.raises(InputError, match="expected a start"):
+        measure_displacement(pair, lambda x: np.nan * x, options=COARSE)
+
+
+def test_images_without_anything_in_common() -> None:
+    pair = plate_pair(quadratic_field)
+    with pytest.raises(InputError, match="got none in common"):
+        measure_displacement(pair, lambda x: x + 100.0, options=COARSE)
+
+
+def test_whole_image_without_masks() -> None:
+    grid = PixelGrid.centred(120, 140, 0.01)
+    exact = speckle(1, grid)
+    x, y = np.meshgrid(grid.x, grid.y)
+    pair = ImagePair(exact(x, y), exact(x - 0.013, y + 0.004), grid)
+    result = measure_displacement(pair, at_rest, options=COARSE)
+    u = result.displacement_on()[20:-20, 20:-20] / grid.pixel_size
+    assert abs(u - [1.3, -0.4]).max() < 0.01
+
+
+def test_options_are_checked() -> None:
+    for wrong in ({"element_px": 1.0}, {"steps": 0}, {"cutoff_px": 0.0}, {"edge_px": -1}):
+        with pytest.raises(InputError):
+            FiniteElementOptions(**wrong)

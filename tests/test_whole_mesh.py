@@ -1,0 +1,87 @@
+"""Meshes of the material from masks alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plate_with_hole import GRID, HALF_SIZE, RADIUS, is_material
+
+from modeharvest.fem.field import Mesh, boundary_sides
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, outlines, quadratic
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.util.errors import InputError
+
+pytest.importorskip("gmsh")
+
+PLATE = is_material(np.stack(np.meshgrid(GRID.x, GRID.y), axis=-1))
+
+
+def test_outline_to_sub_pixel() -> None:
+    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0)
+    edge = mesh.nodes[np.unique(boundary_sides(mesh))]
+    radius = np.hypot(*edge.T)
+    hole = radius < 0.5
+    assert hole.sum() > 30
+    off_px = (radius[hole] - RADIUS) / GRID.pixel_size
+    # The mask knows pixel centres only.
+    assert abs(off_px).max() < 0.6
+    assert abs(off_px.mean()) < 0.25
+    # Half a pixel beyond the last centre that is inside; corners are sharp.
+    distance = (HALF_SIZE - abs(edge[~hole])).min(axis=1) / GRID.pixel_size
+    assert abs(distance).max() < 1.0
+    for corner in HALF_SIZE * [[1, 1], [1, -1], [-1, 1], [-1, -1]]:
+        assert np.linalg.norm(edge - corner, axis=1).min() < 1.5 * GRID.pixel_size
+
+
+def test_mesh_covers_the_mask() -> None:
+    mesh = mesh_of_mask(PLATE, GRID, 20.0, 10.0)
+    covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
+    assert (PLATE & ~covered).sum() < 0.002 * PLATE.sum()
+    assert (covered & ~PLATE).sum() < 0.01 * PLATE.sum()
+
+
+def test_whole_image_without_holes() -> None:
+    mesh = mesh_of_mask(np.ones(GRID.shape, dtype=bool), GRID, 30.0)
+    assert locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask.all()
+
+
+def test_islands_are_bodies_and_specks_are_left_out() -> None:
+    mask = np.zeros(GRID.shape, dtype=bool)
+    mask[20:100, 20:120] = mask[120:200, 130:240] = True
+    mask[50:70, 50:70] = False  # a hole of the first
+    mask[10:14, 200:204] = True  # a speck
+    mask[150:154, 160:164] = False  # dirt
+    found = outlines(mask, 12.0)
+    assert sorted(len(part) for part in found.parts) == [1, 2]
+    assert [word.split(" of ")[0] for word in found.ignored] == ["island", "hole"]
+    mesh = mesh_of_mask(mask, GRID, 12.0)
+    covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
+    assert (mask & ~covered).sum() < 100
+    assert not covered[55:65, 55:65].any()
+
+
+def test_no_material() -> None:
+    mask = np.zeros(GRID.shape, dtype=bool)
+    mask[5:9, 5:9] = True
+    with pytest.raises(InputError, match="expected a mask with material for elements of 24 px"):
+        mesh_of_mask(mask, GRID, 24.0)
+
+
+def test_linear_triangles_become_quadratic() -> None:
+    mesh = mesh_of_mask(PLATE, GRID, 40.0, 20.0)
+    linear = Mesh(mesh.nodes, mesh.cells[:, :3], "T3")
+    found = quadratic(linear)
+    assert found.element == "T6"
+    np.testing.assert_allclose(
+        found.nodes[found.cells[:, 3]], found.nodes[found.cells[:, :2]].mean(axis=1), atol=1e-15
+    )
+    assert len(np.unique(found.cells)) == len(np.unique(mesh.cells))
+
+
+def test_other_and_folded_elements_are_refused() -> None:
+    square = Mesh([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2, 3]], "Q4")
+    with pytest.raises(InputError, match="expected a mesh of T3 or T6 elements"):
+        quadratic(square)
+    folded = Mesh([[0, 0], [0, 1], [1, 0]], [[0, 1, 2]], "T3")
+    with pytest.raises(InputError, match="positive Jacobians"):
+        quadratic(folded)
