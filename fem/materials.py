@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from modeharvest.fem.jets import JetMatrix
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import made, nearest
 
@@ -53,8 +54,7 @@ class Ogden:
 
     def energy(self, F: Any) -> Any:
         """W(F) [MPa]."""
-        import ufl
-
+        ufl = functions_of(F)
         J = ufl.det(F)
         terms = [
             c / m**2 * (power_sum_of_stretches(F, m) - 2.0 - m * ufl.ln(J))
@@ -82,8 +82,7 @@ class TwoTermI1:
 
     def energy(self, F: Any) -> Any:
         """W(F) [MPa]."""
-        import ufl
-
+        ufl = functions_of(F)
         J = ufl.det(F)
         i1 = ufl.inner(F, F) + 1.0
         return (
@@ -92,6 +91,15 @@ class TwoTermI1:
             - 2.0 * self.c1 * ufl.ln(J)
             + 0.5 * self.bulk * (J - 1.0) ** 2
         )
+
+
+def functions_of(F: Any) -> Any:
+    """The functions det, inner, ln, sqrt, lt and conditional of F: UFL's, or those of jets."""
+    if isinstance(F, JetMatrix):
+        return JetMatrix
+    import ufl
+
+    return ufl
 
 
 @runtime_checkable
@@ -137,20 +145,17 @@ def power_sum_of_stretches(F: Any, m: float) -> Any:
     where s >= 0 is a smooth function of F, free of cancellation. cosh(m asinh(sqrt(s))) is
     analytic in s; near s = 0 its power series is used, elsewhere the closed form.
     """
-    import ufl
-
+    ufl = functions_of(F)
     J = ufl.det(F)
     s = ((F[0, 0] - F[1, 1]) ** 2 + (F[0, 1] + F[1, 0]) ** 2) / (4.0 * J)
-    return 2.0 * J ** (0.5 * m) * _cosh_m_asinh_sqrt(s, m)
+    return 2.0 * J ** (0.5 * m) * _cosh_m_asinh_sqrt(ufl, s, m)
 
 
 _SERIES_LIMIT = 0.02
 _SERIES_TERMS = 9  # the first one left out is below 1e-15 at the limit for |m| <= 10
 
 
-def _cosh_m_asinh_sqrt(s: Any, m: float) -> Any:
-    import ufl
-
+def _cosh_m_asinh_sqrt(ufl: Any, s: Any, m: float) -> Any:
     near = ufl.lt(s, _SERIES_LIMIT)
     # The closed form must stay differentiable where it isn't used: 0 * NaN would be NaN.
     root = ufl.sqrt(ufl.conditional(near, _SERIES_LIMIT, s))

@@ -7,6 +7,7 @@ from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import Factor, factorise
+from modeharvest.idic.finite_element.equilibrium import Imbalance
 from modeharvest.idic.finite_element.pattern import NodalPattern
 from modeharvest.idic.finite_element.pixels import NodalEquations
 from modeharvest.idic.finite_element.smoothness import add_at, inner_sides, smoothness_matrix
@@ -21,11 +22,13 @@ class Body:
         sides = inner_sides(mesh.cells)
         pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
-        self.R = self.pattern.both(smoothness_matrix(mesh))
+        self._smoothness = self.pattern.both(smoothness_matrix(mesh))
+        self.law: Imbalance | None = None
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
         self._wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
         self._waves = _waves(mesh.nodes, self._wavelength)
         self._factor: Factor | None = None
+        self._stored = 0
 
     @property
     def library(self) -> str:
@@ -39,16 +42,23 @@ class Body:
         add_at(gradient, self.mesh.cells, equations.gradient)
         return M, gradient.ravel()
 
-    def weight(self, M: csr_array, cutoff: float) -> float:
-        """The weight lambda of the smoothness for a cut-off wavelength [mm]."""
-        data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, self.R))
+    def penalty(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
+        """(2 n, 2 n) R and (2 n,) half the gradient of what is penalised, at u (2 n,)."""
+        if self.law is not None:
+            return self.law.linearised(u)
+        return self._smoothness, self._smoothness @ (u - self.start.ravel())
+
+    def weight(self, M: csr_array, R: csr_array, cutoff: float) -> float:
+        """The weight lambda of R for a cut-off wavelength [mm]."""
+        data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, R))
         return (cutoff / self._wavelength) ** 4 * data / smooth
 
-    def factor(self, M: csr_array, weight: float) -> Factor:
-        """Factorise M + lambda R; always the same object."""
-        A = csr_array((M.data + weight * self.R.data, M.indices, M.indptr), shape=M.shape)
-        if self._factor is None:
-            self._factor = factorise(A)
+    def factor(self, M: csr_array, R: csr_array, weight: float) -> Factor:
+        """Factorise M + lambda R."""
+        A = csr_array(M + weight * R)
+        A.sort_indices()
+        if self._factor is None or self._stored != A.nnz:
+            self._factor, self._stored = factorise(A), A.nnz
         else:
             self._factor.update(A)
         return self._factor

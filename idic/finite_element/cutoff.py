@@ -51,6 +51,8 @@ class Linearised:
         Sum of r^2, and how many pixels it is over.
     blocks
         (m, 3, 6, 6) parts of M, element by element.
+    R, penalty
+        (2 n, 2 n) matrix and (2 n,) gradient of the regularisation.
     """
 
     u: FloatArray
@@ -59,6 +61,8 @@ class Linearised:
     square_sum: float
     pixels: int
     blocks: FloatArray
+    R: csr_array
+    penalty: FloatArray
 
 
 @dataclass(frozen=True)
@@ -85,10 +89,10 @@ class Risk:
 
 def risk(body: Body, at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> Risk:
     """Estimate the risk of one cut-off wavelength; ``excess`` is c."""
-    weight = body.weight(at.M, cutoff_px * pixel_size)
+    weight = body.weight(at.M, at.R, cutoff_px * pixel_size)
     z = np.random.default_rng(0).choice([-1.0, 1.0], (at.u.size, _PROBES))
-    right = at.gradient - weight * (body.R @ (at.u - body.start.ravel()))
-    found = body.factor(at.M, weight).solve(np.column_stack([right, at.M @ z]))
+    right = at.gradient - weight * at.penalty
+    found = body.factor(at.M, at.R, weight).solve(np.column_stack([right, at.M @ z]))
     step = found[:, 0]
     Q = at.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
@@ -126,9 +130,8 @@ _SAMPLES = 16
 
 def newton_step(body: Body, at: Linearised, cutoff: float) -> FloatArray:
     """(2 n,) Gauss-Newton step for a cut-off wavelength [mm]."""
-    weight = body.weight(at.M, cutoff)
-    smooth = body.R @ (at.u - body.start.ravel())
-    return body.factor(at.M, weight).solve(at.gradient - weight * smooth)
+    weight = body.weight(at.M, at.R, cutoff)
+    return body.factor(at.M, at.R, weight).solve(at.gradient - weight * at.penalty)
 
 
 def deviations(body: Body, at: Linearised, cutoff: float) -> tuple[FloatArray, FloatArray]:
@@ -144,7 +147,8 @@ def deviations(body: Body, at: Linearised, cutoff: float) -> tuple[FloatArray, F
     """
     longer = newton_step(body, at, _STEP * cutoff)
     change = (longer - newton_step(body, at, cutoff)).reshape(-1, 2)
-    found = body.factor(at.M, body.weight(at.M, cutoff)).solve(body.samples(at.blocks, _SAMPLES))
+    factor = body.factor(at.M, at.R, body.weight(at.M, at.R, cutoff))
+    found = factor.solve(body.samples(at.blocks, _SAMPLES))
     by_noise = np.sqrt(np.mean(found**2, axis=1)).reshape(-1, 2)
     cells = body.mesh.cells
     around, count = np.zeros_like(change), np.zeros((len(change), 1))

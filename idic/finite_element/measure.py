@@ -167,14 +167,14 @@ def measure_displacement(
             f"expected a start of finite displacements {mesh.nodes.shape} at the nodes, got "
             f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
         )
-    course = _Course(pair, Body(mesh, begin), options, progress)
+    course = _Measurement(pair, Body(mesh, begin), options, progress)
     for stage in options.stages:
         course.through(stage)
     tried = course.finish()
     return course.result(tried)
 
 
-class _Course:
+class _Measurement:
     """A measurement on its way: the images of a stage, the displacement of the nodes."""
 
     def __init__(
@@ -230,7 +230,10 @@ class _Course:
             raise InputError("expected pixels of the material in both images, got none in common")
         M, gradient = self.body.assembled(found)
         self._lap("pixels")
-        return Linearised(self.u, M, gradient, found.square_sum, found.pixels, found.blocks)
+        return Linearised(
+            self.u, M, gradient, found.square_sum, found.pixels, found.blocks,
+            *self.body.penalty(self.u),
+        )  # fmt: skip
 
     def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
         """Take steps until they are short."""
