@@ -7,7 +7,7 @@ from the best fit; how often 95 % intervals hold the truth; the cut-off waveleng
 and what others would have left.
 
 Run: scripts/env python benchmarks/whole_field.py FOLDER [--strain 0.128] [--noise 0 0.01 0.02]
-     [--seeds 1] [--mesh mask|specimen] [--others 0.7 1.4 2] [--json FILE]
+     [--seeds 1] [--mesh mask|specimen] [--law] [--element 24 12] [--others 0.7 1.4 2] [--json FILE]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import argparse
 import json
 import resource
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from modeharvest.fem.materials import material_of
 from modeharvest.fem.meshing import mesh_specimen
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import best_fit, fit_displacement
-from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet
@@ -84,6 +85,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--mesh", choices=["mask", "specimen"], default="mask")
     parser.add_argument("--others", type=float, nargs="*", default=[])
+    parser.add_argument("--law", action="store_true", help="regularise with the truth's own law")
+    parser.add_argument("--element", type=float, nargs=2, default=[24.0, 12.0], metavar="PX")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     images = ImageSet.read(given.folder / "images")
@@ -94,15 +97,16 @@ def main() -> None:
     best = best_fit(truth, start)
     rows, head = [], "noise seed  cut-off     all   edges  ligam.    bulk longest   refit"
     print(f"{head}  covered (all, edges)  seconds (CPU)   GB  unknowns")
+    options = FiniteElementOptions(*given.element, law=law_of(images) if given.law else None)
     for noise in given.noise:
         for seed in range(given.seeds):
             pair = noisy(images, given.strain, noise, seed)
-            row = measured(pair, start, best, specimen, noise, seed, given.mesh, None)
+            row = measured(pair, start, best, specimen, noise, seed, given.mesh, options)
             rows.append(row)
             show(row)
             for share in given.others:
-                cutoff = share * row.cutoff_px
-                show(measured(pair, start, best, specimen, noise, seed, given.mesh, cutoff))
+                other = replace(options, cutoff_px=share * row.cutoff_px)
+                show(measured(pair, start, best, specimen, noise, seed, given.mesh, other))
     if given.json:
         given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), "utf-8")
 
@@ -111,6 +115,20 @@ def specimen_of(images: ImageSet) -> Specimen:
     """The specimen that the images show."""
     table: dict[str, Any] = dict(images.info["solution"]["specimen"])
     return Specimen(**table)
+
+
+def law_of(images: ImageSet) -> Law:
+    """The material of the truth; the ends along x are loaded."""
+    grid, mask = images.grid, images.mask()
+    ends = grid.x[np.flatnonzero(mask.any(axis=0))[[0, -1]]] + [-0.5, 0.5] * np.array(
+        grid.pixel_size
+    )
+
+    def loaded(points: NDArray[Any]) -> NDArray[np.bool_]:
+        distance = np.abs(points[:, :1] - ends).min(axis=1)
+        return np.asarray(distance < grid.pixel_size)
+
+    return Law(material_of(images.info["solution"]["material"]), loaded)
 
 
 def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair:
@@ -128,10 +146,9 @@ def noisy(images: ImageSet, strain: float, noise: float, seed: int) -> ImagePair
 
 def measured(
     pair: ImagePair, start: Result, best: Result, specimen: Specimen, noise: float, seed: int,
-    kind: str, cutoff_px: float | None,
+    kind: str, options: FiniteElementOptions,
 ) -> Row:  # fmt: skip
     """Measure, and set it against the truth."""
-    options = FiniteElementOptions(cutoff_px=cutoff_px)
     px = pair.grid.pixel_size
     mesh = mesh_specimen(specimen, 16.0 * px) if kind == "specimen" else None
     wall, cpu = time.perf_counter(), time.process_time()

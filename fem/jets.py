@@ -96,7 +96,8 @@ class JetMatrix:
     @staticmethod
     def ln(x: Jet) -> Jet:
         """Natural logarithm."""
-        return x.of(np.log(x.value), 1.0 / x.value, -1.0 / x.value**2)
+        inverse = np.asarray(1.0 / x.value)
+        return x.of(np.log(x.value), inverse, -inverse * inverse)
 
     @staticmethod
     def sqrt(x: Jet) -> Jet:

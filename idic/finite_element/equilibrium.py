@@ -58,7 +58,7 @@ class Imbalance:
         f = np.einsum("eqij,eqaj->eai", P, self._slopes, optimize=True)
         half = np.einsum("eqijkl,eqbl->eqijkb", A, self._slopes, optimize=True)
         K = np.einsum("eqijkb,eqaj->eaibk", half, self._slopes, optimize=True)
-        total = np.bincount(self._dofs, f.ravel(), u.size)
+        total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
         return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
 
     def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:

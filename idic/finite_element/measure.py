@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import Material
 from modeharvest.idic.finite_element.body import Body
 from modeharvest.idic.finite_element.cutoff import (
     Linearised,
@@ -25,6 +26,7 @@ from modeharvest.idic.finite_element.cutoff import (
     newton_step,
     risk,
 )
+from modeharvest.idic.finite_element.equilibrium import Imbalance
 from modeharvest.idic.finite_element.images import continued, images_on
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import (
@@ -42,12 +44,15 @@ from modeharvest.idic.solver.weighting import best_blur
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, silent
 
 _FIRST_PX = 20.0
 """Cut-off wavelength from which on the best one is sought [px]."""
+_FIRST_WITH_LAW_PX = 150.0
+_WORSE = 1.01
+"""Ratio of the residual's noise with a law to that without, beyond which the law is wrong."""
 _ROUNDS = 3
 _SETTLED = 0.25
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -73,6 +78,22 @@ STAGES = (Stage(Level(2, 3.0), 200.0), Stage(Level(2, 1.5), 80.0), Stage(FULL, 4
 
 
 @dataclass(frozen=True)
+class Law:
+    """A material law to regularise with.
+
+    Parameters
+    ----------
+    material
+        Of the body, in plane strain; a factor of its moduli doesn't matter.
+    loaded
+        Which points (n, 2) of the body [mm] forces may act on: (n,) True there.
+    """
+
+    material: Material
+    loaded: Callable[[FloatArray], BoolArray]
+
+
+@dataclass(frozen=True)
 class FiniteElementOptions:
     """How to measure on a mesh.
 
@@ -84,6 +105,8 @@ class FiniteElementOptions:
         Before the last one, which has the unfiltered images and ``cutoff_px``.
     cutoff_px
         Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk.
+    law
+        By which to regularise in the end; None for the smoothness of what is added to the start.
     edge_px
         Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
     order
@@ -101,6 +124,7 @@ class FiniteElementOptions:
     edge_element_px: float = 12.0
     stages: tuple[Stage, ...] = STAGES
     cutoff_px: float | None = None
+    law: Law | None = None
     edge_px: int = 0
     order: int | None = None
     steps: int = 4
@@ -170,8 +194,8 @@ def measure_displacement(
     course = _Measurement(pair, Body(mesh, begin), options, progress)
     for stage in options.stages:
         course.through(stage)
-    tried = course.finish()
-    return course.result(tried)
+    course.finish()
+    return course.result()
 
 
 class _Measurement:
@@ -189,6 +213,8 @@ class _Measurement:
         self.images: LevelPair
         self.pixels: ElementPixels
         self.share = 0.0
+        self.tried: tuple[Risk, ...] = ()
+        self.warnings: tuple[str, ...] = ()
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = options.order or (5 if self.speckle_px >= 6.5 else 11)
 
@@ -256,24 +282,38 @@ class _Measurement:
             if rms < tolerance_px:
                 break
 
-    def finish(self) -> tuple[Risk, ...]:
-        """Find the last cut-off wavelength and what it gives."""
-        px, cutoff = self.pair.grid.pixel_size, self.options.cutoff_px
+    def finish(self) -> None:
+        """Find the last cut-off wavelength and what it gives: without a law, then with one."""
         self._prepare(FULL)
-        tried: tuple[Risk, ...] = ()
+        law, given = self.options.law, self.options.cutoff_px
+        free = self._regularised(_FIRST_PX, None if law is not None else given)
+        if law is None:
+            return
+        mesh, before = self.body.mesh, free.noise
+        self.body.law = Imbalance(mesh, law.material, law.loaded(mesh.nodes))
+        found = self._regularised(_FIRST_WITH_LAW_PX, given).noise
+        if found > _WORSE * before:
+            self.warnings = (
+                f"The material law doesn't fit: with it the residual's noise is {found:.4g} grey "
+                f"levels, without it {before:.4g}; measure without it, or correct the law.",
+            )
+
+    def _regularised(self, first_px: float, cutoff: float | None) -> Risk:
+        """Go to a cut-off wavelength, given or to be found from a first one on; its risk."""
+        px, self.tried = self.pair.grid.pixel_size, ()
         if cutoff is None:
-            cutoff = _FIRST_PX
+            cutoff = first_px
             for _ in range(_ROUNDS):
                 self.through(Stage(FULL, cutoff))
                 before = cutoff
-                tried = least_risk(self.body, self.linearised(), before, px, self._excess())
-                cutoff = best_of(tried)
+                self.tried = least_risk(self.body, self.linearised(), before, px, self._excess())
+                cutoff = best_of(self.tried)
                 self._lap("cut-off")
                 if abs(np.log(cutoff / before)) < _SETTLED:
                     break
         self.through(Stage(FULL, cutoff), self.options.tolerance_px)
         self.cutoff_px = cutoff
-        return tried
+        return risk(self.body, self.linearised(), cutoff, px, self._excess())
 
     def _transfer(self) -> NoiseTransfer:
         """What of the deformed image's noise reaches the residual, at the elements' middles."""
@@ -292,7 +332,7 @@ class _Measurement:
         transfer = self._transfer()
         return (1.0 + transfer.density) / (1.0 + transfer.value)
 
-    def result(self, tried: tuple[Risk, ...]) -> NodalResult:
+    def result(self) -> NodalResult:
         """Make the result, with its standard deviations."""
         at, px = self.linearised(), self.pair.grid.pixel_size
         excess = self._excess()
@@ -310,7 +350,7 @@ class _Measurement:
             noise_deviation=by_noise,
             grid=self.pair.grid,
             cutoff_px=self.cutoff_px,
-            tried=tried,
+            tried=self.tried,
             residual_rms=float(np.sqrt(at.square_sum / at.pixels)),
             residual_noise=here.noise,
             pixels=at.pixels,
@@ -320,4 +360,5 @@ class _Measurement:
             library=self.body.library,
             history=tuple(self.history),
             timings_s=self.laps,
+            warnings=self.warnings,
         )
