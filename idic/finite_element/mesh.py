@@ -1,7 +1,7 @@
 """A T6 mesh of the material: from a mask alone, or from a mesh that is given.
 
 The outline of a mask is the contour at one half of the mask blurred by 1.5 px, smoothed along
-itself, with its corners put back: within 0.2 px of a smooth edge, holes included.
+itself, with its corners put back: within some 0.2 px of a smooth edge, holes included.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.signal import savgol_filter
 from skimage import measure
 
 from modeharvest.fem.field import Mesh
@@ -21,8 +22,10 @@ from modeharvest.util.errors import InputError
 find_contours: Any = measure.find_contours
 
 _BLUR_PX = 1.5
-_ALONG_PX = 2.0
-"""Smoothing of the contour along itself."""
+_WINDOW_PX = 41
+"""Cubics are fitted to that much of a contour: a pixel's edge is smoothed away, no curvature."""
+_ROUNDED_PX = 4
+"""Of a contour, rounded off at corners by the blur."""
 _CORNER = np.deg2rad(40.0)
 _ARM_PX = 12
 """How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
@@ -147,21 +150,27 @@ def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
     s = np.concatenate([[0.0], np.cumsum(length)])
     closed = np.vstack([points, points[:1]])
     raw = np.stack([np.interp(at, s, closed[:, k]) for k in (0, 1)], axis=1)
-    smooth = ndimage.gaussian_filter1d(raw, _ALONG_PX, axis=0, mode="wrap")
     corners = _corners(raw)
     if not corners.size:
+        around = savgol_filter(raw, _window(count), 3, axis=0, mode="wrap")
         k = max(16, round(2.0 * total / element_px))
-        rest = np.rint(np.arange(k + 1) * count / k).astype(int) % count
-        return (smooth[rest],)
-    sharp = {int(k): _intersection(raw, int(k)) for k in corners}
+        return (around[np.rint(np.arange(k + 1) * count / k).astype(int) % count],)
     curves = []
     for begin, end in zip(corners, np.roll(corners, -1), strict=True):
         span = int((end - begin) % count) or count
-        k = max(1, round(2.0 * span / element_px))
-        inner = (begin + np.rint(np.arange(1, k) * span / k).astype(int)) % count
-        far = [p for p in inner if min((p - begin) % count, (end - p) % count) >= _ARM_PX // 2]
-        curves.append(np.vstack([sharp[int(begin)], smooth[far], sharp[int(end)]]))
+        side = raw[(begin + np.arange(_ROUNDED_PX, span - _ROUNDED_PX + 1)) % count]
+        if len(side) > 5:
+            side = savgol_filter(side, _window(len(side)), 3, axis=0, mode="interp")
+        k = max(1, round(2.0 * len(side) / element_px))
+        inner = side[np.rint(np.arange(1, k) * len(side) / k).astype(int)]
+        ends = [_intersection(raw, int(corner))[None] for corner in (begin, end)]
+        curves.append(np.vstack([ends[0], inner, ends[1]]))
     return tuple(curves)
+
+
+def _window(count: int) -> int:
+    """Pixels that a contour of so many is smoothed over: odd, an eighth of it, at most 41."""
+    return int(np.clip(count // 8, 5, _WINDOW_PX)) | 1
 
 
 def _corners(points: FloatArray) -> IntArray:
