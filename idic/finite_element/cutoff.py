@@ -26,8 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from modeharvest.idic.finite_element.body import Body
-from modeharvest.idic.finite_element.smoothness import add_at
+from modeharvest.idic.finite_element.system import Body, add_at
 from modeharvest.util.arrays import FloatArray
 
 _PROBES = 4

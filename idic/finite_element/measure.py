@@ -16,7 +16,6 @@ import numpy as np
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material
-from modeharvest.idic.finite_element.body import Body
 from modeharvest.idic.finite_element.cutoff import (
     Linearised,
     Risk,
@@ -36,6 +35,7 @@ from modeharvest.idic.finite_element.pixels import (
     require_cover,
 )
 from modeharvest.idic.finite_element.result import NodalResult, Step
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
