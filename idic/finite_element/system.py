@@ -5,7 +5,7 @@ component c at node i.
 
 Smoothness, without a material law:
 
-u'Ru = sum over elements int |grad grad u|^2 dA
+    u'Ru = sum over elements int |grad grad u|^2 dA
          + sum over inner sides (2/h) int |[grad u]|^2 ds,
 
 [.] being the jump across a side of length h: zero for affine displacements alone, and natural
