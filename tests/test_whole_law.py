@@ -10,8 +10,7 @@ from perforated import OBLIQUE, holed_cell
 from plate_with_hole import GRID, plate_pair
 
 from modeharvest.fem.field import boundary_sides
-from modeharvest.fem.jets import JetMatrix, stress_and_tangent
-from modeharvest.fem.materials import Ogden, TwoTermI1
+from modeharvest.fem.materials import JetMatrix, Ogden, TwoTermI1, stress_and_tangent
 from modeharvest.idic.finite_element.equilibrium import Imbalance
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 

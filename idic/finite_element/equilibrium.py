@@ -11,8 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.fem.jets import stress_and_tangent
-from modeharvest.fem.materials import Material
+from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.imaging.mapping.elements import shape_gradients
 from modeharvest.util.arrays import BoolArray, FloatArray
 

@@ -13,7 +13,7 @@ Smoothness, without a material law:
 Engel et al., Comput. Methods Appl. Mech. Eng. 191 (2002), doi 10.1016/S0045-7825(02)00286-4. A
 wave of length T costs (2 pi/T)^4 times its mean square, so that a weight of (l/T)^4 v'Mv/v'Rv for
 any wave v halves what of it is at the wavelength l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild,
-Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9435-9.
+Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9407-6.
 """
 
 from __future__ import annotations
