@@ -28,6 +28,8 @@ CASE = f"""{synthetic_benchmark.CASE}
 [correlation]
 v0_degree = 3
 v_degree = 2
+[whole_field]
+measure = false
 """
 HARVEST = """
 title = "A test"

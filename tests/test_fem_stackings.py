@@ -32,19 +32,22 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run, require_same_experiment
+from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.study import ImagePairSpec
 
 RECTANGULAR = Specimen(4, 6, diameter=1.5, diameter_y=1.7, stacking="rectangular", pitch_y=2.0)
 TRIANGULAR = Specimen(3, 5, diameter=1.5, stacking="triangular", bulk_x=1.0, bulk_y=0.5)
 IMAGING = ImagingSpec(pixel_size=0.04, speckle=SpeckleSpec(standard_deviation=0.08, blur_px=1.5))
+NONE = WholeFieldOptions(measure=False)
 FEW = SquareLatticeOptions(v0_degree=3, v_degree=1)
 
 
 def summary_of(specimen: Specimen, strain: float, folder: Path, v_degree: int) -> dict[str, Any]:
     experiment = Experiment(specimen, strains=(strain,), mesh_size=0.35)
     how = SquareLatticeOptions(v0_degree=4, v_degree=v_degree)
-    return Run(Case(experiment=experiment, imaging=IMAGING, correlation=how), folder).all()
+    case = Case(experiment=experiment, imaging=IMAGING, correlation=how, whole_field=NONE)
+    return Run(case, folder).all()
 
 
 def test_ellipses_in_rectangular_stacking_buckle_and_are_measured(tmp_path: Path) -> None:

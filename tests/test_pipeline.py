@@ -18,9 +18,11 @@ from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
+from modeharvest.idic.finite_element.files import read_result
 from modeharvest.runs import run
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
+from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 
@@ -36,6 +38,8 @@ holes_y = 6
 pixel_size = 0.08
 [imaging.speckle]
 seed = 3
+[whole_field]
+measure = false
 """
 
 pytestmark = pytest.mark.dolfinx
@@ -98,6 +102,28 @@ def test_the_run_leaves_what_it_promises(finished: Path) -> None:
         "summary.json",
     } <= names
     assert not [name for name in names if ".part" in name]
+
+
+def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: Path) -> None:
+    how = WholeFieldOptions(element_px=16.0, edge_element_px=10.0)
+    whole = Case.read(case).model_copy(update={"whole_field": how})
+    run(whole, folder)
+    summary = read_json(folder / "summary.json")
+    for snapshot in summary["snapshots"]:
+        found = snapshot["whole_field"]
+        assert found["coverage"] == 1.0
+        assert found["rms_px"] < 0.3 * snapshot["rms_w_px"]
+        assert found["rms_bulk_px"] < found["rms_px"] < found["rms_edges_px"] < found["max_px"]
+        assert found["rms_refit_to_best_fit_px"] < 0.2 * snapshot["rms_idic_to_best_fit_px"]
+        assert found["interval_coverage"] > 0.85
+        assert found["seconds"] > 0.0
+        name = f"displacement_{round(1e4 * snapshot['nominal_strain']):04d}.h5"
+        assert read_result(folder / "whole_field" / name).unknowns == found["unknowns"]
+    page = (folder / "report.html").read_text("utf-8")
+    assert "Whole displacement" in page
+    before = stamps(folder)
+    run(whole, folder)
+    assert not changed(before, stamps(folder))
 
 
 def test_summary_holds_the_documented_keys_and_sound_numbers(finished: Path) -> None:

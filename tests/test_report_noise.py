@@ -23,6 +23,8 @@ bits = 10
 [imaging.sensor]
 read_noise = 0.02
 full_well = 5000
+[whole_field]
+measure = false
 """
 
 

@@ -23,6 +23,7 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import quantity, to_plain
 from modeharvest.validation.truth import Comparison, VectorStatistics, compare, pattern_size
+from modeharvest.validation.whole_field import WholeFieldSummary
 
 PAPER = "Maraghechi et al. 2024, doi 10.1016/j.ijsolstr.2024.112916"
 INDEPENDENT = "independent calculation"
@@ -121,6 +122,7 @@ class SnapshotSummary:
     details_px: Mapping[str, VectorStatistics]
     """Statistics of w, best-fit error, and IDIC - best fit."""
     pattern_reading: tuple[str, ...]
+    whole_field: WholeFieldSummary | None = None
 
     def plain(self) -> dict[str, Any]:
         """As plain values, without what was not measured: parameters of modes, gain, offset."""
@@ -129,6 +131,7 @@ class SnapshotSummary:
                   "mode_deviation_percent", "mode_best_fit")  # fmt: skip
         absent = {name for name in brightness if getattr(self, name) is None}
         absent |= (set() if self.mode else {*single}) | (set() if self.modes else {"modes"})
+        absent |= set() if self.whole_field else {"whole_field"}
         return {name: value for name, value in to_plain(self).items() if name not in absent}
 
 

@@ -135,7 +135,7 @@ def normal_equations(
     blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 3))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
     g = level.deformed
-    _accumulate(
+    accumulate_elements(
         pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
         level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
@@ -144,10 +144,11 @@ def normal_equations(
 
 
 @compiled(parallel=True, relaxed=True)
-def _accumulate(
+def accumulate_elements(
     pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, pixel_size: float,
     share: float, blocks: Any, gradient: Any, sums: Any,
 ) -> None:  # fmt: skip
+    """Fill each element's own sums of products over its pixels."""
     for e in prange(x.shape[0]):
         own = np.empty((7, _BLOCK))
         N = np.empty((6, _BLOCK))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,8 +38,15 @@ def cases(
             print(f"{shipped:18}{command:14}{title}")
 
 
-def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
-    """Run a whole case: simulate, image, correlate, validate.
+def run(
+    case: CaseName,
+    out: OutFolder,
+    solution: SolutionFile = None,
+    whole_field: Annotated[
+        bool, typer.Option(help="Measure the whole displacement, up to every edge.")
+    ] = True,
+) -> None:
+    """Run a whole case: simulate, image, correlate, measure the whole displacement, validate.
 
     Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
     same command again after an interruption: finished stages are not repeated. The twin of a real
@@ -48,7 +56,7 @@ def run(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
     from modeharvest.report.model import print_report
     from modeharvest.report.photographs import photographs_report
 
-    with _stages(case, out, solution) as stages:
+    with _stages(case, out, solution, whole_field=whole_field) as stages:
         is_twin = stages.case.calibration is not None
         if is_twin:
             from modeharvest.runs.twin import TwinRun
@@ -114,11 +122,16 @@ def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> N
 
 
 @contextmanager
-def _stages(case: str, out: Path, solution: Path | None = None) -> Iterator[Run]:
-    """The stages of a case, under progress bars."""
+def _stages(
+    case: str, out: Path, solution: Path | None = None, whole_field: bool = True
+) -> Iterator[Run]:
+    """The stages of a case, under progress bars; not that of the whole displacement if False."""
     from modeharvest.runs.case import Case
 
     checked = Case.read(case)
+    if not whole_field:
+        off = replace(checked.whole_field, measure=False)
+        checked = checked.model_copy(update={"whole_field": off})
     from modeharvest.runs.experiment import Run
 
     with bars() as progress:

@@ -36,6 +36,7 @@ from modeharvest.report.model import (
 )
 from modeharvest.util.typed import quantities
 from modeharvest.validation.summary import SnapshotSummary
+from modeharvest.validation.whole_field import WholeFieldSummary
 
 Snapshot = Mapping[str, Any]
 Summary = Mapping[str, Any]
@@ -137,7 +138,7 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
     last = summary["snapshots"][-1]
     at = f"at {percent(last['nominal_strain'])}"
     critical = summary.get("critical_strain")
-    expected = summary.get("expected", [])
+    expected, whole = summary.get("expected", []), last.get("whole_field")
     met = sum(bool(row["ok"]) for row in expected)
 
     def key(name: str, value: float | None, unit: str, remark: str, digits: int = 3) -> KeyNumber:
@@ -152,6 +153,8 @@ def key_numbers(summary: Summary) -> list[KeyNumber]:
         key("model (ansatz) error", last["rms_best_fit_px"], "px", f"rms of truth − best fit {at}"),
         key("measurement error", last["rms_idic_to_best_fit_px"], "px",
             f"rms of IDIC − best fit {at}", 2),
+        *([key("whole displacement", whole["rms_px"], "px",
+               f"rms of truth − measured up to all edges {at}", 2)] if whole else []),
         KeyNumber("expected values met", f"{met} of {len(expected)}" if expected else None, "",
                   "table below" if expected else "none known for this specimen"),
     ]  # fmt: skip
@@ -195,8 +198,12 @@ def number_cards(summary: Summary) -> list[Card]:
     snapshots, critical = summary["snapshots"], summary.get("critical_strain")
     symbol = _symbol(snapshots[0])
     heads = {name: f"{label} [{unit}]" if unit not in ("", "–") else label
-             for label, unit, name in quantities(SnapshotSummary)}  # fmt: skip
-    rows = _rows(snapshots, {k: label.replace("v₁φ₁", symbol) for k, label in heads.items()})
+             for kind in (SnapshotSummary, WholeFieldSummary)
+             for label, unit, name in quantities(kind)}  # fmt: skip
+    rows = _rows(
+        [{**s, **s.get("whole_field", {})} for s in snapshots],
+        {k: label.replace("v₁φ₁", symbol) for k, label in heads.items()},
+    )
     labels = [snapshot_label(s["nominal_strain"], s["branch"], critical) for s in snapshots]
     columns = ("rms: per component, all material", *labels)
     table = ReportTable("Results", columns, rows, name="results")
@@ -277,8 +284,8 @@ def _hero(data: ExperimentData) -> ReportFigure:
 def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
     snapshots: Sequence[Snapshot] = summary["snapshots"]
     several = data.modes > 1
-    images, found, errors = panel_sections(
-        ("images", "found", "errors"), snapshot_panels(data.modes), data.states,
+    images, found, errors, whole = panel_sections(
+        ("images", "found", "errors", "whole"), snapshot_panels(data.modes), data.states,
         lambda key, state: panel_numbers(key, snapshots[state.k]) or shape_numbers(key, state),
         pattern=Markup("Σ v<sub>i</sub>φ<sub>i</sub>" if several else "v<sub>1</sub>φ<sub>1</sub>"),
         of_spectra="" if several else "Fig. “spect_virt” of the paper. ",
@@ -293,6 +300,7 @@ def _figures(data: ExperimentData, summary: Summary) -> list[Section]:
         Section(images.name, images.title, cards, images.lead),
         found,
         errors,
+        *([whole] if whole.cards else []),
     ]
 
 
@@ -300,6 +308,16 @@ def panel_numbers(key: str, snapshot: Snapshot) -> str:
     """One line of numbers under the picture of a panel; empty if there is nothing to add."""
     if key == "residual":
         return f"rms {snapshot['rms_residual']:.3g} of full scale"
+    if key == "whole-error":
+        at = snapshot["whole_field"]
+        return (
+            f"rms {at['rms_px']:.2g} px per component on {100 * at['coverage']:.4g} % of the "
+            f"material, {at['rms_edges_px'] or 0.0:.2g} px within 10 px of an edge; largest length "
+            f"{at['max_px']:.2g} px"
+        )
+    if key == "whole-deviation":
+        covered = 100 * snapshot["whole_field"]["interval_coverage"]
+        return f"{covered:.3g} % of the truth in intervals of 95 %"
     part = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}.get(key, "")
     details = snapshot.get("details_px", {}).get(part)
     if details is None:

@@ -24,6 +24,7 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.distortion.target import CalibrationTarget
 from modeharvest.imaging.spec import ImagingSpec
+from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
 from modeharvest.util.typed import CHECKS, made, nearest, require_types, sentence, to_plain
@@ -202,6 +203,7 @@ class Case(CaseModel):
         ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
     ] = ImagingSpec()
     correlation: SquareLatticeOptions = SquareLatticeOptions()
+    whole_field: WholeFieldOptions = WholeFieldOptions()
     calibration: CalibrationTarget | None = None
 
     def plain(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@
     solution.h5 solution.vtu    fem        what the finite elements found
     images/                     image      speckle images, masks, truth
     correlation/                correlate  one result for each image
+    whole_field/                measure    the whole displacement of each image, on a mesh
     report.html summary.json    validate   how large the errors are, and why
     stages.json timings.json               which stages are finished, and what they took
 
@@ -19,7 +20,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,12 +28,14 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
 from modeharvest.runs.case import Case, shipped_cases, shipped_solution
 from modeharvest.runs.precompile import precompiling
+from modeharvest.runs.whole_field import WholeFields
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
-from modeharvest.util.files import read_json, write_json
+from modeharvest.util.files import make_folder, read_json, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.validation.summary import (
@@ -42,6 +45,8 @@ from modeharvest.validation.summary import (
     experiment_summary,
     snapshot_summary,
 )
+from modeharvest.validation.truth import Comparison
+from modeharvest.validation.whole_field import WholeFieldComparison, compare_whole
 
 _COMPLETE = "complete"
 T = TypeVar("T")
@@ -113,17 +118,45 @@ class Run(StagedRun[Case]):
         key = self._correlate_key(images)
         return self.do("correlate", key, work, lambda: self._results(images))
 
+    def measure(self) -> dict[float, NodalResult]:
+        """Measure the whole displacement of every deformed image; leaves ``whole_field/``.
+
+        Nothing where the case says not to. Raises InputError if images or results are not of this
+        case.
+        """
+        options = self.case.whole_field
+        if not options.measure:
+            return {}
+        images, correlated = self._correlated()
+        how = options.of(self.case.experiment, images.grid.pixel_size)
+
+        def work() -> list[Path]:
+            make_folder(self._whole_fields.folder)
+            results, camera = self._results(images), options.camera
+            return [
+                path
+                for strain in images.strains
+                for path in self._whole_fields.measure(
+                    images.pair(strain, camera=camera), strain, results[strain], how, self.progress
+                )
+            ]
+
+        key = self._measure_key(correlated)
+        return self.do(
+            "measure", key, work, lambda: {e: self._whole_fields.read(e) for e in images.strains}
+        )
+
     def validate(self) -> dict[str, Any]:
         """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
 
         Raises InputError if the results are not of these images and this case.
         """
-        images = self._images()
-        correlated = self._correlate_key(images)
-        if not self.stages.is_finished("correlate", correlated):
+        images, correlated = self._correlated()
+        measured = self._measure_key(correlated)
+        if self.case.whole_field.measure and not self.stages.is_finished("measure", measured):
             raise InputError(
-                f"expected results of this case in {self.folder / 'correlation'}, found none that "
-                "are finished and whole; make them with 'modeharvest correlate'"
+                f"expected whole displacements of this case in {self._whole_fields.folder}, found "
+                "none that are finished and whole; make them with 'modeharvest run'"
             )
         path, page = self.folder / "summary.json", self.folder / "report.html"
 
@@ -131,7 +164,7 @@ class Run(StagedRun[Case]):
             write_json(path, self._report(images, page))
             return path, page
 
-        key = stage_key([correlated, self.case.title])
+        key = stage_key([measured, self.case.title])
         return self.do("validate", key, work, lambda: dict(read_json(path)))
 
     def all(self) -> dict[str, Any]:
@@ -141,13 +174,15 @@ class Run(StagedRun[Case]):
         simulation did not reach all strains asked for: what it did reach is reported.
         """
         with exclusive(self.folder):
-            ahead = [stage for stage in ("image", "correlate") if stage not in self.stages.timings]
+            stages = ("image", "correlate", *("measure",) * self.case.whole_field.measure)
+            ahead = [stage for stage in stages if stage not in self.stages.timings]
             with precompiling(ahead) as kernels:
                 solution = self.solved()
                 kernels.wait("image", self.progress)
                 self.image()
                 kernels.wait("correlate", self.progress)
                 self.correlate()
+            self.measure()
             summary = self.validate()
         outcome = _outcome(solution.info)
         if outcome != _COMPLETE:
@@ -155,6 +190,26 @@ class Run(StagedRun[Case]):
         return summary
 
     # -- parts --------------------------------------------------------------------------
+
+    @property
+    def _whole_fields(self) -> WholeFields:
+        return WholeFields(self.folder / "whole_field")
+
+    def _measure_key(self, correlated: str) -> str:
+        if not self.case.whole_field.measure:
+            return correlated
+        return stage_key([correlated, asdict(self.case.whole_field)], "fem", "imaging", "idic")
+
+    def _correlated(self) -> tuple[ImageSet, str]:
+        """The images, and the key of their results; InputError without finished ones."""
+        images = self._images()
+        correlated = self._correlate_key(images)
+        if not self.stages.is_finished("correlate", correlated):
+            raise InputError(
+                f"expected results of this case in {self.folder / 'correlation'}, found none that "
+                "are finished and whole; make them with 'modeharvest correlate'"
+            )
+        return images, correlated
 
     def _report(self, images: ImageSet, page: Path) -> dict[str, Any]:
         """Compare with the truth and write the report; returns the content of the summary."""
@@ -175,12 +230,26 @@ class Run(StagedRun[Case]):
             snapshots = _Awaited(
                 [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
             )
+            wholes = _Awaited(
+                [threads.submit(self._compare_whole, comparisons, k)
+                 for k in every if case.whole_field.measure]
+            )  # fmt: skip
             found, pitch = [results[strain] for strain in strains], measured.specimen.pitch
-            data = ExperimentData(solution, images, strains, found, comparisons, spectra, pitch)
+            data = ExperimentData(
+                solution, images, strains, found, comparisons, spectra, pitch, wholes
+            )
             pictures = draw_figures(experiment_figures(data), self.progress)
-            summary = experiment_summary(measured, case.plain(), list(snapshots)).plain()
+            numbers = list(snapshots)
+            for k, whole in enumerate(wholes):
+                numbers[k] = replace(numbers[k], whole_field=whole.summary)
+            summary = experiment_summary(measured, case.plain(), numbers).plain()
         write_page(experiment_report(summary, data), page, pictures=pictures)
         return summary
+
+    def _compare_whole(self, comparisons: Sequence[Comparison], k: int) -> WholeFieldComparison:
+        comparison, fields = comparisons[k], self._whole_fields
+        measured, seconds = fields.read(comparison.strain), fields.seconds(comparison.strain)
+        return compare_whole(comparison, measured, self.case.experiment.specimen, seconds)
 
     def _images(self) -> ImageSet:
         advice = "make it again with 'modeharvest image'"

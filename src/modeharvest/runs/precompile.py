@@ -17,9 +17,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from modeharvest.fem.field import Solution
 from modeharvest.idic.correlate import best_fit, correlate
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.pixels import accumulate_elements
 from modeharvest.idic.solver.passes import accumulate
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import make_images
@@ -55,6 +58,20 @@ def _correlation() -> None:
     best_fit(Truth.of(displacement=found.displacement()), found)
 
 
+def _measurement() -> None:
+    """What the stage ``measure`` compiles beyond that."""
+    rng = np.random.default_rng(0)
+    grid = PixelGrid.centred(200, 240, 0.05)
+    f, mask = (
+        gaussian_filter(rng.random(grid.shape, np.float32), 2.0),
+        np.ones(grid.shape, np.bool_),
+    )
+    mask[80:120, 90:150] = False
+    pair = ImagePair(f, f.copy(), grid, mask, mask)
+    found = measure_displacement(pair, np.zeros_like, options=FiniteElementOptions(steps=1))
+    found.standard_deviation_on()
+
+
 @dataclass(frozen=True)
 class _Part:
     """A child's work, and a kernel beside which it notes that it is done."""
@@ -69,7 +86,11 @@ class _Part:
         return None if folder is None else folder / f"precompiled-{sources()}.nbi"
 
 
-_PARTS = {"image": _Part(_images, rasterise), "correlate": _Part(_correlation, accumulate)}
+_PARTS = {
+    "image": _Part(_images, rasterise),
+    "correlate": _Part(_correlation, accumulate),
+    "measure": _Part(_measurement, accumulate_elements),
+}
 
 
 @dataclass(frozen=True)
