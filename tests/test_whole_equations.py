@@ -10,8 +10,7 @@ from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
-from modeharvest.idic.finite_element.images import continued, images_on
-from modeharvest.idic.finite_element.pixels import normal_equations, pixels_of
+from modeharvest.idic.finite_element.pixels import continued, images_on, normal_equations, pixels_of
 from modeharvest.idic.finite_element.system import Body, inner_sides, smoothness_matrix
 from modeharvest.idic.solver.pyramid import FULL
 

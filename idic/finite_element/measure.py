@@ -25,17 +25,17 @@ from modeharvest.idic.finite_element.cutoff import (
     newton_step,
     risk,
 )
-from modeharvest.idic.finite_element.equilibrium import Imbalance
-from modeharvest.idic.finite_element.images import continued, images_on
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import (
     ElementPixels,
+    continued,
+    images_on,
     normal_equations,
     pixels_of,
     require_cover,
 )
 from modeharvest.idic.finite_element.result import NodalResult, Step
-from modeharvest.idic.finite_element.system import Body
+from modeharvest.idic.finite_element.system import Body, Imbalance
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
