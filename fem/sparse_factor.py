@@ -34,10 +34,8 @@ def factorise(matrix: csr_array, library: str | None = None) -> Factor:
 
     Parameters
     ----------
-    matrix
-        (n, n), both triangles.
-    library
-        A name among ``LIBRARIES``; by default the first one that is there.
+    matrix : (n, n), both triangles.
+    library : a name among ``LIBRARIES``; by default the first one that is there.
 
     Raises
     ------

@@ -105,7 +105,7 @@ def test_the_run_leaves_what_it_promises(finished: Path) -> None:
 
 
 def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: Path) -> None:
-    how = WholeFieldOptions(element_px=16.0, edge_element_px=10.0)
+    how = WholeFieldOptions(measure=True, element_px=16.0, edge_element_px=10.0)
     whole = Case.read(case).model_copy(update={"whole_field": how})
     run(whole, folder)
     summary = read_json(folder / "summary.json")

@@ -38,52 +38,35 @@ _LEAST_PX, _MOST_PX = 2.0, 400.0
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Normal equations at some displacement of the nodes.
-
-    Parameters
-    ----------
-    u
-        (2 n,) [mm].
-    M, gradient
-        (2 n, 2 n) and (2 n,): sums of h h' and of h r.
-    square_sum, pixels
-        Sum of r^2, and how many pixels it is over.
-    blocks
-        (m, 3, 6, 6) parts of M, element by element.
-    R, penalty
-        (2 n, 2 n) matrix and (2 n,) gradient of the regularisation.
-    """
+    """Normal equations at some displacement of the nodes."""
 
     u: FloatArray
+    """(2 n,) [mm]."""
     M: csr_array
     gradient: FloatArray
+    """(2 n, 2 n) and (2 n,): sums of h h' and of h r."""
     square_sum: float
     pixels: int
+    """Sum of r^2, and how many pixels it is over."""
     blocks: FloatArray
+    """(m, 3, 6, 6) parts of M, element by element."""
     R: csr_array
     penalty: FloatArray
+    """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
 
 
 @dataclass(frozen=True)
 class Risk:
-    """What a cut-off wavelength is expected to cost.
-
-    Parameters
-    ----------
-    cutoff_px
-        Cut-off wavelength [px].
-    value
-        Generalised cross-validation [grey levels^2].
-    unknowns
-        Their effective number t.
-    noise
-        Estimated standard deviation of the residual's noise [grey levels].
-    """
+    """What a cut-off wavelength is expected to cost."""
 
     cutoff_px: float
+    """Cut-off wavelength [px]."""
     value: float
+    """Generalised cross-validation [grey levels^2]."""
     unknowns: float
+    """Their effective number t."""
     noise: float
+    """Estimated standard deviation of the residual's noise [grey levels]."""
 
 
 def risk(body: Body, at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> Risk:

@@ -60,18 +60,12 @@ _SETTLED = 0.25
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage from coarse to fine.
-
-    Parameters
-    ----------
-    level
-        Binning and blur of the images.
-    cutoff_px
-        Wavelength of which the regularisation leaves one half [px].
-    """
+    """One stage from coarse to fine."""
 
     level: Level
+    """Binning and blur of the images."""
     cutoff_px: float
+    """Wavelength of which the regularisation leaves one half [px]."""
 
 
 STAGES = (Stage(Level(2, 3.0), 200.0), Stage(Level(2, 1.5), 80.0), Stage(FULL, 40.0))
@@ -79,57 +73,39 @@ STAGES = (Stage(Level(2, 3.0), 200.0), Stage(Level(2, 1.5), 80.0), Stage(FULL, 4
 
 @dataclass(frozen=True)
 class Law:
-    """A material law to regularise with.
-
-    Parameters
-    ----------
-    material
-        Of the body, in plane strain; a factor of its moduli doesn't matter.
-    loaded
-        Which points (n, 2) of the body [mm] forces may act on: (n,) True there.
-    """
+    """A material law to regularise with."""
 
     material: Material
+    """Of the body, in plane strain; a factor of its moduli doesn't matter."""
     loaded: Callable[[FloatArray], BoolArray]
+    """Which points (n, 2) of the body [mm] forces may act on: (n,) True there."""
 
 
 @dataclass(frozen=True)
 class FiniteElementOptions:
-    """How to measure on a mesh.
-
-    Parameters
-    ----------
-    element_px, edge_element_px
-        Edge length of the elements inside and along edges, where the mesh is to be made [px].
-    stages
-        Before the last one, which has the unfiltered images and ``cutoff_px``.
-    cutoff_px
-        Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk.
-    law
-        By which to regularise in the end; None for the smoothness of what is added to the start.
-    edge_px
-        Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
-    order
-        Of the spline: 3, 5 or 11; by default as in a correlation.
-    steps
-        Of Gauss-Newton in each stage, at most.
-    tolerance_px
-        The last stage ends with a step shorter than that, earlier ones with ten times that [px];
-        rms over the nodes.
-    longest_step_px
-        Of a node [px].
-    """
+    """How to measure on a mesh."""
 
     element_px: float = 24.0
     edge_element_px: float = 12.0
+    """Edge length of the elements inside and along edges, where the mesh is to be made [px]."""
     stages: tuple[Stage, ...] = STAGES
+    """Before the last one, which has the unfiltered images and ``cutoff_px``."""
     cutoff_px: float | None = None
+    """Cut-off wavelength of the last stage [px]; None for the one with the least estimated risk."""
     law: Law | None = None
+    """By which to regularise in the end; None for the smoothness of what is added to the start."""
     edge_px: int = 0
+    """Pixels closer than this to the edge of the mask are left out of the unfiltered images [px].
+    """
     order: int | None = None
+    """Of the spline: 3, 5 or 11; by default as in a correlation."""
     steps: int = 4
+    """Of Gauss-Newton in each stage, at most."""
     tolerance_px: float = 5e-3
+    """The last stage ends with a step shorter than that, earlier ones with ten times that [px]; rms
+    over the nodes."""
     longest_step_px: float = 8.0
+    """Of a node [px]."""
 
     def __post_init__(self) -> None:
         what = "finite-element DIC: expected"
@@ -157,25 +133,17 @@ def measure_displacement(
 ) -> NodalResult:
     """Measure the whole displacement on a mesh of the material.
 
+    InputError if the mesh is folded or of other elements, covers no more than a part of the mask,
+    or has parts that show no pixels.
+
     Parameters
     ----------
-    pair
-        Of images. Without a mask every pixel counts.
-    start
-        Where the measurement begins: a correlation's result, or any displacement closer to the
+    pair : of images. Without a mask every pixel counts.
+    start : where the measurement begins: a correlation's result, or any displacement closer to the
         truth than about 10 px; what is found is smooth relative to it.
-    mesh
-        T6 or T3, in the reference's frame [mm]; by default made from the pair's mask.
-    options
-        How to measure.
-    progress
-        Listener.
-
-    Raises
-    ------
-    InputError
-        If the mesh is folded or of other elements, covers no more than a part of the mask, or has
-        parts that show no pixels.
+    mesh : T6 or T3, in the reference's frame [mm]; by default made from the pair's mask.
+    options : how to measure.
+    progress : listener.
     """
     options = options or FiniteElementOptions()
     if mesh is None:

@@ -32,19 +32,13 @@ _ARM_PX = 12
 
 
 class Outlines(NamedTuple):
-    """The outlines of the material in a mask.
-
-    Parameters
-    ----------
-    parts
-        For each island its loops, the outer one first; curves (k, 2) of (column, -row) [px], whose
-        corners are where one curve ends.
-    ignored
-        Islands and holes too small for elements, in words.
-    """
+    """The outlines of the material in a mask."""
 
     parts: tuple[tuple[tuple[FloatArray, ...], ...], ...]
+    """For each island its loops, the outer one first; curves (k, 2) of (column, -row) [px], whose
+    corners are where one curve ends."""
     ignored: tuple[str, ...]
+    """Islands and holes too small for elements, in words."""
 
 
 def mesh_of_mask(
@@ -52,10 +46,7 @@ def mesh_of_mask(
 ) -> Mesh:
     """Make a T6 mesh [mm] of the material in a mask, elements of so many px.
 
-    Raises
-    ------
-    InputError
-        If there is no island of at least four elements, or gmsh isn't there.
+    InputError if there is no island of at least four elements, or gmsh isn't there.
     """
     try:
         from modeharvest.fem.meshing import mesh_outlines
@@ -80,10 +71,7 @@ def mesh_of_mask(
 def quadratic(mesh: Mesh) -> Mesh:
     """The mesh itself if it is of T6 elements; T3 elements get mid-side nodes.
 
-    Raises
-    ------
-    InputError
-        If the elements are of another type, or folded.
+    InputError if the elements are of another type, or folded.
     """
     if mesh.element == "T3":
         ends = np.sort(mesh.cells[:, [[0, 1], [1, 2], [2, 0]]], axis=2)

@@ -46,12 +46,9 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
 
     Parameters
     ----------
-    pair, level
-        As for :func:`modeharvest.idic.solver.pyramid.level_pair`.
-    edge_px
-        Pixels closer than this to the mask's edge are left out on the finest level [px].
-    order
-        Of the spline.
+    pair, level : as for :func:`modeharvest.idic.solver.pyramid.level_pair`.
+    edge_px : pixels closer than this to the mask's edge are left out on the finest level [px].
+    order : of the spline.
     """
     found = level_pair(pair, level, edge_px, order)
     mask = pair.deformed_mask
@@ -67,10 +64,9 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
 
     Parameters
     ----------
-    image
-        (rows, cols) grey levels.
-    mask
-        (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is kept.
+    image : (rows, cols) grey levels.
+    mask : (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is
+        kept.
     """
     distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
     filled = np.ascontiguousarray(image[tuple(nearest)])
@@ -101,28 +97,19 @@ def _continue(image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any]) ->
 
 
 class ElementPixels(NamedTuple):
-    """The pixels that count, element by element.
-
-    Parameters
-    ----------
-    start
-        (m + 1,): those of element e are start[e] ... start[e + 1] - 1.
-    row, col
-        (p,) int32 position [px].
-    xi
-        (2, p) float32 local coordinates [-].
-    grey
-        (p,) float32 f there.
-    slope
-        (2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0).
-    """
+    """The pixels that count, element by element."""
 
     start: NDArray[Any]
+    """(m + 1,): those of element e are start[e] ... start[e + 1] - 1."""
     row: NDArray[Any]
     col: NDArray[Any]
+    """(p,) int32 position [px]."""
     xi: NDArray[Any]
+    """(2, p) float32 local coordinates [-]."""
     grey: NDArray[Any]
+    """(p,) float32 f there."""
     slope: NDArray[Any]
+    """(2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0)."""
 
 
 def pixels_of(mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
@@ -165,23 +152,16 @@ def require_cover(pixels: ElementPixels, mask: BoolArray) -> None:
 
 @dataclass(frozen=True, eq=False)
 class NodalEquations:
-    """Normal equations of the nodes' displacements, element by element.
-
-    Parameters
-    ----------
-    blocks
-        (m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2].
-    gradient
-        (m, 6, 2) sums of N_a h_i r [grey levels^2/mm].
-    square_sum, pixels, outside
-        Sum of r^2 [grey levels^2], pixels it is over, and pixels mapped to where g isn't valid.
-    """
+    """Normal equations of the nodes' displacements, element by element."""
 
     blocks: FloatArray
+    """(m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2]."""
     gradient: FloatArray
+    """(m, 6, 2) sums of N_a h_i r [grey levels^2/mm]."""
     square_sum: float
     pixels: int
     outside: int
+    """Sum of r^2 [grey levels^2], pixels it is over, and pixels mapped to where g isn't valid."""
 
 
 def normal_equations(
@@ -191,17 +171,12 @@ def normal_equations(
 
     Parameters
     ----------
-    pixels
-        Of the level's reference.
-    mesh
-        T6.
-    level
-        Whose deformed image is sampled.
-    u
-        (n, 2) displacement of the nodes [mm].
-    share
-        Of the reference's gradient, pushed forward, in what weighs the residual; the rest is that
-        of the deformed image at x + u [-].
+    pixels : of the level's reference.
+    mesh : T6.
+    level : whose deformed image is sampled.
+    u : (n, 2) displacement of the nodes [mm].
+    share : of the reference's gradient, pushed forward, in what weighs the residual; the rest is
+        that of the deformed image at x + u [-].
     """
     m = len(mesh.cells)
     blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 3))

@@ -15,8 +15,7 @@ from modeharvest.idic.finite_element.cutoff import Risk
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
-from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate
-from modeharvest.imaging.mapping.pointwise import locate_points
+from modeharvest.imaging.mapping.isoparametric import Located, interpolate, locate, locate_points
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 
@@ -27,75 +26,53 @@ _CHUNK = 500_000
 
 @dataclass(frozen=True)
 class Step:
-    """One Gauss-Newton step.
-
-    Parameters
-    ----------
-    level, cutoff_px, number
-        Of the images, cut-off wavelength [px], number of the step in its stage.
-    residual
-        Rms before the step [grey levels of the level].
-    step_px, longest_px
-        Rms over the nodes, and the longest of a node [px].
-    """
+    """One Gauss-Newton step."""
 
     level: Level
     cutoff_px: float
     number: int
+    """Of the images, cut-off wavelength [px], number of the step in its stage."""
     residual: float
+    """Rms before the step [grey levels of the level]."""
     step_px: float
     longest_px: float
+    """Rms over the nodes, and the longest of a node [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class NodalResult:
-    """A displacement measured at the nodes of a T6 mesh, in the reference's frame (x right, y up).
-
-    Parameters
-    ----------
-    mesh, displacement, start
-        Nodes and u there (n, 2) [mm], and where the measurement began.
-    standard_deviation
-        (n, 2) of u by noise and smoothing [mm].
-    noise_deviation
-        (n, 2) of u by noise alone [mm].
-    grid
-        The pixels of the images.
-    cutoff_px, tried
-        Cut-off wavelength of the regularisation [px], and those that were tried to find it.
-    residual_rms, residual_noise, pixels, outside
-        Root mean square of the residual and what of it is noise [grey levels]; pixels compared,
-        and pixels mapped to where the deformed image isn't valid.
-    effective_unknowns
-        What the images determine of them [-].
-    blur_px
-        Blur of the reference whose gradient weighs the residual [px].
-    library
-        That factorised the matrices.
-    history, timings_s
-        Every step; seconds by what they were spent on.
-    warnings
-        Sentences.
-    """
+    """A displacement measured at the nodes of a T6 mesh; the frame is the reference's, y up."""
 
     mesh: Mesh
     displacement: FloatArray
     start: FloatArray
+    """Nodes and u there (n, 2) [mm], and where the measurement began."""
     standard_deviation: FloatArray
+    """(n, 2) of u by noise and smoothing [mm]."""
     noise_deviation: FloatArray
+    """(n, 2) of u by noise alone [mm]."""
     grid: PixelGrid
+    """The pixels of the images."""
     cutoff_px: float
     tried: tuple[Risk, ...]
+    """Cut-off wavelength of the regularisation [px], and those that were tried to find it."""
     residual_rms: float
     residual_noise: float
     pixels: int
     outside: int
+    """Root mean square of the residual and what of it is noise [grey levels]; pixels compared, and
+    pixels mapped to where the deformed image isn't valid."""
     effective_unknowns: float
+    """What the images determine of them [-]."""
     blur_px: float
+    """Blur of the reference whose gradient weighs the residual [px]."""
     library: str
+    """That factorised the matrices."""
     history: tuple[Step, ...] = ()
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    """Every step; seconds by what they were spent on."""
     warnings: tuple[str, ...] = ()
+    """Sentences."""
 
     @property
     def unknowns(self) -> int:

@@ -9,16 +9,15 @@ Smoothness, without a material law:
          + sum over inner sides (2/h) int |[grad u]|^2 ds,
 
 [.] being the jump across a side of length h: zero for affine displacements alone, and natural
-(free) at all boundaries. It is the energy of a bent plate in the interior-penalty form of G.
-Engel et al., Comput. Methods Appl. Mech. Eng. 191 (2002), doi 10.1016/S0045-7825(02)00286-4. A
-wave of length T costs (2 pi/T)^4 times its mean square, so that a weight of (l/T)^4 v'Mv/v'Rv for
-any wave v halves what of it is at the wavelength l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild,
-Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9407-6.
+(free) at all boundaries. It is the energy of a bent plate in the interior-penalty form of G. Engel
+et al., Comput. Methods Appl. Mech. Eng. 191 (2002), doi 10.1016/S0045-7825(02)00286-4. A wave of
+length T costs (2 pi/T)^4 times its mean square, so that a weight of (l/T)^4 v'Mv/v'Rv for any wave
+v halves what of it is at the wavelength l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild, Exp. Mech. 51
+(2011), doi 10.1007/s11340-010-9407-6.
 
 With a law: where nothing loads the body its internal forces f vanish, at inner nodes as on free
-edges. Penalised is their sum of squares |D f(u)|^2, D leaving out the loaded nodes, not the
-energy: M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the moduli
-cancels.
+edges. Penalised is their sum of squares |D f(u)|^2, D leaving out the loaded nodes, not the energy:
+M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the moduli cancels.
 """
 
 from __future__ import annotations
@@ -50,12 +49,9 @@ class Imbalance:
 
     Parameters
     ----------
-    mesh
-        [mm].
-    material
-        Of the body, in plane strain.
-    loaded
-        (n,) True at nodes on which unknown forces act.
+    mesh : [mm].
+    material : of the body, in plane strain.
+    loaded : (n,) True at nodes on which unknown forces act.
     """
 
     def __init__(self, mesh: Mesh, material: Material, loaded: BoolArray) -> None:
@@ -94,16 +90,11 @@ class Imbalance:
 
 @dataclass(frozen=True, eq=False)
 class NodalPattern:
-    """Which nodes have to do with each other, in compressed rows.
-
-    Parameters
-    ----------
-    indptr, indices
-        (n + 1,), (q,): the neighbours of each node, itself included, ascending.
-    """
+    """Which nodes have to do with each other, in compressed rows."""
 
     indptr: IntArray
     indices: IntArray
+    """(n + 1,), (q,): the neighbours of each node, itself included, ascending."""
 
     @classmethod
     def of(cls, count: int, *groups: IntArray) -> NodalPattern:

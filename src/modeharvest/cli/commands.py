@@ -43,10 +43,11 @@ def run(
     out: OutFolder,
     solution: SolutionFile = None,
     whole_field: Annotated[
-        bool, typer.Option(help="Measure the whole displacement, up to every edge.")
-    ] = True,
+        bool | None,
+        typer.Option(help="Measure the whole displacement, up to every edge, on a mesh, or don't."),
+    ] = None,
 ) -> None:
-    """Run a whole case: simulate, image, correlate, measure the whole displacement, validate.
+    """Run a whole case: simulate, image, correlate, validate.
 
     Leaves solution, images with truth, results, report.html and summary.json in DIR. Run the
     same command again after an interruption: finished stages are not repeated. The twin of a real
@@ -123,15 +124,15 @@ def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> N
 
 @contextmanager
 def _stages(
-    case: str, out: Path, solution: Path | None = None, whole_field: bool = True
+    case: str, out: Path, solution: Path | None = None, whole_field: bool | None = None
 ) -> Iterator[Run]:
-    """The stages of a case, under progress bars; not that of the whole displacement if False."""
+    """The stages of a case, under progress bars; ``whole_field`` instead of what the case says."""
     from modeharvest.runs.case import Case
 
     checked = Case.read(case)
-    if not whole_field:
-        off = replace(checked.whole_field, measure=False)
-        checked = checked.model_copy(update={"whole_field": off})
+    if whole_field is not None:
+        how = replace(checked.whole_field, measure=whole_field)
+        checked = checked.model_copy(update={"whole_field": how})
     from modeharvest.runs.experiment import Run
 
     with bars() as progress:

@@ -31,8 +31,8 @@ _SECONDS = "timings.json"
 class WholeFieldOptions:
     """How the whole displacement is measured, from an ansatz' result, on a mesh of the material."""
 
-    measure: bool = True
-    """Whether it is measured at all."""
+    measure: bool = False
+    """Whether it is measured at all: that costs more than the rest of the run."""
     camera: bool = True
     """Whether in the images as a camera gives them, quantised, or in the exact ones."""
     element_px: float = 24.0
