@@ -31,6 +31,10 @@ _ARM_PX = 12
 """How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
 
 
+_NARROWEST_PX = 3.0
+"""Material between two holes that can still be meshed."""
+
+
 class Outlines(NamedTuple):
     """The outlines of the material in a mask."""
 
@@ -55,7 +59,13 @@ def mesh_of_mask(
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
         ) from error
-    edge = edge_element_px or element_px
+    # Elements longer than a ligament is wide would make chords of its two edges cross.
+    edge = min(edge_element_px or element_px, _narrowest(mask))
+    if edge < _NARROWEST_PX:
+        raise InputError(
+            f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
+            "px; take images of more pixels, or fill the holes in the mask"
+        )
     parts, ignored = outlines(mask, edge)
     if not parts:
         raise InputError(
@@ -66,6 +76,16 @@ def mesh_of_mask(
     x, y = grid.to_mm(-block.nodes[:, 1], block.nodes[:, 0])
     cells = _counter_clockwise(block.nodes, block.cells)
     return quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+
+
+def _narrowest(mask: BoolArray) -> float:
+    """Width of the material where it is narrowest between two holes, or a hole and outside [px]."""
+    inside = np.pad(mask, 1)
+    distance, nearest = ndimage.distance_transform_edt(inside, return_indices=True)
+    hole = ndimage.label(~inside)[0][tuple(nearest)]
+    pairs = ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1]))
+    widths = [(distance[a] + distance[b])[hole[a] != hole[b]] for a, b in pairs]
+    return float(min((w.min() for w in widths if w.size), default=np.inf))
 
 
 def quadratic(mesh: Mesh) -> Mesh:
@@ -171,8 +191,9 @@ def _corners(points: FloatArray) -> IntArray:
     cross = ahead[:, 0] * behind[:, 1] - ahead[:, 1] * behind[:, 0]
     turn = np.pi - np.abs(np.arctan2(cross, (ahead * behind).sum(axis=1)))
     most = ndimage.maximum_filter1d(turn, 2 * _ARM_PX + 1, mode="wrap")
-    # Within its arms a circle turns, too: by 8 px over its radius.
-    peaks = np.flatnonzero((turn == most) & (turn > _CORNER))
+    # A circle turns, too: from the middle of one arm to that of the other, 16 px, by 16 px/radius.
+    least = _CORNER + (_ARM_PX + near) * 2.0 * np.pi / len(points)
+    peaks = np.flatnonzero((turn == most) & (turn > least))
     middle = ndimage.gaussian_filter1d(turn, 2.0, mode="wrap")
     if peaks.size and not peaks.size < len(points) / (2 * _ARM_PX):
         return np.empty(0, dtype=np.int64)  # a small circle turns everywhere
