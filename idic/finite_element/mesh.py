@@ -29,8 +29,6 @@ _ROUNDED_PX = 4
 _CORNER = np.deg2rad(40.0)
 _ARM_PX = 12
 """How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
-
-
 _NARROWEST_PX = 3.0
 """Material between two holes that can still be meshed."""
 
