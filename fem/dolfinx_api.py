@@ -30,8 +30,8 @@ _T6_FROM_VTK = [0, 1, 2, 4, 5, 3]
 def create_mesh(mesh: Mesh, comm: MPI.Comm) -> dolfinx.mesh.Mesh:
     """Distribute a T6 mesh (of rank 0, ignored elsewhere) over the communicator.
 
-    The body is cut in halves by the cells' places until every rank has its part: in an eighth of
-    the time that a partitioner of graphs takes, and with as few nodes on the cuts.
+    The body is cut in halves by the cells' places until every rank has its part, which takes less
+    time than a partitioner of graphs.
     """
     if comm.rank == 0:
         nodes, cells = mesh.nodes, mesh.cells[:, _T6_FROM_VTK]

@@ -25,6 +25,7 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5, read_in_child, reading
+from modeharvest.util.typed import made
 
 FORMAT = "modeharvest-solution-1"
 COMPRESSED = {"compression": 6, "shuffle": True}
@@ -140,7 +141,7 @@ class Solution:
                 "expected a solution that says of which specimen it is, got one that does not "
                 "(read from another solver's mesh); state a Specimen"
             )
-        return Specimen(**self.info["specimen"])
+        return made(Specimen, self.info["specimen"])
 
     def at(self, nominal_strain: float) -> Snapshot:
         """The stable snapshot at a nominal strain, the first if several; InputError without one."""

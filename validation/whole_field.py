@@ -59,6 +59,8 @@ class WholeFieldComparison:
     """(rows, cols, 2) measured u [mm]; NaN off the mesh."""
     error: FloatArray
     """(rows, cols, 2) truth - measured [mm]."""
+    standard_deviation: FloatArray
+    """(rows, cols, 2) of the measured displacement [mm]."""
     refit: Result
     """The correlation's ansatz, fitted to what was measured."""
     summary: WholeFieldSummary
@@ -79,7 +81,8 @@ def compare_whole(
     correlated, best = comparison.result, comparison.best
     refit = fit_displacement(u, grid, correlated.ansatz, correlated.unknowns, there)
     apart = (refit.displacement() - best.displacement())[mask] / px
-    inside = np.abs(error) < _NORMAL_95 * measured.standard_deviation_on(grid)
+    deviation = measured.standard_deviation_on(grid)
+    inside = np.abs(error) < _NORMAL_95 * deviation
     labels = np.where(there, regions(mask, grid, specimen), -1)
     places = {name: labels == REGIONS.index(name) for name in REGIONS}
     rms = {name: _rms(error[place]) / px for name, place in places.items() if place.any()}
@@ -107,7 +110,7 @@ def compare_whole(
         warnings=measured.warnings,
         seconds=seconds,
     )
-    return WholeFieldComparison(measured, u, error, refit, summary)
+    return WholeFieldComparison(measured, u, error, deviation, refit, summary)
 
 
 def _rms(values: NDArray[Any]) -> float:

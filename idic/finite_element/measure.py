@@ -159,20 +159,21 @@ def measure_displacement(
             f"expected a start of finite displacements {mesh.nodes.shape} at the nodes, got "
             f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
         )
-    course = _Measurement(pair, Body(mesh, begin), options, progress)
-    for stage in options.stages:
+    course = _Measurement(pair, Body(mesh, begin), options)
+    for k, stage in enumerate(options.stages):
+        progress(k, len(options.stages) + 1, "whole displacement")
         course.through(stage)
-    course.finish()
+    progress(len(options.stages), len(options.stages) + 1, "whole displacement")
+    course.regularise()
+    progress(1, 1, "whole displacement")
     return course.result()
 
 
 class _Measurement:
     """A measurement on its way: the images of a stage, the displacement of the nodes."""
 
-    def __init__(
-        self, pair: ImagePair, body: Body, options: FiniteElementOptions, progress: Progress
-    ) -> None:
-        self.pair, self.body, self.options, self.progress = pair, body, options, progress
+    def __init__(self, pair: ImagePair, body: Body, options: FiniteElementOptions) -> None:
+        self.pair, self.body, self.options = pair, body, options
         self.u = body.start.ravel().copy()
         self.history: list[Step] = []
         self.laps: dict[str, float] = {}
@@ -250,7 +251,7 @@ class _Measurement:
             if rms < tolerance_px:
                 break
 
-    def finish(self) -> None:
+    def regularise(self) -> None:
         """Find the last cut-off wavelength and what it gives: without a law, then with one."""
         self._prepare(FULL)
         law, given = self.options.law, self.options.cutoff_px

@@ -185,7 +185,15 @@ class TwinRun(StagedRun[Case]):
     """A solution file to use instead of simulating."""
 
     def all(self) -> dict[str, Any]:
-        """Make, harvest, compare; returns the content of the harvest's ``summary.json``."""
+        """Make, harvest, compare; returns the content of the harvest's ``summary.json``.
+
+        Raises InputError if the case asks for the whole displacement.
+        """
+        if self.case.whole_field.measure:
+            raise InputError(
+                "expected a twin without [whole_field] measure = true (or --whole-field): the "
+                "whole displacement is measured of virtual experiments only; leave it out"
+            )
         with exclusive(self.folder):
             solution = Run(self.case, self.folder, self.progress, self.solution).solved()
             twin = make_twin(self.case, solution, self.folder / "twin", self.progress)

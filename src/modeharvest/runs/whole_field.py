@@ -88,15 +88,17 @@ class WholeFields:
         Raises InputError where there is nothing to measure on, with the way around.
         """
         begin, path = time.perf_counter(), self.path(strain)
-        progress(0, 1, f"whole displacement, strain {100 * strain:.2f} %")
+
+        def tell(done: float, total: float, what: str) -> None:
+            progress(done, total, f"{what}, strain {100 * strain:.2f} %")
+
         try:
-            found = measure_displacement(pair, start, options=options, progress=progress)
+            found = measure_displacement(pair, start, options=options, progress=tell)
         except InputError as error:
             raise InputError(
                 f"whole displacement at strain {strain:g}: {error}; or leave it out: "
                 "[whole_field] measure = false, --no-whole-field"
             ) from error
-        progress(1, 1, f"whole displacement, strain {100 * strain:.2f} %")
         write_result(path, found)
         write_vtu(path.with_suffix(".vtu"), found)
         seconds = {**self._seconds(), path.stem: time.perf_counter() - begin}

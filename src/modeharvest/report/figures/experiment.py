@@ -166,7 +166,7 @@ def _principal_strain(state: SnapshotState) -> Figure:
 
 
 def _deviation(state: SnapshotState) -> Figure:
-    sd = lengths(state.whole.measured.standard_deviation_on(state.view.grid))
+    sd = lengths(state.whole.standard_deviation)
     return fits.draw_length(state, state.view.map_frame().average(sd))
 
 
