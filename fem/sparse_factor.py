@@ -1,8 +1,7 @@
 """Factorisation of sparse symmetric positive definite matrices of one pattern, by a library.
 
-The first library found of these factorises: MUMPS through petsc4py (beside dolfinx), PARDISO of
-Intel's MKL (``pip install pypardiso``), SuperLU of SciPy, which takes several times as long. The
-order of elimination is found once for all matrices of a pattern.
+MUMPS through petsc4py, which is there beside dolfinx, finds the order of elimination once for all
+matrices of a pattern. Without it SciPy's SuperLU does the work, in several times as long.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.sparse import csc_matrix, csr_array, csr_matrix, triu
+from scipy.sparse import csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
 from modeharvest.util.arrays import FloatArray
@@ -106,25 +105,6 @@ class _Mumps:
         return np.array(x.getDenseArray())
 
 
-class _Pardiso:
-    library = "PARDISO"
-
-    def __init__(self, matrix: csr_array) -> None:
-        from pypardiso import PyPardisoSolver
-
-        self._solver = PyPardisoSolver(mtype=2)
-        self._upper = csr_matrix(triu(matrix, format="csr"))
-        self._solver.factorize(self._upper)
-
-    def update(self, matrix: csr_array) -> None:
-        self._upper = csr_matrix(triu(matrix, format="csr"))
-        self._solver.set_phase(22)  # numbers only
-        self._solver._call_pardiso(self._upper, np.zeros((matrix.shape[0], 1)))
-
-    def solve(self, rhs: FloatArray) -> FloatArray:
-        return np.asarray(self._solver.solve(self._upper, rhs))
-
-
 class _SuperLU:
     library = "SuperLU"
 
@@ -144,5 +124,5 @@ class _SuperLU:
         return np.asarray(self._factor.solve(rhs))
 
 
-LIBRARIES: dict[str, Any] = {"mumps": _Mumps, "pardiso": _Pardiso, "superlu": _SuperLU}
+LIBRARIES: dict[str, Any] = {"mumps": _Mumps, "superlu": _SuperLU}
 """In the order in which they are tried."""

@@ -101,6 +101,9 @@ def test_a_solution_knows_its_specimen(tmp_path: Path) -> None:
     solution = Solution(MESHES["T3"], (), Experiment(specimen).described())
     solution.write(tmp_path / "solution.h5")
     assert Solution.read(tmp_path / "solution.h5").specimen == specimen
+    damaged = Solution(MESHES["T3"], (), {"specimen": {"holes_z": 4}})
+    with pytest.raises(InputError, match="holes_z"):
+        _ = damaged.specimen
     with pytest.raises(InputError, match="of which specimen it is"):
         _ = sample().specimen
 

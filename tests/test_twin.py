@@ -20,7 +20,8 @@ from modeharvest.imaging.spec import ImagingSpec, choose_grid
 from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.twin import Twin, make_twin
+from modeharvest.runs.twin import Twin, TwinRun, make_twin
+from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 
@@ -121,6 +122,12 @@ def test_again_does_nothing_and_another_calibration_is_made_anew(tmp_path: Path)
     make_twin(CASE.model_copy(update={"calibration": target}), solution(), tmp_path)
     assert len(stage_shifts(first)) == 2
     assert len(list(first.experiment.parent.glob("calibration_*"))) == 2
+
+
+def test_the_whole_displacement_of_a_twin_is_refused(tmp_path: Path) -> None:
+    case = CASE.model_copy(update={"whole_field": WholeFieldOptions(measure=True)})
+    with pytest.raises(InputError, match=r"a twin without \[whole_field\] measure"):
+        TwinRun(case, tmp_path).all()
 
 
 def test_without_a_lens_there_is_nothing_to_calibrate(tmp_path: Path) -> None:
