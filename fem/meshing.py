@@ -353,8 +353,8 @@ def _add_loop(loop: Collection[FloatArray], size: float) -> int:
     begins = [geo.addPoint(*curve[0], 0.0) for curve in loop]
     curves = []
     for k, (curve, length) in enumerate(zip(loop, lengths, strict=True)):
-        inner = [geo.addPoint(*point, 0.0) for point in curve[1:-1]]
+        interior = [geo.addPoint(*point, 0.0) for point in curve[1:-1]]
         ends = begins[k], begins[(k + 1) % len(begins)]
-        curves.append(geo.addSpline([ends[0], *inner, ends[1]]))
+        curves.append(geo.addSpline([ends[0], *interior, ends[1]]))
         geo.mesh.setTransfiniteCurve(curves[-1], max(1, round(length / size)) + 1)
     return int(geo.addCurveLoop(curves))

@@ -138,9 +138,9 @@ def square_family(origin: str = "junction") -> ModeFamily:
     four holes, where a mode starts from [1, 1, 1, -1, 1, 0, 0], or the centre of a "hole": [1, 1,
     1, 1, -1, 0, 0]; anything else raises InputError.
     """
-    starts = {"junction": [1, 1, 1, -1, 1, 0, 0], "hole": [1, 1, 1, 1, -1, 0, 0]}
-    if origin not in starts:
-        raise InputError(f"expected an origin among {list(starts)}, got {origin!r}")
+    guesses = {"junction": [1, 1, 1, -1, 1, 0, 0], "hole": [1, 1, 1, 1, -1, 0, 0]}
+    if origin not in guesses:
+        raise InputError(f"expected an origin among {list(guesses)}, got {origin!r}")
     matrix, offset = np.zeros((10, 7)), np.zeros(10)
     matrix[[0, 5], 0] = -1.0  # A1 = A2 = -a1
     offset[[1, 6]] = 1.0, -1.0  # B1 = 1, B2 = -1
@@ -148,7 +148,7 @@ def square_family(origin: str = "junction") -> ModeFamily:
         matrix[row, column] = 1.0
     units = ("-",) * 5 + ("mm",) * 2
     return ModeFamily(
-        f"square, origin at a {origin}", matrix, offset, np.array(starts[origin]), units=units
+        f"square, origin at a {origin}", matrix, offset, np.array(guesses[origin]), units=units
     )
 
 

@@ -286,7 +286,7 @@ def result_to_dict(result: Result) -> dict[str, Any]:
     weighting = result.weighting
     content["weighting"] |= {
         "gradient": weighting.gradient.value,
-        "explanation": weighting.sentence,
+        "explanation": weighting.text,
     }
     return content | {
         "outcome": result.outcome.value,

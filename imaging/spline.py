@@ -73,11 +73,11 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     """
     rows, cols = image.shape
     padded = np.empty((rows + 2 * pad, cols + 2 * pad), dtype=image.dtype)
-    inner = padded[pad : pad + rows, pad : pad + cols]
+    interior = padded[pad : pad + rows, pad : pad + cols]
     z = poles(order)
     gain = float(np.prod((1.0 - z) * (1.0 - 1.0 / z)))
-    _filter_columns(readable(image), z, _mirrored(z, rows), gain, inner)
-    _filter_rows(z, _mirrored(z, cols), gain, inner)
+    _filter_columns(readable(image), z, _mirrored(z, rows), gain, interior)
+    _filter_rows(z, _mirrored(z, cols), gain, interior)
     _pad_mirrored(padded, pad)
     return padded
 
@@ -157,8 +157,9 @@ def _pad_mirrored(padded: NDArray[Any], pad: int) -> None:
     """Fill the frame of an array from what it frames, mirrored about the outermost values."""
     rows, cols = (size - 2 * pad for size in padded.shape)
     up, left = (_reflected(size, pad) for size in (rows, cols))
-    inner = padded[pad : pad + rows]
-    inner[:, :pad], inner[:, pad + cols :] = inner[:, left[:pad]], inner[:, left[pad + cols :]]
+    interior = padded[pad : pad + rows]
+    interior[:, :pad] = interior[:, left[:pad]]
+    interior[:, pad + cols :] = interior[:, left[pad + cols :]]
     padded[:pad], padded[pad + rows :] = padded[up[:pad]], padded[up[pad + rows :]]
 
 

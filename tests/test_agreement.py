@@ -53,20 +53,20 @@ def test_noise_is_recognised_and_chi_squared_is_one() -> None:
     assert test.is_white
     assert test.is_predicted
     assert test.chi_square == pytest.approx(1.0, abs=0.03)
-    assert "is noise" in test.sentence
+    assert "is noise" in test.text
 
 
 def test_a_wrong_noise_is_recognised() -> None:
     test = noisy().residual_test(1.3 * NOISE)
     assert test.is_white
     assert not test.is_predicted
-    assert "not the given one" in test.sentence
+    assert "not the given one" in test.text
 
 
 def test_a_displacement_that_the_ansatz_lacks_is_recognised_without_knowing_the_noise() -> None:
     test = noisy(1).residual_test()
     assert not test.is_white
-    assert "not noise" in test.sentence
+    assert "not noise" in test.text
     assert np.isnan(test.chi_square)
 
 
@@ -109,12 +109,12 @@ def test_noise_and_leftover_are_told_apart_whatever_the_speckle(
     assert ResidualTest(autocorrelation(beside_noise), f.size).is_white == (width < 6.0)
     moved = SplineImage.of(noise[1]).sample(*(0.97 * np.stack([rows, cols]) + 3))[0]
     test = ResidualTest(autocorrelation(noise[0] - moved, lags), f.size, lags_px=lags)
-    assert test.is_white, test.sentence
+    assert test.is_white, test.text
 
 
 def test_lags_of_the_paper_s_speckle() -> None:
     assert lags_for(12.4) == LAGS_PX
-    said = ResidualTest(0.5, 1000, lags_px=lags_for(4.0)).sentence
+    said = ResidualTest(0.5, 1000, lags_px=lags_for(4.0)).text
     assert "autocorrelation over 3 to 4 px" in said
 
 

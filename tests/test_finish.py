@@ -75,7 +75,7 @@ def test_a_small_model_error_needs_no_blur() -> None:
     image = Speckle(SpeckleSpec(), SHAPE).image()
     finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), 2.0)
     assert finish.blur_px == 0.0
-    assert "on the unfiltered images" in finish.sentence
+    assert "on the unfiltered images" in finish.text
 
 
 def test_a_blur_makes_speckles_as_wide_as_the_rule_says() -> None:
@@ -83,7 +83,7 @@ def test_a_blur_makes_speckles_as_wide_as_the_rule_says() -> None:
     finish = FinalSmoothing.of(ImagePair(image, image, PLAIN), model_error)
     after = speckle_size(ndimage.gaussian_filter(image, finish.blur_px), EVERYWHERE)
     assert after == pytest.approx(WIDTHS * model_error, rel=0.05)
-    assert f"blurred by {finish.blur_px:.1f} px" in finish.sentence
+    assert f"blurred by {finish.blur_px:.1f} px" in finish.text
 
 
 def test_a_blurred_pair_has_the_contrast_of_the_blurred_reference() -> None:

@@ -25,7 +25,7 @@ from modeharvest.idic.modes import FourierMode, Taper, free_family
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
-from modeharvest.report.figures.outlines import mask_boundary
+from modeharvest.report.figures.boundaries import mask_boundary
 from modeharvest.report.figures.photographs import (
     MOST_SHOWN,
     PhotographState,

@@ -21,7 +21,8 @@ MOST_LINES = 42_500
 
 PRIVATE_WORDS = """
     told judged leftover softness softened pushes unmatched trapped landed levelled marched
-    walker desk nobodys atlas mistakes introduce grains sheet
+    walker desk nobodys atlas mistakes introduce grains sheet sentence sentences fact facts
+    starts home finish rim
 """
 """Parts of names that once meant something to this project alone."""
 

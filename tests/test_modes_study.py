@@ -205,7 +205,7 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     assert (row["first"], row["ratio"]) == ("none", 0.6)
     assert math.isnan(row["a1"])
     found = report_modes(study, table, folder)
-    assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.sentences)
+    assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.text)
     assert len(frame(found.tables, "Buckling")) == 3
     assert list(frame(found.tables, "Parameters")["level"]) == ["", "3.8 mm"]
     assert len(frame(found.attachments, "Every parameter")) == 2 * 7
@@ -222,7 +222,7 @@ def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "local_minimum"
-    said = " ".join(modes_findings(ModesAnalysis.of(odd), folder, "seed 0").sentences)
+    said = " ".join(modes_findings(ModesAnalysis.of(odd), folder, "seed 0").text)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said

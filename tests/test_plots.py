@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.waves import PlaneWave
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import (
     draw_convergence,
     draw_density,
@@ -34,7 +35,6 @@ from modeharvest.report.figures.experiment import (
 )
 from modeharvest.report.figures.fits import Panel
 from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
-from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.report.figures.style import BLUE, INK, MUTED, SIGNED, to_svg
 
 UNITS = {"µm", "mm⁶"}

@@ -20,6 +20,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from modeharvest.report.figures.boundaries import LatticePatch
 from modeharvest.report.figures.lattice import (
     draw_amplitudes,
     draw_captured,
@@ -34,7 +35,6 @@ from modeharvest.report.figures.lattice import (
     draw_overlay,
     draw_zone_map,
 )
-from modeharvest.report.figures.outlines import LatticePatch
 from modeharvest.report.figures.style import INK
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.validation.studies.lattice import EQ_MODE, wave_sum
@@ -61,9 +61,9 @@ def test_copies_join_without_seams_and_fill_the_window(
     patch = LatticePatch.of(mesh, lattice, (3 * L, 2 * L))
     assert len(np.unique(np.round(patch.mesh.nodes, 9), axis=0)) == len(patch.mesh.nodes)
     # One outer edge, and around each hole one loop of 8 edges; a seam would add more.
-    holes = [loop for loop in patch.outline.loops if len(loop) == 8]
-    assert len(holes) == len(patch.outline.loops) - 1
-    (outer,) = (loop for loop in patch.outline.loops if len(loop) != 8)
+    holes = [loop for loop in patch.boundary.loops if len(loop) == 8]
+    assert len(holes) == len(patch.boundary.loops) - 1
+    (outer,) = (loop for loop in patch.boundary.loops if len(loop) != 8)
     left, right, bottom, top = patch.limits
     edge = patch.mesh.nodes[outer[:, 0]]
     assert not np.any((edge[:, 0] > left) & (edge[:, 0] < right)

@@ -219,8 +219,8 @@ def test_findings_of_a_resolution_study(
     assert 0.3 < found.numbers["affine_subset_indicator_px2"] < 3.0
     assert len(found.figures) == 4
     assert all(f.draw().axes for card in found.figures for f in card.figures)
-    assert len(found.sentences) == 7
-    assert not any("nan" in sentence for sentence in found.sentences)
+    assert len(found.text) == 7
+    assert not any("nan" in sentence for sentence in found.text)
 
 
 @pytest.mark.parametrize(

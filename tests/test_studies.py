@@ -110,11 +110,11 @@ def test_numbers_of_a_robustness_study() -> None:
     assert numbers["mean_epsilon_without_outliers_percent"] == pytest.approx(0.5 / 98)
     assert numbers["largest_distance_px"] == 2.0
     assert numbers["other_minimum_called_converged"] == 1
-    assert found.sentences[0].startswith("97 of 100 initial guesses")
-    assert any("1 failed, and count as not converged" in s for s in found.sentences)
+    assert found.text[0].startswith("97 of 100 initial guesses")
+    assert any("1 failed, and count as not converged" in s for s in found.text)
     # Its epsilon is 0.5 %.
-    assert any("does not detect 1 of the 2 results in other" in s for s in found.sentences)
-    assert any("2 in other minima, 1 are called converged" in s for s in found.sentences)
+    assert any("does not detect 1 of the 2 results in other" in s for s in found.text)
+    assert any("2 in other minima, 1 are called converged" in s for s in found.text)
 
 
 def test_the_basin_ends_where_the_first_start_is_lost() -> None:
@@ -125,7 +125,7 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
         parts.append(part.assign(radius=radius))
     table = pd.concat(parts, ignore_index=True)
     found = report_robustness(RobustnessStudy(), table, Path())
-    (said,) = [s for s in found.sentences if "All initial guesses converge" in s]
+    (said,) = [s for s in found.text if "All initial guesses converge" in s]
     assert "up to 10 % off" in said
     assert "50 %: 1 of 4" in said
     basin = frame(found.tables, "Basin of convergence")

@@ -21,7 +21,7 @@ from modeharvest.idic import correlate as correlation
 from modeharvest.idic.correlate import best_fit, fit_displacement
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import Truth
-from modeharvest.report.figures.outlines import MeshBoundary
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.validation.truth import Comparison, VectorStatistics, pattern_size
 
 GRID = PixelGrid.centred(150, 130, 0.02)

@@ -110,7 +110,7 @@ def test_the_reference_s_gradient_pushed_forward_is_the_deformed_image_s() -> No
 def test_noise_free_images_keep_the_least_squares_minimum() -> None:
     found = correlate(ImagePair(*pair(), GRID, MASK), ANSATZ, guess=truth(), options=FINEST)
     assert found.weighting.is_least_squares
-    assert "deformed image's gradient." in found.weighting.sentence
+    assert "deformed image's gradient." in found.weighting.text
 
 
 def test_a_displacement_left_over_keeps_the_least_squares_minimum() -> None:

@@ -212,7 +212,7 @@ def _fields(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, FloatArray]
 
 def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
     """All that isn't a nodal field, as plain JSON values."""
-    starts = [{"combination": list(b.combination), "outcome": b.outcome} for b in branches]
+    outcomes = [{"combination": list(b.combination), "outcome": b.outcome} for b in branches]
     return {
         "format": FORMAT,
         "normalisation": NORMALISATION,
@@ -222,7 +222,7 @@ def _described(modes: ModeSet, branches: Sequence[Branch]) -> dict[str, Any]:
         "primitive_mm": modes.primitive.tolist(),
         "waves_rad": [list(wave) for wave in modes.waves],
         "eigenvalues_N_per_mm4": modes.eigenvalues.tolist(),
-        "branches": starts,
+        "branches": outcomes,
         "info": dict(modes.info),
     }
 

@@ -43,8 +43,8 @@ class BlochMap:
         self._turned = np.flatnonzero(np.any(shift != 0, axis=1))
         # The first copies of all unknowns, the second copies of those that have one, ...
         order = np.argsort(places, kind="stable")
-        starts = np.searchsorted(places[order], np.arange(places.max() + 1))
-        rank = np.arange(len(places)) - starts[places[order]]
+        first = np.searchsorted(places[order], np.arange(places.max() + 1))
+        rank = np.arange(len(places)) - first[places[order]]
         self._ranks = [order[rank == k] for k in range(int(rank.max()) + 1)]
 
     def at(self, waves: FloatArray) -> BlochTransform:
@@ -55,25 +55,25 @@ class BlochMap:
 class BlochTransform:
     """T(k) for some wave vectors; made by ``BlochMap.at``."""
 
-    def __init__(self, copies: BlochMap, factors: Batch) -> None:
+    def __init__(self, bloch_map: BlochMap, factors: Batch) -> None:
         self.dtype = factors.dtype
-        self._copies, self._factors = copies, factors[:, :, None]
+        self._map, self._factors = bloch_map, factors[:, :, None]
 
     def expand(self, vectors: Batch) -> Batch:
         """T x for x (size, w, m)."""
-        copies = self._copies
-        result = vectors[copies.places].astype(np.result_type(vectors, self.dtype), copy=False)
-        result[copies._turned] *= self._factors
+        bloch_map = self._map
+        result = vectors[bloch_map.places].astype(np.result_type(vectors, self.dtype), copy=False)
+        result[bloch_map._turned] *= self._factors
         return np.asarray(result)
 
     def restrict(self, forces: Batch) -> Batch:
         """T^H f for f (n, w, m), which is overwritten."""
-        copies = self._copies
-        forces[copies._turned] *= self._factors.conj()
-        first, *others = copies._ranks
+        bloch_map = self._map
+        forces[bloch_map._turned] *= self._factors.conj()
+        first, *others = bloch_map._ranks
         result = forces[first]
         for rank in others:
-            result[copies.places[rank]] += forces[rank]
+            result[bloch_map.places[rank]] += forces[rank]
         return np.asarray(result)
 
 

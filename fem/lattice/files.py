@@ -188,15 +188,15 @@ def _ends_and_middle(curve: int) -> FloatArray:
 
 
 def _translates(
-    outline: list[FloatArray], lattice: FloatArray
+    boundary: list[FloatArray], lattice: FloatArray
 ) -> list[tuple[int, int, FloatArray]]:
     """Pairs of curves, the second being the first moved by a vector; each is in one pair."""
     near = 1e-6 * float(np.linalg.norm(lattice, axis=1).min())
     found: list[tuple[int, int, FloatArray]] = []
     paired: set[int] = set()
     for shift in np.array([[1, 0], [0, 1], [1, 1], [-1, 1]]) @ lattice:
-        for a, start in enumerate(outline):
-            for b, end in enumerate(outline):
+        for a, start in enumerate(boundary):
+            for b, end in enumerate(boundary):
                 if not {a, b} & paired and np.abs(start + shift - end).max() < near:
                     found.append((a, b, shift))
                     paired |= {a, b}

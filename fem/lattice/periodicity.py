@@ -88,12 +88,12 @@ def _pairs(nodes: FloatArray, lattice: FloatArray, distance: float) -> IntArray:
 
 
 def _refuse_overlap(mesh: Mesh, lattice: FloatArray, boundary: IntArray) -> None:
-    inner = np.setdiff1d(mesh.cells[:, :3], boundary)
-    covered = _covered(mesh, lattice, mesh.nodes[inner])
+    interior = np.setdiff1d(mesh.cells[:, :3], boundary)
+    covered = _covered(mesh, lattice, mesh.nodes[interior])
     if covered.any():
         raise InputError(
             "periodic cell: expected copies of the cell to meet at its boundary only, but they "
-            f"overlap at {_named(inner[covered], mesh.nodes)}; check the lattice vectors"
+            f"overlap at {_named(interior[covered], mesh.nodes)}; check the lattice vectors"
         )
 
 
@@ -111,7 +111,7 @@ def _refuse_hanging(mesh: Mesh, lattice: FloatArray, sides: IntArray, pairs: Int
         lost = alone if len(alone) else mine
         raise InputError(
             "periodic cell: expected a partner, one lattice translation away, for every node on "
-            f"the cell's outline, got none for {_named(lost, mesh.nodes)}; divide opposite sides "
+            f"the cell's boundary, got none for {_named(lost, mesh.nodes)}; divide opposite sides "
             "alike or check the lattice vectors"
         )
 
@@ -155,8 +155,8 @@ def _refuse_loose(mesh: Mesh, found: Periodicity, sides: IntArray) -> None:
     shifts = np.unique(np.diff(found.shift[order], axis=0)[is_same], axis=0)
     rank = np.linalg.matrix_rank(shifts) if len(shifts) else 0
     if rank < 2:
-        outline = np.unique(sides)
-        alone = outline[np.bincount(found.master)[found.master[outline]] == 1]
+        boundary = np.unique(sides)
+        alone = boundary[np.bincount(found.master)[found.master[boundary]] == 1]
         raise InputError(
             "periodic cell: expected the lattice to hold together along both lattice vectors, but "
             f"{'no' if rank == 0 else 'only one'} direction has partners; without one are "

@@ -168,9 +168,9 @@ def _smooth(points: FloatArray, element_px: float) -> tuple[FloatArray, ...]:
         if len(side) > 5:
             side = savgol_filter(side, _window(len(side)), 3, axis=0, mode="interp")
         k = max(1, round(2.0 * len(side) / element_px))
-        inner = side[np.rint(np.arange(1, k) * len(side) / k).astype(int)]
+        interior = side[np.rint(np.arange(1, k) * len(side) / k).astype(int)]
         ends = [_intersection(raw, int(corner))[None] for corner in (begin, end)]
-        curves.append(np.vstack([ends[0], inner, ends[1]]))
+        curves.append(np.vstack([ends[0], interior, ends[1]]))
     return tuple(curves)
 
 

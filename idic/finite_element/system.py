@@ -6,7 +6,7 @@ component c at node i.
 Smoothness, without a material law:
 
     u'Ru = sum over elements int |grad grad u|^2 dA
-         + sum over inner sides (2/h) int |[grad u]|^2 ds,
+         + sum over interior sides (2/h) int |[grad u]|^2 ds,
 
 [.] being the jump across a side of length h: zero for affine displacements alone, and natural
 (free) at all boundaries. It is the energy of a bent plate in the interior-penalty form of G. Engel
@@ -15,7 +15,7 @@ length T costs (2 pi/T)^4 times its mean square, so that a weight of (l/T)^4 v'M
 v halves what of it is at the wavelength l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild, Exp. Mech. 51
 (2011), doi 10.1007/s11340-010-9407-6.
 
-With a law: where nothing loads the body its internal forces f vanish, at inner nodes as on free
+With a law: where nothing loads the body its internal forces f vanish, at interior nodes as on free
 edges. Penalised is their sum of squares |D f(u)|^2, D leaving out the loaded nodes, not the energy:
 M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the moduli cancels.
 """
@@ -155,7 +155,7 @@ def _expand(indptr: Any, indices: Any, parts: Any, begin: Any, columns: Any, dat
                     to += 1
 
 
-def inner_sides(cells: IntArray) -> IntArray:
+def interior_sides(cells: IntArray) -> IntArray:
     """(s, 4) first cell, its side 0 ... 2, second cell and its side, of sides between two cells."""
     corners = np.sort(np.stack([cells[:, [k, (k + 1) % 3]] for k in range(3)], axis=1), axis=2)
     flat = corners.reshape(-1, 2)
@@ -183,7 +183,7 @@ def second_gradients(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 
 def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Jumps of the gradient across inner sides.
+    """Jumps of the gradient across interior sides.
 
     Returns
     -------
@@ -212,7 +212,7 @@ def smoothness_matrix(mesh: Mesh) -> csr_array:
     """(n, n) R of one component [1/mm^2], for nodal values (n,) on a T6 mesh; sorted indices."""
     gradients, weights = second_gradients(mesh)
     inside = np.einsum("eq,eqkij,eqlij->ekl", weights, gradients, gradients, optimize=True)
-    nodes, jumps, shares = side_jumps(mesh, inner_sides(mesh.cells))
+    nodes, jumps, shares = side_jumps(mesh, interior_sides(mesh.cells))
     across = _PENALTY * np.einsum("sg,sgki,sgli->skl", shares, jumps, jumps, optimize=True)
     n = len(mesh.nodes)
     total = csr_array((n, n))
@@ -236,7 +236,7 @@ class Body:
 
     def __init__(self, mesh: Mesh, start: FloatArray) -> None:
         self.mesh, self.start = mesh, start
-        sides = inner_sides(mesh.cells)
+        sides = interior_sides(mesh.cells)
         pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
         self._smoothness = self.pattern.both(smoothness_matrix(mesh))

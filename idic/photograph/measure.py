@@ -144,7 +144,7 @@ def _measured(
 ) -> MeasuredPhotograph:
     """A photograph's result with the final smoothing in its text."""
     assert result.final_smoothing is not None
-    return MeasuredPhotograph(result, local, fixed, (*text, result.final_smoothing.sentence))
+    return MeasuredPhotograph(result, local, fixed, (*text, result.final_smoothing.text))
 
 
 def _with_brightness(result: Result, how: PhotographOptions) -> tuple[Ansatz, FloatArray]:

@@ -35,9 +35,9 @@ def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     looked at, 128 px; that for an image without contrast, too.
     """
     mask = np.ones(image.shape, dtype=np.bool_) if mask is None else mask
-    inner = eroded(mask, _SPECKLE_EDGE_PX)
-    inner = inner if inner.any() else mask
-    curve = 0.5 * (_autocorrelation(image, inner) + _autocorrelation(image.T, inner.T))
+    interior = eroded(mask, _SPECKLE_EDGE_PX)
+    interior = interior if interior.any() else mask
+    curve = 0.5 * (_autocorrelation(image, interior) + _autocorrelation(image.T, interior.T))
     below = int(np.argmax(curve < 0.5))
     if below == 0:
         return 2.0 * _LONGEST
@@ -45,11 +45,11 @@ def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     return float(2.0 * (below - 1 + fraction))
 
 
-def _autocorrelation(image: NDArray[Any], inner: BoolArray) -> FloatArray:
+def _autocorrelation(image: NDArray[Any], interior: BoolArray) -> FloatArray:
     """(_LONGEST,) along the rows, over pairs of pixels that are both inside."""
-    lines = np.flatnonzero(inner.any(axis=1))
+    lines = np.flatnonzero(interior.any(axis=1))
     lines = lines[:: len(lines) // _LINES + 1]
-    values, weights = image[lines], inner[lines]
+    values, weights = image[lines], interior[lines]
     level = values[weights].mean(dtype=np.float64) if weights.any() else 0.0
     shown = np.where(weights, values - np.float32(level), np.float32(0.0))
     n = fft.next_fast_len(shown.shape[1] + _LONGEST, real=True)
@@ -101,7 +101,7 @@ class FinalSmoothing:
         return cls(speckle_size(pair.reference, pair.mask), np.nan, blur_px)
 
     @property
-    def sentence(self) -> str:
+    def text(self) -> str:
         """That in words."""
         start = (
             f"The speckle size (autocorrelation) is {self.speckle_size_px:.1f} px, the model error "
@@ -132,7 +132,7 @@ def smoothed_pair(pair: ImagePair, blur_px: float) -> ImagePair:
 
 def contrast_after(image: FloatImage, mask: BoolArray | None, blur_px: float) -> np.float32:
     """Standard deviation that a speckle has after a blur [grey levels]."""
-    inner = np.ones(image.shape, np.bool_) if mask is None else mask
-    reach = eroded(inner, int(np.ceil(3.0 * blur_px)))
+    interior = np.ones(image.shape, np.bool_) if mask is None else mask
+    reach = eroded(interior, int(np.ceil(3.0 * blur_px)))
     smooth = ndimage.gaussian_filter(np.asarray(image, dtype=np.float32), blur_px)
-    return np.float32(smooth[reach if reach.any() else inner].std(dtype=np.float64))
+    return np.float32(smooth[reach if reach.any() else interior].std(dtype=np.float64))

@@ -84,8 +84,8 @@ def estimated_noise(image: NDArray[Any], mask: NDArray[np.bool_]) -> CameraNoise
     """
     second = np.array([1.0, -2.0, 1.0])
     details = ndimage.convolve(image.astype(np.float64), np.outer(second, second))
-    inner = ndimage.binary_erosion(mask, iterations=2)
-    sd = stats.median_abs_deviation(details[inner], scale="normal") / 6.0
+    interior = ndimage.binary_erosion(mask, iterations=2)
+    sd = stats.median_abs_deviation(details[interior], scale="normal") / 6.0
     return CameraNoise(
         float(sd), "estimated from the finest details of the reference: two exposures measure it"
     )

@@ -184,10 +184,10 @@ def _valid(mask: BoolArray | None, shape: tuple[int, int], edge_px: int, order: 
     """Where g may be sampled: away from its border, and from the edges of its mask if known."""
     border = min(border_reach(order, _FELT), int(_MOST * min(shape)))
     valid = np.zeros(shape, dtype=np.bool_)
-    inner = (slice(border, shape[0] - border), slice(border, shape[1] - border))
+    interior = (slice(border, shape[0] - border), slice(border, shape[1] - border))
     # The reference's eroded edge lands near edge_px from the edge of g, give or take the
     # local strain; one pixel less leaves those pixels in.
-    valid[inner] = True if mask is None else eroded(mask, max(0, edge_px - 1))[inner]
+    valid[interior] = True if mask is None else eroded(mask, max(0, edge_px - 1))[interior]
     return valid
 
 

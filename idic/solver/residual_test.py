@@ -155,7 +155,7 @@ class ResidualTest:
         return bool(np.isnan(self.chi_square) or abs(self.chi_square - 1.0) < reach)
 
     @property
-    def sentence(self) -> str:
+    def text(self) -> str:
         """What that means."""
         known = "" if np.isnan(self.chi_square) else f"chi squared is {self.chi_square:.3g}, and "
         if self.is_white and self.is_predicted:

@@ -107,7 +107,7 @@ class Weighting:
         return float((1.0 + t) ** 4 * (1.0 / (1.0 + 2.0 * t) ** 2 + 0.5 * noise) - 1.0)
 
     @property
-    def sentence(self) -> str:
+    def text(self) -> str:
         """That in words."""
         whose = {
             Gradient.DEFORMED: "the deformed image's gradient",

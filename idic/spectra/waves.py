@@ -297,8 +297,8 @@ def select_waves(
     stars = _stars(spectrum)
     xi = np.array([wave for star in stars for wave in star])
     fit = WaveFit(rule, field, xi, spectrum.pitch)
-    starts = np.cumsum([0] + [len(star) for star in stars])
-    left = {k: list(range(starts[k], starts[k + 1])) for k in range(len(stars))}
+    first = np.cumsum([0] + [len(star) for star in stars])
+    left = {k: list(range(first[k], first[k + 1])) for k in range(len(stars))}
     order, curve = _pursued(fit, left)
     kept = 1
     while kept < len(curve) and curve[kept][1] - curve[kept - 1][1] >= growth:
@@ -315,11 +315,11 @@ def _stars(spectrum: LatticeSpectrum) -> list[list[tuple[float, float]]]:
     for peak in spectrum.peaks:
         if peak.density < PEAK_SHARE * spectrum.peaks[0].density:
             break
-        home = next((star for star in stars if _exchangeable(star[0], peak)), None)
-        if home is None:
+        own = next((star for star in stars if _exchangeable(star[0], peak)), None)
+        if own is None:
             stars.append([peak])
         else:
-            home.append(peak)
+            own.append(peak)
     return [
         sorted((peak.xi for peak in star), key=lambda xi: np.arctan2(xi[1], xi[0]))
         for star in stars

@@ -120,11 +120,11 @@ def fill(
             fill_affine(elements, fields, pixels, e, first, last, state, begin)
         else:
             _fill_element(elements, fields, pixels, e, first, last, state, begin, batch)
-    return _finish_rows(pixels.element, pixels.values, pixels.residual, state, begin)
+    return _mark_background(pixels.element, pixels.values, pixels.residual, state, begin)
 
 
 @compiled()
-def _finish_rows(
+def _mark_background(
     element: NDArray[np.int32],
     values: FloatArray,
     residual: NDArray[np.float32],

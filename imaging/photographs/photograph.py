@@ -26,7 +26,7 @@ _BITS = (8, 10, 12, 14, 16)
 _NOISE_ONLY = 0.1
 """Correlation of neighbouring pixels below which there is no speckle: speckles of 3 px have
 about 0.6, and n px of white noise have 1/sqrt(n)."""
-_SHADE_PX = 31
+_MEAN_PX = 31
 """Lighting that is uneven over more than this is no pattern."""
 _OTHER_SCALE = 4.0
 """Ratio of two frames' bright levels from which on they can't be of one bit depth."""
@@ -162,11 +162,13 @@ def read_frame(path: Path | str, reference: Photograph) -> Photograph:
 def neighbour_correlation(image: FloatImage, mask: BoolArray | None = None) -> float:
     """Correlation of pixels with their right and lower neighbours, uneven lighting removed [-]."""
     weight = np.ones(image.shape, np.float32) if mask is None else mask.astype(np.float32)
-    total = scipy.ndimage.uniform_filter(image * weight, _SHADE_PX)
-    share = scipy.ndimage.uniform_filter(weight, _SHADE_PX)
-    reach = _SHADE_PX // 2  # beyond it the mean is not one-sided, so a ramp leaves nothing
-    inner = (slice(reach, -reach),) * 2 if min(image.shape) > 2 * _SHADE_PX else (slice(None),) * 2
-    fine = (weight * (image - total / np.maximum(share, 1e-6)))[inner].astype(np.float64)
+    total = scipy.ndimage.uniform_filter(image * weight, _MEAN_PX)
+    share = scipy.ndimage.uniform_filter(weight, _MEAN_PX)
+    reach = _MEAN_PX // 2  # beyond it the mean is not one-sided, so a ramp leaves nothing
+    interior = (
+        (slice(reach, -reach),) * 2 if min(image.shape) > 2 * _MEAN_PX else (slice(None),) * 2
+    )
+    fine = (weight * (image - total / np.maximum(share, 1e-6)))[interior].astype(np.float64)
     power = float((fine**2).mean())
     if power == 0.0:
         return 0.0

@@ -50,16 +50,16 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from its home when it is first used."""
+    """Load a public name from its module when it is first used."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        home = import_module(f"{__name__}.{_HOMES[name]}")
+        module = import_module(f"{__name__}.{_HOMES[name]}")
     except ModuleNotFoundError as error:
         if name == "simulate":
             raise dolfinx_missing("simulate needs") from error
         raise
-    value = globals()[name] = getattr(home, name)
+    value = globals()[name] = getattr(module, name)
     return value
 
 

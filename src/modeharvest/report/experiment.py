@@ -32,7 +32,7 @@ from modeharvest.report.model import (
     material_text,
     number,
     percent,
-    sentence,
+    text_of,
 )
 from modeharvest.util.typed import quantities
 from modeharvest.validation.summary import SnapshotSummary
@@ -238,7 +238,7 @@ def _mode_cards(summary: Summary) -> list[Card]:
             row: list[Cell] = [f"{text} [{unit}]" if unit != "-" else text, mode["ideal"][k]]
             rows.append(row + [cell for _, modes in found for cell in _parameter(modes[i], k)])
     table = ReportTable("Parameters of the modes", columns, rows, name="mode")
-    words = sentence("experiment-modes" if several else "experiment-mode")
+    words = text_of("experiment-modes" if several else "experiment-mode")
     return Card.tabular(table, caption=words, wide=True)
 
 
@@ -349,9 +349,9 @@ def notes(summary: Summary) -> list[str]:
         text += _about(snapshot)
     text += [
         _standard_errors(summary),
-        sentence("experiment-weights"),
-        sentence("experiment-rms"),
-        *([sentence("experiment-material")] if summary.get("expected") else []),
+        text_of("experiment-weights"),
+        text_of("experiment-rms"),
+        *([text_of("experiment-material")] if summary.get("expected") else []),
     ]
     return text
 
@@ -360,12 +360,12 @@ def _standard_errors(summary: Summary) -> str:
     """What the standard errors mean for these images."""
     noise = [s["noise_sd"] for s in summary["snapshots"] if s.get("noise_sd") is not None]
     sensor = summary.get("case", {}).get("imaging", {}).get("sensor", {})
-    text = sentence("experiment-noise-free")
+    text = text_of("experiment-noise-free")
     if noise:
-        text = sentence("experiment-exposures", noise=max(noise))
+        text = text_of("experiment-exposures", noise=max(noise))
     elif sensor.get("read_noise") or sensor.get("full_well"):
-        text = sentence("experiment-averages")
-    return sentence("experiment-errors", text=text)
+        text = text_of("experiment-averages")
+    return text_of("experiment-errors", text=text)
 
 
 def _about(snapshot: Snapshot) -> list[str]:
@@ -373,7 +373,7 @@ def _about(snapshot: Snapshot) -> list[str]:
     at = f"At {100 * snapshot['nominal_strain']:.4g} %"
     text = []
     if snapshot.get("negative_pivots"):
-        text.append(sentence("experiment-unstable", at=at, pivots=snapshot["negative_pivots"]))
+        text.append(text_of("experiment-unstable", at=at, pivots=snapshot["negative_pivots"]))
     if snapshot["outcome"] != "converged":
         text.append(f"{at} the correlation ended as “{snapshot['outcome']}”: "
                     f"{snapshot['outcome_why']}")  # fmt: skip
@@ -393,15 +393,15 @@ def _about(snapshot: Snapshot) -> list[str]:
             if _is_free(snapshot)
             else "Fixed at the ideal pattern, the mode describes"
         )
-        text.append(sentence(
+        text.append(text_of(
             "experiment-no-pattern", at=at, symbol=_symbol(snapshot), inner=inner, corners=corners,
             describes=describes,
         ))  # fmt: skip
     return text
 
 
-def _lower(sentence: str) -> str:
-    return f"{sentence[0].lower()}{sentence[1:]}"
+def _lower(text: str) -> str:
+    return f"{text[0].lower()}{text[1:]}"
 
 
 def _is_free(snapshot: Snapshot) -> bool:

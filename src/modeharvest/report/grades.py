@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from modeharvest.report.figures import maps, style
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import curve, legend_above, plain_ticks
-from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -177,8 +177,8 @@ def write_grading(folder: Path | str, grading: Grading) -> None:
 def grading_report(grading: Grading) -> Report:
     """The report of displacement fields, graded and ranked."""
     scores, best = grading.scores, grading.scores[0]
-    outline = MeshBoundary.of(grading.truth.solution.mesh)
-    frame, scale = maps.MapFrame.of(outline, grading.truth.grid, _CELLS), length_scale(scores)
+    boundary = MeshBoundary.of(grading.truth.solution.mesh)
+    frame, scale = maps.MapFrame.of(boundary, grading.truth.grid, _CELLS), length_scale(scores)
     drawn = [ErrorMaps(frame, graded) for graded in scores]
     several = len(scores) > 1
     what = f"Displacement fields of {len(scores)} codes, ranked" if several else (

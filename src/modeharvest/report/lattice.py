@@ -15,7 +15,7 @@ from markupsafe import Markup
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import upward
 from modeharvest.report.figures import lattice as figures
-from modeharvest.report.figures.outlines import LatticePatch
+from modeharvest.report.figures.boundaries import LatticePatch
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -30,7 +30,7 @@ from modeharvest.report.model import (
     material_text,
     number,
     percent,
-    sentence,
+    text_of,
 )
 from modeharvest.runs.lattice.results import (
     DRAWN_AMPLITUDE,
@@ -140,11 +140,11 @@ def findings(summary: Summary) -> list[str]:
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
     text += [
-        sentence("lattice-zone", at=percent(part["load"]), wave=wave_name(part["wave"]),
-                 eigenvalue=part["eigenvalue"]) for part in summary["zone"]
+        text_of("lattice-zone", at=percent(part["load"]), wave=wave_name(part["wave"]),
+                 eigenvalue=number(part["eigenvalue"])) for part in summary["zone"]
     ]  # fmt: skip
     text += [
-        sentence("lattice-family", **family | {"waves": len(family["waves"]),
+        text_of("lattice-family", **family | {"waves": len(family["waves"]),
                                                "captured": percent(family["captured"])})
         for family in summary["families"]
     ]  # fmt: skip
@@ -207,15 +207,15 @@ def notes(summary: Summary) -> list[str]:
     """What a reader should know before trusting the numbers, drawn from the data."""
     text, point = [], summary["critical"]
     if point is not None and not point["found"]:
-        text.append(sentence("lattice-no-proof", loading=point["loading"],
+        text.append(text_of("lattice-no-proof", loading=point["loading"],
                              load=percent(point["load"]), outcome=summary["outcome"]))  # fmt: skip
     elif point is not None and point["long_wave_angle"] is not None:
-        text.append(sentence("lattice-long-waves", loading=point["loading"]))
+        text.append(text_of("lattice-long-waves", loading=point["loading"]))
     if any(branch["states"] for branch in summary["branches"]):
-        text.append(sentence("lattice-branches"))
+        text.append(text_of("lattice-branches"))
     if summary["study"] is not None:
-        text.append(sentence("lattice-material"))
-    return [*text, sentence("lattice-densities")]
+        text.append(text_of("lattice-material"))
+    return [*text, text_of("lattice-densities")]
 
 
 def _window(run: LatticeRun, width: float = CELLS, height: float = CELLS) -> LatticePatch:

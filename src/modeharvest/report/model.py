@@ -41,9 +41,9 @@ def caption(name: str, **values: object) -> dict[str, Any]:
     return {key: Markup(text).format(**values) for key, text in _captions()[name].items()}
 
 
-def sentence(name: str, **values: object) -> str:
-    """The sentence of that name in ``captions.toml``, plain text, with values filled in."""
-    return _captions()["sentences"][name].format(**values)
+def text_of(name: str, **values: object) -> str:
+    """The text of that name in ``captions.toml``, plain text, with values filled in."""
+    return _captions()["text"][name].format(**values)
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ class Findings:
 
     numbers: Mapping[str, Any]
     """The study's results as plain values, with their units in the names."""
-    sentences: Sequence[str]
+    text: Sequence[str]
     """The same in sentences, the most important first."""
     keys: Sequence[KeyNumber] = ()
     """Up to six numbers to begin with."""
@@ -403,8 +403,8 @@ def print_report(report: Report, out: Path) -> None:
 
     console = Console(highlight=False)
     console.print(f"[bold]{escape(report.title)}[/bold]", soft_wrap=True)
-    for sentence in report.findings:
-        console.print(f"- {escape(sentence)}", soft_wrap=True)
+    for text in report.findings:
+        console.print(f"- {escape(text)}", soft_wrap=True)
     brief = [report.brief] if report.brief else []
     for table in (*brief, *(table for table in report.tables if table.on_terminal)):
         printed = Table(title=escape(table.title), title_justify="left")

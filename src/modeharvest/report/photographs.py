@@ -27,7 +27,7 @@ from modeharvest.report.model import (
     caption,
     number,
     percent,
-    sentence,
+    text_of,
 )
 from modeharvest.runs.photographs.results import Harvest
 
@@ -79,7 +79,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         ],
         warnings=[
             *(f"not used: {row['name']}: {row['reason']}" for row in summary.get("skipped", [])),
-            *(f"{frame['name']}: {_sentence(warning)}" for frame in summary["frames"]
+            *(f"{frame['name']}: {_capitalised(warning)}" for frame in summary["frames"]
               for warning in frame["warnings"]),
         ],
         notes=notes(summary),
@@ -286,7 +286,7 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
         ("pixel size", f"{number(1000 * px)} µm"),
         ("camera noise", f"{number(summary['noise']['sd'])} levels"),
     ]
-    drawn = partial(figures.draw_reference, harvest, states[0].view.outline, states[0].levels)
+    drawn = partial(figures.draw_reference, harvest, states[0].view.boundary, states[0].levels)
     figure = ReportFigure("reference", "The reference", drawn, wide=True)
     table = ReportTable("Reference", ("", ""), rows)
     title = "Material, holes, lattice and the part with holes"
@@ -460,7 +460,7 @@ def _wave_cards(frames: Sequence[Frame], names: Mapping[str, str]) -> list[Card]
                 ))  # fmt: skip
     table = ReportTable("Wave vectors", ("", "wave", "ξ₁ [1/l]", "ξ₂ [1/l]"), rows, "waves",
                         on_terminal=True)  # fmt: skip
-    words = sentence("photographs-waves")
+    words = text_of("photographs-waves")
     return Card.tabular(table, caption=words, wide=len(frames) > 2)
 
 
@@ -472,16 +472,16 @@ def notes(summary: Summary) -> list[str]:
         if frame["outcome"] != "converged":
             ended = f"the correlation ended as “{frame['outcome']}”: {frame['outcome_why']}"
             text.append(f"{at} {ended}")
-        text += [f"{at} {frame['residual_test']}", f"{at} {_sentence(frame['weighting'])}"]
+        text += [f"{at} {frame['residual_test']}", f"{at} {_capitalised(frame['weighting'])}"]
     noise = summary["noise"]
     share = "" if noise["of_full_scale"] is None else (
         f", {100 * noise['of_full_scale']:.2g} % of full scale")  # fmt: skip
     text += [
         f"Camera noise: {noise['sd']:.3g} grey levels{share}, {noise['source']}.",
-        *map(sentence, ("photographs-errors", "photographs-w", "photographs-rms")),
+        *map(text_of, ("photographs-errors", "photographs-w", "photographs-rms")),
     ]
     return text
 
 
-def _sentence(text: str) -> str:
+def _capitalised(text: str) -> str:
     return text if text.endswith(".") else f"{text}."

@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, colour_bar, shaded
-from modeharvest.report.figures.outlines import MeshBoundary
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.modes import (
     IDEAL,
@@ -232,7 +232,7 @@ def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
     ran, measured, sizes = found.ran, found.measured, found.sizes
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
-        sentences=_sentences(found),
+        text=_text(found),
         keys=_keys(sizes),
         figures=_figures(measured, sizes, folder, seeds),
         tables=[
@@ -270,14 +270,14 @@ def _keys(sizes: pd.DataFrame) -> tuple[KeyNumber, ...]:
     )  # fmt: skip
 
 
-def _sentences(found: ModesAnalysis) -> list[str]:
+def _text(found: ModesAnalysis) -> list[str]:
     """What was found, the most important first."""
     ran, measured, sizes = found.ran, found.measured, found.sizes
     return [
         *(_of_sizes(sizes) if len(sizes) else []),
         *_of_the_others(measured),
         *_of_graded(measured),
-        *_not_observable_sentences(ran),
+        *_not_observable_text(ran),
         *_of_strains(ran),
     ]
 
@@ -293,12 +293,12 @@ def _of_sizes(sizes: pd.DataFrame) -> list[str]:
 
     overlaps = [key for columns in list(_OVERLAPS.values())[:2] for key in columns]
     return [
-        sentence("modes-measured", specimens=specimens, least=sizes["ratio"].min(),
+        text_of("modes-measured", specimens=specimens, least=sizes["ratio"].min(),
                  most=sizes["ratio"].max(), **off()),
-        sentence("modes-best", least=number(float(errors.min())), most=number(float(errors.max())),
+        text_of("modes-best", least=number(float(errors.min())), most=number(float(errors.max())),
                  within=int((np.abs(apart) <= 2).sum()), count=apart.size,
                  rms=np.sqrt((apart**2).mean()), **off("best_")),
-        sentence("modes-overlap", **{key: _between(sizes[key]) for key in overlaps}),
+        text_of("modes-overlap", **{key: _between(sizes[key]) for key in overlaps}),
     ]  # fmt: skip
 
 
@@ -313,7 +313,7 @@ def _of_the_others(measured: pd.DataFrame) -> list[str]:
                 for prefix in ("", "best_")
             )
             levels = ", ".join(map(str, part["level"]))
-            text.append(sentence("modes-others", what=what, levels=levels, moved=moved, best=best,
+            text.append(text_of("modes-others", what=what, levels=levels, moved=moved, best=best,
                                  overlap=_between(part["overlap_lattice"])))  # fmt: skip
     return text
 
@@ -323,7 +323,7 @@ def _of_graded(measured: pd.DataFrame) -> list[str]:
     base = measured[measured["varied"] == "base"]
     if not len(part) or not len(base):
         return []
-    return [sentence(
+    return [text_of(
         "modes-graded", least=part["smallest_ratio"].min(), most=part["largest_ratio"].max(),
         waves=_percent(deviations(part)[WAVE_VECTORS]), overlap=_between(part["overlap_truth"]),
         worst=part.loc[part["overlap_truth"].idxmin()], base=base["overlap_truth"].iloc[0],
@@ -332,7 +332,7 @@ def _of_graded(measured: pd.DataFrame) -> list[str]:
     )]  # fmt: skip
 
 
-def _not_observable_sentences(ran: pd.DataFrame) -> list[str]:
+def _not_observable_text(ran: pd.DataFrame) -> list[str]:
     """Specimens without a measured pattern, or in an unstable state."""
     text = []
     for _, row in ran.iterrows():
@@ -342,13 +342,13 @@ def _not_observable_sentences(ran: pd.DataFrame) -> list[str]:
             continue
         if row["first"] == "other":
             share = 100 * row["pattern_share"] ** 2
-            remarks.append(sentence("modes-other-mode", share=share))
+            remarks.append(text_of("modes-other-mode", share=share))
         elif row["outcome"] != "converged":
             remarks.append(f"the correlation ended {row['outcome']}, and does not count above")
         if row["simulation"] != "complete":
             remarks.append(row["simulation"])
         if row["unstable_pivots"]:
-            remarks.append(sentence("modes-unstable", pivots=row["unstable_pivots"]))
+            remarks.append(text_of("modes-unstable", pivots=row["unstable_pivots"]))
         text += [f"{name}: {remark}." for remark in remarks]
     return text
 
@@ -360,7 +360,7 @@ def _of_strains(ran: pd.DataFrame) -> list[str]:
     if not len(both):
         return []
     ratio = both["critical_strain"] / both["lattice_pattern_strain"]
-    return [sentence("modes-strains", least=ratio.min(), most=ratio.max())]
+    return [text_of("modes-strains", least=ratio.min(), most=ratio.max())]
 
 
 def _figures(measured: pd.DataFrame, sizes: pd.DataFrame, folder: Path, seeds: str) -> list[Card]:

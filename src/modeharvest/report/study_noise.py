@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, WIDE, curve
 from modeharvest.report.figures.maps import ColourScale, colour_bar
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.studies.noise import NoiseStudy
 from modeharvest.validation.studies.noise_statistics import (
@@ -320,10 +320,10 @@ def report_noise(study: NoiseStudy, table: pd.DataFrame, folder: Path) -> Findin
             "curvature_sd_ratio": {f"{k:g}": v for k, v in found.curvature_sd_ratio.items()},
             "not_converged": found.not_converged,
         },
-        sentences=(
-            *_level_sentences(levels, ours, found.points.pair),
-            _cause_sentence(causes),
-            *_other_sentences(found),
+        text=(
+            *_level_text(levels, ours, found.points.pair),
+            _cause_text(causes),
+            *_other_text(found),
         ),
         keys=_keys(levels, ours, shown),
         figures=_figures(found, causes, shown, study.seeds),
@@ -352,7 +352,7 @@ def _keys(levels: Levels, ours: Levels, shown: float) -> tuple[KeyNumber, ...]:
     )  # fmt: skip
 
 
-def _level_sentences(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tuple[str, ...]:
+def _level_text(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tuple[str, ...]:
     px = pair.images.grid.pixel_size
     at = "at " + _listed(f"{100 * level:g}" for level in levels) + " % of noise in both images"
     shares = [
@@ -367,10 +367,10 @@ def _level_sentences(levels: Levels, ours: Levels, pair: VirtualImagePair) -> tu
     )
     bound = levels[min(levels)]["u"].rms_bound / px / (100.0 * min(levels))
     return (
-        sentence("noise-scatter", ratio=ratio, at=at),
-        sentence("noise-bound", over=over, bound=number(bound)),
-        sentence("noise-coverage", covered=covered, covered_u=covered_u),
-        sentence("noise-bias", bias=bias),
+        text_of("noise-scatter", ratio=ratio, at=at),
+        text_of("noise-bound", over=over, bound=number(bound)),
+        text_of("noise-coverage", covered=covered, covered_u=covered_u),
+        text_of("noise-bias", bias=bias),
     )
 
 
@@ -380,18 +380,18 @@ def _listed(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _cause_sentence(causes: pd.DataFrame) -> str:
+def _cause_text(causes: pd.DataFrame) -> str:
     u = dict(zip(causes["what"], causes["u"], strict=True))
     det, curved, least = (u[CAUSE_LABELS[cause]] for cause in CAUSES[1:])
-    return sentence("noise-causes", det=det, curved=curved, least=least)
+    return text_of("noise-causes", det=det, curved=curved, least=least)
 
 
-def _other_sentences(found: NoiseAnalysis) -> tuple[str, ...]:
+def _other_text(found: NoiseAnalysis) -> tuple[str, ...]:
     row, lost = found.noise_free.row, found.not_converged
     noisy = ", ".join(f"{v:.3f} at {100 * k:g} %" for k, v in found.curvature_sd_ratio.items())
     measurement, model = (number(float(row[f"{k}_error_px"])) for k in ("measurement", "model"))
     return (
-        sentence("noise-bars", noisy=noisy),
-        sentence("noise-without", measurement=measurement, model=model),
+        text_of("noise-bars", noisy=noisy),
+        text_of("noise-without", measurement=measurement, model=model),
         *([f"{lost} correlations did not converge, and count as they ended."] if lost else []),
     )

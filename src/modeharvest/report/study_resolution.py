@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import curve, plain_ticks
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.resolution.buckled import ResolutionSpec
 from modeharvest.validation.resolution.star import KEPT
 from modeharvest.validation.resolution.transfer import (
@@ -158,9 +158,7 @@ _KEPT = 0.85
 """Share of a wave that is found, from which on images are set against best fits apart [-]."""
 
 
-def _sentences(
-    found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame
-) -> tuple[str, ...]:
+def _text(found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame) -> tuple[str, ...]:
     """The findings, the most important first.
 
     ``waves``, ``floors``: tables: images against best fits, scatter against covariance.
@@ -178,20 +176,20 @@ def _sentences(
         for part, name in (("v0", "v0"), ("v1", "v1phi1"))
     }
     return (
-        sentence("resolution-finest", degree=chosen.degree, v0=v0, v1=v1, v0_cells=v0 / pitch,
+        text_of("resolution-finest", degree=chosen.degree, v0=v0, v1=v1, v0_cells=v0 / pitch,
                  v1_cells=v1 / pitch, share=100 * v0 / width),
-        sentence("resolution-trade-off", first=first, last=last, before=before / pitch,
+        text_of("resolution-trade-off", first=first, last=last, before=before / pitch,
                  after=after / pitch, **rise),
-        sentence("resolution-product", first=first, last=last, gain=before / after,
+        text_of("resolution-product", first=first, last=last, gain=before / after,
                  least=min(products), most=max(products), subset=found.subset_px2),
-        sentence("resolution-choice"),
-        *_measured_sentences(found, waves, floors),
-        sentence("resolution-pattern", px=2 * pitch, least=kept.min(), most=kept.max(),
+        text_of("resolution-choice"),
+        *_measured_text(found, waves, floors),
+        text_of("resolution-pattern", px=2 * pitch, least=kept.min(), most=kept.max(),
                  degree=chosen.degree, retuned=100 * band.retuned),
     )  # fmt: skip
 
 
-def _measured_sentences(
+def _measured_text(
     found: ResolutionAnalysis, waves: pd.DataFrame, floors: pd.DataFrame
 ) -> list[str]:
     """What correlated images add to best fits and theory, where there are any."""
@@ -200,13 +198,13 @@ def _measured_sentences(
         off, kept = 100 * waves["difference"].abs(), waves["best fit"] >= _KEPT
         elsewhere = "" if kept.all() else f"; otherwise by {off[~kept].max():.1f} %"
         anywhere, resolved = (100 * share for share in found.curves.cross_talk())
-        text.append(sentence(
+        text.append(text_of(
             "resolution-images", kept=100 * _KEPT, amplitude=found.spec.amplitude_px,
             off=off[kept].max(), elsewhere=elsewhere, resolved=resolved, anywhere=anywhere,
         ))  # fmt: skip
     if len(floors):
         ratio = floors["Monte Carlo / predicted"]
-        text.append(sentence("resolution-noise", least=ratio.min(), most=ratio.max(),
+        text.append(text_of("resolution-noise", least=ratio.min(), most=ratio.max(),
                              error=floors["±"].mean()))  # fmt: skip
     return text
 
@@ -230,7 +228,7 @@ def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
             "cross_talk": dict(zip(("any_period", "resolved"), curves.cross_talk(), strict=True)),
             "longest_retuned": found.passband.retuned,
         },
-        sentences=_sentences(found, waves, floors),
+        text=_text(found, waves, floors),
         keys=_keys(found.chosen, spec),
         figures=_figures(found, waves, seeds),
         tables=[

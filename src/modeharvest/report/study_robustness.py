@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import SMALL, curve
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.studies.robustness import (
     OUTLIER_PERCENT,
     PUBLISHED,
@@ -153,11 +153,11 @@ def report_robustness(study: RobustnessStudy, table: pd.DataFrame, folder: Path)
         tables["Initial guess of v0"] = strains
     return Findings(
         numbers={**asdict(found.statistics), "basin": basin.to_dict("records")},
-        sentences=(
-            *_sentences(found.statistics),
-            *_basin_sentences(basin),
+        text=(
+            *_text(found.statistics),
+            *_basin_text(basin),
             *_undetected(found.moved),
-            *_strain_sentences(strains),
+            *_strain_text(strains),
         ),
         keys=_keys(found.statistics),
         figures=_figures(found.at_radius, basin, strains, radius, study.seeds),
@@ -184,29 +184,29 @@ def _keys(found: GuessStatistics) -> tuple[KeyNumber, ...]:
     )  # fmt: skip
 
 
-def _sentences(found: GuessStatistics) -> tuple[str, ...]:
+def _text(found: GuessStatistics) -> tuple[str, ...]:
     low, high = found.success_interval_95
     elsewhere = found.initial_guesses - found.same_minimum - found.failed
     text = [
-        sentence("robustness-success", found=found, radius=100 * found.radius, same=SAME_PX,
+        text_of("robustness-success", found=found, radius=100 * found.radius, same=SAME_PX,
                  success=100 * found.success, low=100 * low, high=100 * high,
                  published=100 * PUBLISHED["success"]),
-        sentence("robustness-epsilon", mean=number(found.mean_epsilon_percent),
+        text_of("robustness-epsilon", mean=number(found.mean_epsilon_percent),
                  largest=number(found.largest_epsilon_percent), limit=OUTLIER_PERCENT,
                  outliers=found.outliers or "none", published=PUBLISHED),
-        sentence("robustness-distance", largest=number(found.largest_distance_px),
+        text_of("robustness-distance", largest=number(found.largest_distance_px),
                  arrived=number(found.largest_distance_of_arrived_px)),
-        sentence("robustness-phases"),
+        text_of("robustness-phases"),
     ]  # fmt: skip
     if elsewhere:
-        text.append(sentence("robustness-elsewhere", elsewhere=elsewhere,
+        text.append(text_of("robustness-elsewhere", elsewhere=elsewhere,
                              converged=found.other_minimum_called_converged))  # fmt: skip
     if found.failed:
         text.append(f"{found.failed} failed, and count as not converged to it.")
     return tuple(text)
 
 
-def _basin_sentences(basin: pd.DataFrame) -> tuple[str, ...]:
+def _basin_text(basin: pd.DataFrame) -> tuple[str, ...]:
     """Up to where all converge to the same minimum."""
     full = basin["same minimum"] == basin["initial guesses"]
     sure = basin.loc[full.cummin(), "off by up to [%]"]
@@ -227,11 +227,11 @@ def _undetected(moved: pd.DataFrame) -> tuple[str, ...]:
     if not len(unseen):
         return ()
     least, most = (number(float(end)) for end in (unseen.min(), unseen.max()))
-    return (sentence("robustness-undetected", unseen=len(unseen), others=len(others), least=least,
+    return (text_of("robustness-undetected", unseen=len(unseen), others=len(others), least=least,
                      most=most, limit=OUTLIER_PERCENT),)  # fmt: skip
 
 
-def _strain_sentences(strains: pd.DataFrame) -> tuple[str, ...]:
+def _strain_text(strains: pd.DataFrame) -> tuple[str, ...]:
     if not len(strains):
         return ()
     same = strains["distance of the result [px]"] < SAME_PX
@@ -239,5 +239,5 @@ def _strain_sentences(strains: pd.DataFrame) -> tuple[str, ...]:
     tried, converged = (", ".join(f"{v:+g}" for v in part).replace("-", "−")
                         for part in (off, off[same]))  # fmt: skip
     which = "" if same.all() or not same.any() else f": {converged} %"
-    return (sentence("robustness-strains", tried=tried, same=int(same.sum()), count=len(strains),
+    return (text_of("robustness-strains", tried=tried, same=int(same.sum()), count=len(strains),
                      which=which),)  # fmt: skip

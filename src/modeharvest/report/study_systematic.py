@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from modeharvest.report.figures import style
-from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, sentence
+from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.validation.studies.systematic import (
     BASE,
     FACTORS,
@@ -104,7 +104,7 @@ def report_systematic(study: SystematicStudy, table: pd.DataFrame, folder: Path)
     figure = Card.captioned("factors", drawn, "systematic-factors", True, seeds=seeds)
     return Findings(
         numbers={"base": dict(found.base), "factors": spans.to_dict("records")},
-        sentences=_sentences(levels, spans, found.base),
+        text=_text(levels, spans, found.base),
         keys=_keys(spans, found.base),
         figures=[figure],
         tables=[
@@ -130,12 +130,10 @@ _FAR, _NEAR = 0.1, 0.01
 """Factors that move the measurement by more, or by less, are listed apart [px]."""
 
 
-def _sentences(
-    levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]
-) -> tuple[str, ...]:
+def _text(levels: pd.DataFrame, spans: pd.DataFrame, base: Mapping[str, float]) -> tuple[str, ...]:
     names = {"measurement": "measurement_error_px", "model": "model_error_px", "v1": "v1_percent"}
     values = {name: number(base[key]) for name, key in names.items()}
-    text = [sentence("systematic-base", **values)]
+    text = [text_of("systematic-base", **values)]
     far = spans[f"largest, {MOVED}"]
     for heading, part in (
         (f"These move the measurement by more than {_FAR:g} px", spans[far > _FAR]),
@@ -152,7 +150,7 @@ def _sentences(
     if len(lost_ones):
         named = ", ".join(f"{r['name']} = {number(r['level'])}" for _, r in lost_ones.iterrows())
         text.append(f"Not every correlation converged at {named}: left out above.")
-    text.append(sentence("systematic-model-error"))
+    text.append(text_of("systematic-model-error"))
     return tuple(text)
 
 
@@ -169,7 +167,7 @@ def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Fig
             shown = part[part[column] > 0.0]  # the base is not moved from itself
             axes.plot(shown["number"], shown[column], linewidth=1, markersize=4, label=column,
                       **look)  # fmt: skip
-        _finish_axes(axes, part, at_base)
+        _label_axes(axes, part, at_base)
     for axes in grid[::_COLUMNS]:
         axes.set_ylabel("rms [px of the base]")
     drawn.legend(*grid[0].get_legend_handles_labels(), ncols=3, loc="upper left")
@@ -177,7 +175,7 @@ def draw_factors(levels: pd.DataFrame, bases: Mapping[str, float | None]) -> Fig
     return drawn
 
 
-def _finish_axes(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:
+def _label_axes(axes: Axes, part: pd.DataFrame, at_base: float | None) -> None:
     factor, name = FACTORS[part["name"].iloc[0]], part["name"].iloc[0]
     levels = part["number"].to_numpy(dtype=np.float64)
     is_geometric = levels.min() > 0 and levels.max() / levels.min() >= 4 and not factor.whole

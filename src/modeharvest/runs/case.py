@@ -27,7 +27,7 @@ from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
-from modeharvest.util.typed import CHECKS, made, nearest, require_types, sentence, to_plain
+from modeharvest.util.typed import CHECKS, described, made, nearest, require_types, to_plain
 
 _SHIPPED = resources.files("modeharvest") / "cases"
 _KINDS = {
@@ -152,7 +152,7 @@ def checked(model: type[CaseType], tables: Mapping[str, Any], name: str | Path) 
         case = model.model_validate(dict(tables))
         require_types(tables, case)
     except ValidationError as error:
-        raise InputError(f"{name}: {sentence(error, model)}") from error
+        raise InputError(f"{name}: {described(error, model)}") from error
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     return case

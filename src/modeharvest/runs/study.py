@@ -116,7 +116,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
     command: str = "modeharvest study STUDY --out DIR"
     """What makes the report again."""
 
-    def subject(self) -> ImagePairSpec:
+    def pair_spec(self) -> ImagePairSpec:
         """What is measured."""
         case = self.case
         return ImagePairSpec(case.experiment, case.imaging, case.correlation, self._solution)
@@ -140,7 +140,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
             _claim(folder, self.case.kind)
             self.workers.require_ready(study.function, folder)
             with self.timed("solution and images"):
-                cases = study.prepare(self.subject(), folder, self.progress)
+                cases = study.prepare(self.pair_spec(), folder, self.progress)
             campaign = Campaign(study.function, cases, folder)
             with self.timed("cases"):
                 listener = named(self.progress, f"study: {len(cases)} cases")

@@ -97,8 +97,8 @@ def make_twin(
         lens = spec.lens(images.grid.shape)
         assert lens is not None
         write_distortion(truth / "distortion.json", lens)
-        seen = ideal_points(lens, images.grid.shape)
-        shots = photograph_target(target, spec.speckle, seen, spec.sensor, spec.bits)
+        observed = ideal_points(lens, images.grid.shape)
+        shots = photograph_target(target, spec.speckle, observed, spec.sensor, spec.bits)
         for k, (name, levels) in enumerate(shots):
             progress(k, len(target.shifts_px), "images: calibration")
             taken.append(photographs / f"{name}.tif")

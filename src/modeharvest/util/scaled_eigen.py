@@ -28,8 +28,8 @@ class ScaledEigen:
         """Decompose a matrix."""
         diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
         # Scaling rounding up to 1 would make a direction of it, with enormous steps along it.
-        seen = diagonal > _ROUNDING * diagonal.max(initial=0.0)
-        scale = np.where(seen, diagonal, np.inf)
+        observed = diagonal > _ROUNDING * diagonal.max(initial=0.0)
+        scale = np.where(observed, diagonal, np.inf)
         values, vectors = np.linalg.eigh(matrix / scale / scale[:, None])
         return cls(scale, values, vectors)
 

@@ -42,7 +42,7 @@ def made(kind: type[T], values: object) -> T:
     try:
         (thing,) = TypeAdapter(tuple[kind], config=CHECKS).validate_python((values,))  # type: ignore[valid-type]
     except ValidationError as error:
-        raise InputError(sentence(error, kind, 1)) from error
+        raise InputError(described(error, kind, 1)) from error
     require_types(values, thing)
     found: T = thing
     return found
@@ -56,11 +56,11 @@ def require_types(given: object, found: object, where: str = "") -> None:
     """
     if isinstance(given, Mapping):
         for key, value in given.items():
-            inner = found.get(key) if isinstance(found, Mapping) else getattr(found, key, None)
-            require_types(value, inner, f"{where}.{key}".lstrip("."))
+            nested = found.get(key) if isinstance(found, Mapping) else getattr(found, key, None)
+            require_types(value, nested, f"{where}.{key}".lstrip("."))
     elif isinstance(given, (list, tuple)) and isinstance(found, (list, tuple)):
-        for k, (value, inner) in enumerate(zip(given, found, strict=False)):
-            require_types(value, inner, f"{where}.{k}")
+        for k, (value, nested) in enumerate(zip(given, found, strict=False)):
+            require_types(value, nested, f"{where}.{k}")
     elif _kind(given) and _kind(found) and _kind(given) != _kind(found):
         raise InputError(f"{where}: expected {_kind(found)}, got {given!r}")
     elif _kind(given) == "a number" and abs(given) > _LARGEST:  # type: ignore[arg-type]
@@ -83,11 +83,11 @@ def to_plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): to_plain(inner) for key, inner in value.items()}
+        return {str(key): to_plain(nested) for key, nested in value.items()}
     if hasattr(value, "tolist"):  # numpy's arrays and numbers
         return to_plain(value.tolist())
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [to_plain(inner) for inner in value]
+        return [to_plain(nested) for nested in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -108,7 +108,7 @@ def quantities(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
             yield f.metadata["label"], f.metadata["unit"], f.name
 
 
-def sentence(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
+def described(error: ValidationError, model: type[Any] | None, skipped: int = 0) -> str:
     """The first fault, in one line: where, what came, what was expected.
 
     ``skipped``: how many steps of the fault's place are not the user's.

@@ -15,8 +15,8 @@ from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.report.figures import fits, style
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, draw_blend, draw_field, draw_image
-from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.truth import Comparison, lengths, pattern_field
 from modeharvest.validation.whole_field import WholeFieldComparison
@@ -44,8 +44,8 @@ class ExperimentData:
     @cached_property
     def states(self) -> list[SnapshotState]:
         """All snapshots."""
-        outline, images = MeshBoundary.of(self.solution.mesh), self.images
-        view = fits.SpecimenView(outline, images.grid, images.mask(), self.pitch)
+        boundary, images = MeshBoundary.of(self.solution.mesh), self.images
+        view = fits.SpecimenView(boundary, images.grid, images.mask(), self.pitch)
         return [
             SnapshotState(f"{round(1e4 * strain):04d}", self._label(strain), view, result,
                           partial(self._densities, k), self, k)

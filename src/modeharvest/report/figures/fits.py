@@ -19,6 +19,7 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.curves import draw_convergence, draw_density, pattern_density
 from modeharvest.report.figures.maps import (
     ColourScale,
@@ -27,7 +28,6 @@ from modeharvest.report.figures.maps import (
     draw_field,
     draw_shape,
 )
-from modeharvest.report.figures.outlines import MeshBoundary
 from modeharvest.report.model import Card, ReportFigure, Section, caption
 from modeharvest.util.arrays import BoolArray, FloatArray
 
@@ -42,7 +42,7 @@ UM = 1e3  # micrometres in a millimetre
 class SpecimenView:
     """The specimen that the maps of all states are drawn on."""
 
-    outline: MeshBoundary
+    boundary: MeshBoundary
     """Of the material in the reference."""
     grid: PixelGrid
     mask: BoolArray
@@ -54,7 +54,7 @@ class SpecimenView:
     def map_frame(self, cells: int = SMOOTH) -> MapFrame:
         """The frame of maps with about that many cells along the longer side."""
         if cells not in self._frames:
-            self._frames[cells] = MapFrame.of(self.outline, self.grid, cells)
+            self._frames[cells] = MapFrame.of(self.boundary, self.grid, cells)
         return self._frames[cells]
 
     def on_material(self, values: FloatArray, cells: int = SMOOTH) -> FloatArray:

@@ -20,8 +20,8 @@ from modeharvest.fem.bloch.modes import Branch
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.report.figures import curves, style
+from modeharvest.report.figures.boundaries import LatticePatch, MeshBoundary
 from modeharvest.report.figures.maps import WIDTH, ColourScale, bare_axes, colour_bar, shaded
-from modeharvest.report.figures.outlines import LatticePatch, MeshBoundary
 from modeharvest.report.figures.style import BLUE, COLOURS, DENSITY, INK, MUTED, RED
 from modeharvest.runs.lattice.results import combination_name
 from modeharvest.util.arrays import FloatArray
@@ -50,7 +50,7 @@ def draw_lattice(
     displacement: FloatArray | None = None,
     gradient: FloatArray | None = None,
 ) -> Figure:
-    """Draw the lattice where it is, or where a displacement takes it, with its cell's outline.
+    """Draw the lattice where it is, or where a displacement takes it, with its cell's boundary.
 
     ``patch``: copies of the cell, and the window. ``pitch``: unit cell size l [mm], for the scale
     bar. ``displacement``: (n, 2) of the cell's nodes [mm]; None for the undeformed lattice.
@@ -59,9 +59,9 @@ def draw_lattice(
     moved = None if displacement is None else patch.moved(displacement, gradient)
     F = np.eye(2) if gradient is None else np.asarray(gradient)
     drawn, axes = _window_axes(patch, pitch)
-    outline = patch.outline.path(moved)
-    style.draw_path(axes, outline, fc=BLUE, ec="none", alpha=0.28)
-    style.draw_path(axes, outline, fill=False, ec=BLUE, lw=0.7)
+    boundary = patch.boundary.path(moved)
+    style.draw_path(axes, boundary, fc=BLUE, ec="none", alpha=0.28)
+    style.draw_path(axes, boundary, fill=False, ec=BLUE, lw=0.7)
     corners = (patch.cell_corners - patch.centre) @ F.T + patch.centre
     axes.add_patch(Polygon(corners, fill=False, ec=RED, lw=1.3, ls=(0, (4, 2)), zorder=3))
     return drawn
@@ -81,7 +81,7 @@ def draw_growth(patch: LatticePatch, shape: FloatArray, amplitude: float, pitch:
     drawn, axes = _window_axes(patch, pitch, 3.6, 0.76, 0.22)
     scale = ColourScale(_EMBER, 0.0, amplitude / pitch, "l")
     shading = shaded(axes, patch.mesh, moved, np.linalg.norm(moved, axis=1) / pitch, scale)
-    edge = style.draw_path(axes, patch.outline.path(moved), fill=False, ec="none", rasterized=True)
+    edge = style.draw_path(axes, patch.boundary.path(moved), fill=False, ec="none", rasterized=True)
     shading.set_clip_path(edge)
     colour_bar(axes, scale)
     return drawn
@@ -97,8 +97,8 @@ def draw_overlay(
     largest displacement of the numerical one, as drawn [mm].
     """
     factor = largest / float(np.linalg.norm(numerical, axis=1).max())
-    outline = MeshBoundary.of(mesh)
-    grey, black = outline.path(factor * analytic), outline.path(factor * numerical)
+    boundary = MeshBoundary.of(mesh)
+    grey, black = boundary.path(factor * analytic), boundary.path(factor * numerical)
     nodes = np.vstack([mesh.nodes + factor * analytic, mesh.nodes + factor * numerical])
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     drawn, axes = bare_axes(WIDTH, high - low, 0.98, _MARGIN, _ABOVE)

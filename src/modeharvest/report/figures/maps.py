@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.report.figures import style
-from modeharvest.report.figures.outlines import MeshBoundary, block_means
+from modeharvest.report.figures.boundaries import MeshBoundary, block_means
 from modeharvest.report.model import ten_to
 from modeharvest.util.arrays import BoolArray, FloatArray
 
@@ -34,7 +34,7 @@ DisplacementFunction = Callable[[FloatArray, FloatArray], FloatArray]
 class MapFrame:
     """What all maps of a specimen share, so that they can be laid over each other."""
 
-    outline: MeshBoundary
+    boundary: MeshBoundary
     """Of the specimen."""
     grid: PixelGrid
     factor: int
@@ -43,13 +43,13 @@ class MapFrame:
     """(left, right, bottom, top) of every map [mm]."""
 
     @classmethod
-    def of(cls, outline: MeshBoundary, grid: PixelGrid, cells: int = 360) -> MapFrame:
-        """Make a frame for an outline, with about that many cells along the longer side."""
+    def of(cls, boundary: MeshBoundary, grid: PixelGrid, cells: int = 360) -> MapFrame:
+        """Make a frame for a boundary, with about that many cells along the longer side."""
         factor = max(1, round(max(grid.shape) / cells))
-        (left, bottom), (right, top) = outline.nodes.min(axis=0), outline.nodes.max(axis=0)
+        (left, bottom), (right, top) = boundary.nodes.min(axis=0), boundary.nodes.max(axis=0)
         margin = 0.012 * max(right - left, top - bottom)
         limits = (left - margin, right + margin, bottom - margin, top + margin)
-        return cls(outline, grid.binned(factor), factor, limits)
+        return cls(boundary, grid.binned(factor), factor, limits)
 
     def average(self, field: FloatArray) -> FloatArray:
         """Average a field (rows, cols) of the images over the cells, NaN left out."""
@@ -71,13 +71,13 @@ class MapFrame:
 
     def moved_nodes(self, motion: DisplacementFunction) -> FloatArray:
         """(n, 2) displacement of the mesh's nodes [mm]."""
-        x, y = self.outline.nodes.T
+        x, y = self.boundary.nodes.T
         return motion(x[:, None], y[:, None])[:, 0]
 
     def moved_corners(self, motion: DisplacementFunction | None) -> tuple[FloatArray, FloatArray]:
         """(rows + 1, cols + 1) positions of the cells' corners [mm], none off the specimen."""
         h = 0.5 * self.grid.pixel_size
-        low, high = self.outline.nodes.min(axis=0), self.outline.nodes.max(axis=0)
+        low, high = self.boundary.nodes.min(axis=0), self.boundary.nodes.max(axis=0)
         x = np.clip(np.append(self.grid.x - h, self.grid.x[-1] + h), low[0], high[0])
         y = np.clip(np.append(self.grid.y + h, self.grid.y[-1] - h), low[1], high[1])
         X, Y = np.meshgrid(x, y)
@@ -184,22 +184,22 @@ def draw_image(
 
     ``image``, ``material``: (rows, cols) grey levels [0 black, 1 white] and where they show
     material, None for everywhere; ``grid``: their pixels. ``displacement``: (n, 2) true
-    displacement at the mesh's nodes [mm], for the outline. ``scale``: what the levels mean;
+    displacement at the mesh's nodes [mm], for the boundary. ``scale``: what the levels mean;
     fractions of full scale by default.
     """
     drawn, axes = _empty_map(map_frame)
     _show_grey(axes, map_frame, image, material, grid)
-    _draw_edge(axes, map_frame.outline.path(displacement))
+    _draw_edge(axes, map_frame.boundary.path(displacement))
     colour_bar(axes, scale or ColourScale(style.GREY, 0.0, 1.0))
     return drawn
 
 
 def draw_shape(map_frame: MapFrame, motion: DisplacementFunction) -> Figure:
-    """Draw the specimen's outline deformed over the undeformed one; no colour bar."""
+    """Draw the specimen's boundary deformed over the undeformed one; no colour bar."""
     drawn, axes = _empty_map(map_frame)
-    style.draw_path(axes, map_frame.outline.path(), fill=False, ec=style.MUTED, lw=0.45, alpha=0.7,
+    style.draw_path(axes, map_frame.boundary.path(), fill=False, ec=style.MUTED, lw=0.45, alpha=0.7,
                     clip_on=False)  # fmt: skip
-    deformed = map_frame.outline.path(map_frame.moved_nodes(motion))
+    deformed = map_frame.boundary.path(map_frame.moved_nodes(motion))
     style.draw_path(axes, deformed, fc=style.BLUE, ec="none", alpha=0.28, clip_on=False)
     style.draw_path(axes, deformed, fill=False, ec=style.BLUE, lw=0.9, clip_on=False)
     return drawn
@@ -234,7 +234,7 @@ def _draw_cells(
 ) -> None:
     """Cells (rows, cols, 4) in their colours, cut out along the boundary, and the boundary."""
     moved = None if motion is None else map_frame.moved_nodes(motion)
-    edge = _draw_edge(axes, map_frame.outline.path(moved))
+    edge = _draw_edge(axes, map_frame.boundary.path(moved))
     if motion is None:
         picture = axes.imshow(colours, extent=map_frame.grid.extent, rasterized=True,
                               interpolation="nearest", aspect="auto")  # fmt: skip

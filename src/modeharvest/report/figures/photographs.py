@@ -28,10 +28,10 @@ from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.report.figures import fits, maps, style
+from modeharvest.report.figures.boundaries import MeshBoundary, block_means, mask_boundary
 from modeharvest.report.figures.curves import draw_density
 from modeharvest.report.figures.fits import UM
 from modeharvest.report.figures.maps import ColourScale
-from modeharvest.report.figures.outlines import MeshBoundary, block_means, mask_boundary
 from modeharvest.report.figures.style import BLUE, GOLD, GREEN, GREY, INK, RED
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
@@ -62,7 +62,7 @@ def shown_frames(harvest: Harvest) -> tuple[HarvestedFrame, ...]:
     return tuple(frames[k] for k in sorted(chosen))
 
 
-def material_outline(harvest: Harvest) -> MeshBoundary:
+def material_boundary(harvest: Harvest) -> MeshBoundary:
     """Of the material in the reference; of the whole image if no material was found."""
     found = mask_boundary(harvest.mask, harvest.grid, _SPECK * harvest.pitch**2)
     everything = np.ones_like(harvest.mask)
@@ -95,7 +95,7 @@ class PhotographState(fits.FittedState):
 def photograph_states(harvest: Harvest, labels: Mapping[str, str]) -> list[PhotographState]:
     """The photographs that are shown, with their labels by name."""
     shown = shown_frames(harvest)
-    view = fits.SpecimenView(material_outline(harvest), harvest.grid, harvest.mask, harvest.pitch)
+    view = fits.SpecimenView(material_boundary(harvest), harvest.grid, harvest.mask, harvest.pitch)
     levels = drawn_levels(harvest)
     pairs = [(frame.spectrum, frame.pattern or _NO_PATTERN) for frame in shown]
     end = fits.largest_density((spectrum, pattern) for spectrum, pattern in pairs if spectrum)
@@ -124,26 +124,26 @@ def draw_hero(state: PhotographState) -> Figure:
         map_frame, grey_levels(state.frame.image, state.levels), None, state.view.grid, length,
         ColourScale(style.GLOW, 0.0, end.high, "µm"), state.motion,
     )  # fmt: skip
-    # The photograph ends where the measured outline does: a mask of it may have ragged edges.
+    # The photograph ends where the measured boundary does: a mask of it may have ragged edges.
     axes = drawn.axes[0]
     axes.images[0].set_clip_path(axes.patches[0])
     return drawn
 
 
 def draw_deformed(state: PhotographState) -> Figure:
-    """Draw a deformed photograph, and over it the reference's outline moved as measured."""
+    """Draw a deformed photograph, and over it the reference's boundary moved as measured."""
     map_frame = state.view.map_frame()
     moved = map_frame.moved_nodes(state.motion)
     image = grey_levels(state.frame.image, state.levels)
     scale = ColourScale(GREY, *state.levels, "levels")
     drawn = maps.draw_image(map_frame, image, None, state.view.grid, moved, scale)
-    style.draw_path(drawn.axes[0], map_frame.outline.path(moved), fill=False, ec=GOLD, lw=0.7,
+    style.draw_path(drawn.axes[0], map_frame.boundary.path(moved), fill=False, ec=GOLD, lw=0.7,
                     rasterized=True, zorder=2)  # fmt: skip
     return drawn
 
 
 def draw_closeup(state: PhotographState) -> Figure:
-    """Draw some cells of a deformed photograph, pixel by pixel, with the outline as measured."""
+    """Draw some cells of a deformed photograph, pixel by pixel, with the boundary as measured."""
     grid, middle = state.view.grid, np.array(state.harvest.cellular.centre)
     x, y = middle + state.motion(*middle[:, None, None])[0, 0]
     half = 0.5 * CLOSE * state.view.pitch
@@ -158,7 +158,7 @@ def draw_closeup(state: PhotographState) -> Figure:
     axes = drawn.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     _show(axes, part, PixelGrid(len(part), part.shape[1], grid.pixel_size, x0, y0).extent)
-    path = state.view.outline.path(state.view.map_frame().moved_nodes(state.motion))
+    path = state.view.boundary.path(state.view.map_frame().moved_nodes(state.motion))
     style.draw_path(axes, path, fill=False, ec=GOLD, lw=1.1, rasterized=True)
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return drawn
@@ -274,7 +274,7 @@ _CELLS, _ARROWS = 120, 17  # of a distortion's map, along the longer side
 _LENGTH = 0.9  # of the longest arrow, distances between arrows
 
 
-def draw_reference(harvest: Harvest, outline: MeshBoundary, levels: tuple[float, float]) -> Figure:
+def draw_reference(harvest: Harvest, boundary: MeshBoundary, levels: tuple[float, float]) -> Figure:
     """Draw the reference and all that was found in it, for a look whether that is right."""
     size = np.array([harvest.grid.cols, harvest.grid.rows])
     drawn, axes = maps.bare_axes(WIDE, size, 0.996, 0.02, _LEGEND, 0.002)
@@ -282,7 +282,7 @@ def draw_reference(harvest: Harvest, outline: MeshBoundary, levels: tuple[float,
     joined = block_means(grey_levels(harvest.reference, levels), factor)
     _show(axes, joined, harvest.grid.binned(factor).extent)
     axes.set(xlim=harvest.grid.extent[:2], ylim=harvest.grid.extent[2:])
-    style.draw_path(axes, outline.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
+    style.draw_path(axes, boundary.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
     shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
     if harvest.lattice is not None:
         shown += _draw_lattice(axes, harvest.lattice, harvest.grid)

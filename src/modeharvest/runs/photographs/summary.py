@@ -136,8 +136,8 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "residual_of_full_scale": _share(result.residual_rms, harvest.full_scale),
         "residual_correlation": frame.residual_test.correlation,
         "chi_square": frame.residual_test.chi_square,
-        "residual_test": frame.residual_test.sentence,
-        "weighting": result.weighting.sentence,
+        "residual_test": frame.residual_test.text,
+        "weighting": result.weighting.text,
         **picked(identified, "model_error_px condition_number undetermined"),
         "errors_px": {
             "noise": rms_errors(frame, frame.by_noise, harvest.cellular),

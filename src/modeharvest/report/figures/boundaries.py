@@ -29,7 +29,7 @@ class MeshBoundary:
 
     @classmethod
     def of(cls, mesh: Mesh) -> MeshBoundary:
-        """Find the outline of a mesh."""
+        """Find the boundary of a mesh."""
         edges = boundary_sides(mesh)
         following = {int(a): k for k, a in enumerate(edges[:, 0])}
         loops, visited = [], np.zeros(len(edges), dtype=bool)
@@ -44,7 +44,7 @@ class MeshBoundary:
         return cls(mesh.nodes, tuple(loops))
 
     def path(self, displacement: FloatArray | None = None) -> Path:
-        """The outline, displaced by (n, 2) at the mesh's nodes [mm]; holes stay open when filled.
+        """The boundary, displaced by (n, 2) at the mesh's nodes [mm]; holes stay open when filled.
 
         A quadratic edge is a parabola, which a Bezier curve of second order draws exactly.
         """
@@ -66,7 +66,7 @@ class MeshBoundary:
 
 
 CELLS = 900
-"""Along the mask's longer side, at most about that many cells; an outline needs no more."""
+"""Along the mask's longer side, at most about that many cells; a boundary needs no more."""
 _TOLERANCE = 0.3  # cells that corners may be off, once straight runs have become one edge
 
 
@@ -117,7 +117,7 @@ class LatticePatch:
 
     mesh: Mesh
     """Of all copies together, undeformed [mm]."""
-    outline: MeshBoundary
+    boundary: MeshBoundary
     """Holes and the ragged outer edge, which the window cuts off."""
     lattice: FloatArray
     """(2, 2) lattice vectors of the cell as rows [mm]."""
