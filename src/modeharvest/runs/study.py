@@ -180,7 +180,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
             "command": self.command,
             "seeds": self.case.study.seeds,
             "question": self.case.study.question,
-            "text": list(findings.sentences),
+            "text": list(findings.text),
             "numbers": to_plain(findings.numbers),
             "cases": len(table),
             "failed": [
