@@ -32,7 +32,6 @@ from modeharvest.idic.solver.residual_test import (
     lags_for,
 )
 from modeharvest.idic.solver.weighting import (
-    LEAST_BLUR_PX,
     Gradient,
     Propagation,
     Weighting,
@@ -411,18 +410,16 @@ def _weighting(result: Result, size_px: float, options: CorrelationOptions) -> W
     it is aliased, in the residual and in the deformed image's gradient alike.
     """
     is_noise, is_aliased = result.residual_test().is_white, size_px < _FINEST_PX
-    gradient, blur_px = options.gradient, options.gradient_blur_px
+    gradient, blur_px, low_pass = options.gradient, options.gradient_blur_px, 0
     if gradient is None:
         gradient = "reference" if is_noise or is_aliased else "deformed"
     if blur_px is None:
         blur_px = best_blur(result.noise_to_slope, size_px, result.order) if is_noise else 0.0
-        if is_aliased:
-            blur_px = max(blur_px, LEAST_BLUR_PX if is_noise else _ALIASED_BLUR_PX)
-    return Weighting(Gradient(gradient), blur_px, size_px)
+        low_pass = _LOW_PASS if is_aliased and not blur_px else 0
+    return Weighting(Gradient(gradient), blur_px, size_px, low_pass)
 
 
 _FINEST_PX = 4.0
-"""Finer speckle is aliased by the pixels; a blur keeps that out of what weighs the residual."""
-_ALIASED_BLUR_PX = 0.75
-"""Where aliasing stands out of the noise: as little as keeps the bias at 0.2 of a standard error in
-benchmarks/small_motion.py, whose last rows have less."""
+"""Finer speckle is aliased by the pixels; a filter keeps that out of what weighs the residual."""
+_LOW_PASS = 3
+"""benchmarks/small_motion.py: of a higher order it leaves more bias, of a lower more scatter."""

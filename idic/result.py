@@ -188,10 +188,11 @@ class Result:
         if self.weight_square <= 0.0:
             return 0.0
         weighting = self.weighting
+        slope = slope_noise(self.order, weighting.blur_px, weighting.low_pass)
         if weighting.gradient is Gradient.REFERENCE:
-            made = noise.reference**2 * slope_noise(self.order, weighting.blur_px)
-        elif weighting.blur_px > 0.0:
-            made = noise.deformed**2 * slope_noise(self.order, weighting.blur_px)
+            made = noise.reference**2 * slope
+        elif not weighting.is_least_squares:
+            made = noise.deformed**2 * slope
         else:
             made = noise.deformed**2 * self.noise_transfer.slope
         return min(made / self.weight_square, _MOST_NOISE)
@@ -311,7 +312,9 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
         "history": tuple(Iteration(**step) for step in steps),
         "residual_lags_px": tuple(content["residual_lags_px"]),
         "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
-        "weighting": Weighting(Gradient(weighting["gradient"]), weighting["blur_px"], size_px),
+        "weighting": Weighting(
+            Gradient(weighting["gradient"]), weighting["blur_px"], size_px, weighting["low_pass"]
+        ),
         "final_smoothing": smoothing
         and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),
     }

@@ -106,9 +106,9 @@ def sides(drawn: Figure) -> dict[str, NDArray[np.float64]]:
 
 
 def test_a_field_is_drawn_the_right_way_up() -> None:
-    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
-    up = np.repeat(np.sign(sheet.grid.y)[:, None], sheet.grid.cols, axis=1)
-    colour = sides(draw_field(sheet, up, ColourScale.signed(up, "µm")))
+    frame = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
+    up = np.repeat(np.sign(frame.grid.y)[:, None], frame.grid.cols, axis=1)
+    colour = sides(draw_field(frame, up, ColourScale.signed(up, "µm")))
     for side in ("left", "right"):
         red, blue = colour[f"upper {side}"], colour[f"lower {side}"]
         assert red[0] > red[2] + 40
@@ -116,26 +116,26 @@ def test_a_field_is_drawn_the_right_way_up() -> None:
 
 
 def test_a_field_is_drawn_where_the_motion_takes_it() -> None:
-    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
-    X, Y = sheet.moved_corners(None)
-    moved_X, moved_Y = sheet.moved_corners(
+    frame = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID)
+    X, Y = frame.moved_corners(None)
+    moved_X, moved_Y = frame.moved_corners(
         lambda x, y: np.stack(np.broadcast_arrays(0.3 + 0 * x * y, 2 * y + 0 * x), axis=-1)
     )
     np.testing.assert_allclose(moved_X, X + 0.3, atol=1e-12)
     np.testing.assert_allclose(moved_Y, 3 * Y, atol=1e-12)
     assert np.all(np.diff(Y[:, 0]) <= 0)  # rows run down the image
-    nodes = sheet.moved_nodes(lambda x, y: np.stack([x, -y], axis=-1))
-    np.testing.assert_array_equal(nodes, sheet.outline.nodes * [1, -1])
+    nodes = frame.moved_nodes(lambda x, y: np.stack([x, -y], axis=-1))
+    np.testing.assert_array_equal(nodes, frame.boundary.nodes * [1, -1])
 
 
 def test_averages_leave_missing_pixels_out() -> None:
-    sheet = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID, cells=26)
-    assert sheet.factor == 5
+    frame = MapFrame.of(MeshBoundary.of(made_up.plate()), made_up.GRID, cells=26)
+    assert frame.factor == 5
     field = np.full(made_up.GRID.shape, 2.0)
     field[::2] = np.nan
     field[:5, :5] = np.nan
-    coarse = sheet.average(field)
-    assert coarse.shape == sheet.grid.shape == sheet.sample(field).shape
+    coarse = frame.average(field)
+    assert coarse.shape == frame.grid.shape == frame.sample(field).shape
     assert np.isnan(coarse[0, 0])
     np.testing.assert_array_equal(coarse.ravel()[1:], 2.0)
 

@@ -447,7 +447,7 @@ def test_failures_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     case = StudyCase(study=RobustnessStudy(initial_guesses=2, radii=(), strain_errors=()))
     case = StudyCase(study=case.study, imaging=replace(case.imaging, pixel_size=0.05))
     pipeline = StudyAnalysis(case, tmp_path, solution=PAPER)
-    cases = case.study.prepare(pipeline.subject(), tmp_path)
+    cases = case.study.prepare(pipeline.pair_spec(), tmp_path)
     plan = Campaign(case.study.function, cases, tmp_path)
     result = starts_table([1e-9]).iloc[0].drop(list(cases[0]), errors="ignore").to_dict()
     traceback = "Traceback …\nMemoryError: too large"

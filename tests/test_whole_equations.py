@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
 from modeharvest.idic.finite_element.pixels import continued, images_on, normal_equations, pixels_of
-from modeharvest.idic.finite_element.system import Body, inner_sides, smoothness_matrix
+from modeharvest.idic.finite_element.system import Body, interior_sides, smoothness_matrix
 from modeharvest.idic.solver.pyramid import FULL
 
 
@@ -48,7 +48,7 @@ def test_smoothness_of_a_quadratic_is_its_second_gradients(mesh: Mesh) -> None:
 
 
 def test_every_side_inside_has_two_cells(mesh: Mesh) -> None:
-    sides = inner_sides(mesh.cells)
+    sides = interior_sides(mesh.cells)
     for cell, k, other, m in sides:
         ends = mesh.cells[cell, [k, (k + 1) % 3]], mesh.cells[other, [m, (m + 1) % 3]]
         assert set(ends[0]) == set(ends[1])

@@ -36,6 +36,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from modeharvest.idic.solver.assembly import Assembly, NormalEquations, push_forward, warped_back
 from modeharvest.idic.solver.gauss_newton import (
@@ -78,18 +79,21 @@ class Weighting:
     """Standard deviation of a blur of the image whose gradient it is [px]; 0 for none."""
     speckle_size_px: float = np.inf
     """Full width at half maximum of the speckle's autocorrelation [px]; infinite if not known."""
+    low_pass: int = 0
+    """Order p of a filter of that image's rows and columns, 1 - sin^2p(pi k) at the frequency k
+    [cycles/px], that leaves nothing at the Nyquist limit, where aliasing is; 0 for none."""
 
     def __post_init__(self) -> None:
-        if not (self.blur_px >= 0 and self.speckle_size_px > 0):
+        if not (self.blur_px >= 0 and self.speckle_size_px > 0 and self.low_pass >= 0):
             raise InputError(
-                "expected a blur of at least 0 px and a speckle wider than 0 px, got "
-                f"{self.blur_px} and {self.speckle_size_px}"
+                "expected a blur of at least 0 px, a speckle wider than 0 px and a filter of order "
+                f"0 or more, got {self.blur_px}, {self.speckle_size_px} and {self.low_pass}"
             )
 
     @property
     def is_least_squares(self) -> bool:
         """Whether h'r = 0 is the minimum of the residual's sum of squares."""
-        return self.gradient is Gradient.DEFORMED and self.blur_px == 0.0
+        return self.gradient is Gradient.DEFORMED and not (self.blur_px or self.low_pass)
 
     def excess(self, noise: float, order: int = 5) -> float:
         """Relative excess of the unknowns' variance over the Cramer-Rao bound [-].
@@ -113,6 +117,11 @@ class Weighting:
             Gradient.DEFORMED: "the deformed image's gradient",
             Gradient.REFERENCE: "the reference's gradient",
         }[self.gradient]
+        if self.low_pass:
+            return (
+                f"The residual was weighed with {whose} after a low-pass filter, which takes away "
+                "what the pixels are too coarse for."
+            )
         if self.blur_px == 0.0:
             return f"The residual was weighed with {whose}."
         return (
@@ -160,16 +169,33 @@ def instrument(
     # As in the pyramid: what is beyond the material is only left out if both masks are known.
     f_mask = None if pair.deformed_mask is None else pair.mask
     if weighting.gradient is Gradient.DEFORMED:
-        g = smoothed(pair.deformed, pair.deformed_mask, weighting.blur_px)
+        g = _filtered(weighting, pair.deformed, pair.deformed_mask)
         made = warped_back(used, a, level.reference, SplineImage.of(g, order))
     else:
-        f = smoothed(pair.reference, f_mask, weighting.blur_px)
+        f = _filtered(weighting, pair.reference, f_mask)
         rest = np.zeros_like(a)
         made = warped_back(used, rest, level.reference, SplineImage.of(f, order))
         push_forward(used, a, made)
     if used.ansatz.brightness.gain_degree is not None:
         made[2] = _neighbours(pair.reference, f_mask, max(weighting.blur_px, _NEIGHBOURS_PX))
     return made
+
+
+def _filtered(
+    weighting: Weighting, image: NDArray[Any], mask: NDArray[np.bool_] | None
+) -> NDArray[Any]:
+    """An image over its material, True in the mask, without what its gradient is not to have."""
+    if not weighting.low_pass:
+        return smoothed(image, mask, weighting.blur_px)
+    passed = np.asarray(image, np.float32)
+    if mask is not None:
+        passed = np.where(mask, passed, smoothed(image, mask, _NEIGHBOURS_PX))
+    high: FloatArray = np.ones(1)
+    for _ in range(weighting.low_pass):
+        high = np.convolve(high, (-0.25, 0.5, -0.25)).astype(np.float64)
+    for axis in (0, 1):
+        passed = passed - ndimage.convolve1d(passed, high, axis, mode="mirror")
+    return passed
 
 
 def _neighbours(

@@ -166,10 +166,8 @@ def mode_family(
         family = free_family(rows, f"{count}, free")
     phi = wave_values(rule, family.waves(family.start), pitch)
     amplitude, captured = best_amplitude(rule, u, phi)
-    sentences = describe(selection, waves, ties if shared else [], family, captured)
-    return FoundFamily(
-        family, pitch, amplitude, captured, selection.growth, sentences, dict(info or {})
-    )
+    text = describe(selection, waves, ties if shared else [], family, captured)
+    return FoundFamily(family, pitch, amplitude, captured, selection.growth, text, dict(info or {}))
 
 
 def as_square(waves: FloatArray, pitch: float) -> ModeFamily | None:
@@ -257,7 +255,7 @@ def read_family(path: Path | str) -> FoundFamily:
             float(content["amplitude"]),
             float(content["captured"]),
             tuple((int(count), float(share)) for count, share in content["growth"]),
-            tuple(str(sentence) for sentence in content["text"]),
+            tuple(str(line) for line in content["text"]),
             dict(content["info"]),
         )
 

@@ -269,7 +269,7 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
     """What was found in the reference, and the photographs that were not used."""
     lattice, px = summary["lattice"], summary["pixel_size_mm"]
     rows: list[tuple[str, Cell]] = []
-    sentences: list[str] = []
+    text: list[str] = []
     if lattice:
         holes = f"{lattice['holes']}; {lattice['missing']}; {lattice['extra']}"
         pitch, diameter = lattice["pitch_px"], lattice["diameter_px"]
@@ -280,7 +280,7 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
             ("mean diameter d", f"{number(diameter * px)} mm, d/l {diameter / pitch:.3f}"),
             ("holes off the straight lattice, rms", f"{lattice['misfit_px']:.2f} px"),
         ]
-        sentences = list(lattice["text"])
+        text = list(lattice["text"])
     rows += [
         ("cell size as given", f"{number(summary['cell_size_mm'])} mm"),
         ("pixel size", f"{number(1000 * px)} µm"),
@@ -290,7 +290,7 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
     figure = ReportFigure("reference", "The reference", drawn, wide=True)
     table = ReportTable("Reference", ("", ""), rows)
     title = "Material, holes, lattice and the part with holes"
-    cards = [Card(title, [figure], [table], [*sentences, *summary["text"]], wide=True)]
+    cards = [Card(title, [figure], [table], [*text, *summary["text"]], wide=True)]
     skipped = [(row["name"], row["reason"]) for row in summary["skipped"]]
     table = ReportTable("Photographs not used", ("photograph", "reason"), skipped, "skipped")
     cards += Card.tabular(table, wide=True)
