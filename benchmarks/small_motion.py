@@ -98,7 +98,7 @@ ROWS = (
     *(Row(in_f, 0.01, options=BLURRED) for in_f in (0.01, 0.0)),
     *(
         Row(0.002, 0.002, 3.0, options={"gradient": "reference", "gradient_blur_px": blur})
-        for blur in (0.6, 0.7)
+        for blur in (0.6, 0.75)
     ),
 )
 

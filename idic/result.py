@@ -313,7 +313,10 @@ def result_fields(content: Mapping[str, Any]) -> dict[str, Any]:
         "residual_lags_px": tuple(content["residual_lags_px"]),
         "noise_transfer": NoiseTransfer(**content["noise_transfer"]),
         "weighting": Weighting(
-            Gradient(weighting["gradient"]), weighting["blur_px"], size_px, weighting["low_pass"]
+            Gradient(weighting["gradient"]),
+            weighting["blur_px"],
+            size_px,
+            weighting.get("low_pass", 0),  # not there in older files
         ),
         "final_smoothing": smoothing
         and FinalSmoothing(**{k: _or(np.nan, v) for k, v in smoothing.items()}),
