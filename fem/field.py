@@ -238,19 +238,31 @@ def read_meshio(path: Path | str, displacement: str, nominal_strain: float) -> S
     read, has no such cells or several types of them, or no such field.
     """
     source = read_any_mesh(path)
-    types = sorted({block.type for block in source.cells})
-    found = [e for e, name in _MESHIO_NAME.items() if name in types]
-    if len(found) != 1:
-        known = list(_MESHIO_NAME.values())
-        raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
+    mesh = _plane_mesh(source, path)
     if displacement not in source.point_data:
         names = list(source.point_data)
         raise InputError(f"expected a nodal field {displacement!r} in {path}, got {names}")
     u = np.asarray(source.point_data[displacement], dtype=np.float64)
     if u.ndim != 2 or u.shape[1] not in (2, 3):
         raise InputError(f"expected {displacement!r} of 2 or 3 components in {path}, got {u.shape}")
-    name = _MESHIO_NAME[found[0]]
-    cells = np.vstack([block.data for block in source.cells if block.type == name])
-    mesh = Mesh(source.points[:, :2], cells, found[0])
     snapshot = Snapshot(nominal_strain, np.ascontiguousarray(u[:, :2]))
     return Solution(mesh, (snapshot,), {"source": str(path)})
+
+
+def read_plane_mesh(path: Path | str) -> Mesh:
+    """The T3, T6, Q4, Q8 or Q9 mesh in the x-y plane of any file that meshio reads.
+
+    InputError if the file can't be read, or has no such cells or several types of them.
+    """
+    return _plane_mesh(read_any_mesh(path), path)
+
+
+def _plane_mesh(source: meshio.Mesh, path: Path | str) -> Mesh:
+    types = sorted({block.type for block in source.cells})
+    found = [e for e, name in _MESHIO_NAME.items() if name in types]
+    if len(found) != 1:
+        known = list(_MESHIO_NAME.values())
+        raise InputError(f"expected one type of cells among {known} in {path}, got {types}")
+    name = _MESHIO_NAME[found[0]]
+    cells = np.vstack([block.data for block in source.cells if block.type == name])
+    return Mesh(source.points[:, :2], cells, found[0])

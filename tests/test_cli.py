@@ -17,6 +17,7 @@ COMMANDS = (
     ("bloch",),
     ("modes",),
     ("harvest",),
+    ("measure",),
     ("study",),
     ("fem",),
     ("image",),

@@ -1,4 +1,4 @@
-"""Files of a displacement measured at nodes: HDF5 to read back, VTU for ParaView.
+"""Files of a displacement measured at nodes: HDF5 to read back, VTU, CSV, maps of the pixels.
 
 The HDF5 file can be read with h5py alone::
 
@@ -11,6 +11,7 @@ Lengths are in mm, or in px where the size of a pixel isn't known; ``unit`` says
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from modeharvest.fem.field import COMPRESSED, read_mesh, write_mesh
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.imaging.photographs.files import write_image
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
@@ -29,6 +31,9 @@ _TYPES = get_type_hints(NodalResult)
 _ARRAYS = [name for name, kind in _TYPES.items() if kind == FloatArray]
 _PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh", "timings_s")]
 """Two measurements leave the same bytes, so their seconds are kept elsewhere."""
+_TENSORS = {"F": "xx xy yx yy", "green_lagrange": "xx yy xy", "logarithmic": "xx yy xy"}
+_VECTORS = {"displacement": ("u", "v up"), "standard_deviation": ("sd_u", "sd_v")}
+"""What components of fields are called in tables."""
 
 
 def write_result(path: Path | str, result: NodalResult, unit: str = "mm") -> None:
@@ -60,8 +65,7 @@ def read_result(path: Path | str) -> NodalResult:
                     f"{values.shape} with {int((~np.isfinite(values)).sum())} that are not"
                 )
         plain: dict[str, Any] = {name: made(_TYPES[name], info[name]) for name in _PLAIN}
-        plain |= arrays
-        return NodalResult(mesh=mesh, **plain)
+        return NodalResult(mesh=mesh, **plain | arrays)
 
 
 def nodal_fields(result: NodalResult) -> dict[str, FloatArray]:
@@ -92,9 +96,65 @@ def write_vtu(path: Path | str, result: NodalResult, unit: str = "mm") -> None:
     for name, values in nodal_fields(result).items():
         padded = np.zeros((len(values), *(3,) * (values.ndim - 1)))
         padded[tuple(slice(size) for size in values.shape)] = values
-        label = f"{name}_{unit}" if name in ("displacement", "standard_deviation") else name
+        label = f"{name}_{unit}" if name in _VECTORS else name
         fields[label] = padded.reshape(len(values), *(padded[0].size,) * (values.ndim > 1))
     nodes = np.pad(result.mesh.nodes, ((0, 0), (0, 1)))
     mesh = meshio.Mesh(nodes, [("triangle6", result.mesh.cells)], point_data=fields)
     with atomic(path) as temporary:
         mesh.write(temporary, file_format="vtu")
+
+
+def columns_at(
+    result: NodalResult, points: FloatArray | None = None, unit: str = "mm"
+) -> dict[str, FloatArray]:
+    """Columns (k,) of a table at points (k, 2) [mm], or at the nodes; NaN beside the mesh."""
+    columns: dict[str, FloatArray] = {}
+    for name, values in nodal_fields(result).items():
+        for label, nodal in _components(name, values, unit).items():
+            if points is None:
+                columns[label] = nodal
+            elif name == "standard_deviation":  # which stays positive so
+                columns[label] = np.exp(result.at(points, np.log(nodal)[:, None])[:, 0])
+            else:
+                columns[label] = result.at(points, nodal[:, None])[:, 0]
+    x, y = (result.mesh.nodes if points is None else np.asarray(points, dtype=np.float64)).T
+    row, col = result.grid.to_px(x, y)
+    return {f"x [{unit}]": x, f"y up [{unit}]": y, "row": row, "column": col, **columns}
+
+
+def _components(name: str, values: FloatArray, unit: str) -> Mapping[str, FloatArray]:
+    """The components (n,) of a nodal field, by what they are called in tables."""
+    if name in _VECTORS:
+        labels = [f"{label} [{unit}]" for label in _VECTORS[name]]
+        return dict(zip(labels, values.T, strict=True))
+    if name in _TENSORS:
+        return {
+            f"{name}_{part}": values[:, "xy".index(part[0]), "xy".index(part[1])]
+            for part in _TENSORS[name].split()
+        }
+    if values.ndim == 2:
+        return {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xy")}
+    return {name: values}
+
+
+def write_csv(
+    path: Path | str, result: NodalResult, points: FloatArray | None = None, unit: str = "mm"
+) -> None:
+    """Write all fields at points (k, 2) [mm], or at the nodes, as CSV, atomically."""
+    columns = columns_at(result, points, unit)
+    table = np.column_stack(list(columns.values()))
+    with atomic(path) as temporary:
+        np.savetxt(temporary, table, "%.9g", ",", header=",".join(columns), comments="")
+
+
+def write_maps(stem: Path, result: NodalResult, unit: str = "mm") -> tuple[Path, ...]:
+    """Write u, v and their standard deviations at the pixels as float32 TIFF, NaN off the material.
+
+    Files are called ``stem`` and what they hold: "stem_u_mm.tif".
+    """
+    u, sd = result.displacement_on(), result.standard_deviation_on()
+    maps = {"u": u[..., 0], "v": u[..., 1], "sd_u": sd[..., 0], "sd_v": sd[..., 1]}
+    paths = tuple(stem.with_name(f"{stem.name}_{name}_{unit}.tif") for name in maps)
+    for path, values in zip(paths, maps.values(), strict=True):
+        write_image(path, values)
+    return paths

@@ -202,6 +202,7 @@ def match_blocks(
     mask: ArrayLike | None = None,
     expected: Expected | None = None,
     reach_px: int = REACH_PX,
+    count: int = BLOCKS,
 ) -> BlockMatch:
     """Look for blocks of the reference in the deformed image, (rows, cols) both.
 
@@ -213,6 +214,8 @@ def match_blocks(
         Where positions should have moved to, as ``HoleMotion.at`` gives it; nowhere by default.
     reach_px
         How far from there a block is searched for, along rows and columns [px].
+    count
+        About how many blocks an image would hold.
 
     Raises
     ------
@@ -223,7 +226,7 @@ def match_blocks(
     if f.ndim != 2 or f.shape != g.shape:
         raise InputError(f"expected two images of one size, got {f.shape} and {g.shape}")
     material = np.ones(f.shape, dtype=np.bool_) if mask is None else np.asarray(mask, np.bool_)
-    centres, half = _blocks(material)
+    centres, half = _blocks(material, count)
     aims = centres if expected is None else np.rint(expected(centres.astype(np.float64)))
     inside = ((aims >= half) & (aims < np.array(f.shape) - half)).all(axis=1)
     centres, aims = centres[inside], aims[inside].astype(np.int64)
@@ -254,11 +257,11 @@ def require_same_surface(match: BlockMatch, reference: str, deformed: str) -> No
         )
 
 
-def _blocks(material: BoolArray) -> tuple[NDArray[np.int64], int]:
+def _blocks(material: BoolArray, count: int) -> tuple[NDArray[np.int64], int]:
     """(centres (n, 2), half an edge) of blocks on material, spread over the image."""
     padded = np.pad(material, 1)  # the image's border counts as an edge
     room = np.asarray(distance_transform_cdt(padded, "chessboard"))[1:-1, 1:-1]
-    cell = max(8, int(np.sqrt(material.size / BLOCKS)))
+    cell = max(8, int(np.sqrt(material.size / count)))
     rows, cols = (n // cell for n in material.shape)
     tiles = room[: rows * cell, : cols * cell].reshape(rows, cell, cols, cell).swapaxes(1, 2)
     flat = tiles.reshape(rows, cols, -1)

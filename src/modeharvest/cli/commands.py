@@ -211,6 +211,53 @@ def harvest(
     print_report(photographs_report(summary), out)
 
 
+def measure(
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Undeformed image.")],
+    deformed: Annotated[
+        list[str],
+        typer.Argument(metavar="DEFORMED...", help="Deformed images in the order of the test."),
+    ],
+    out: Annotated[Path, folder_option("--out", "Folder for everything the measurement leaves.")],
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="Image that is black off the reference's material; without, the speckle is found.",
+            metavar="FILE",
+        ),
+    ] = None,
+    pixel_size: Annotated[
+        float | None, typer.Option(help="Edge of a pixel [mm]; without, lengths are in px.")
+    ] = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(
+            help="Mesh of triangles that meshio reads, in the same unit, from the middle of the "
+            "image, x right, y up; without, one is made from the mask.",
+            metavar="FILE",
+        ),
+    ] = None,
+) -> None:
+    """Measure the whole displacement of any speckled surface, up to the edges of its material.
+
+    TIFF, PNG or JPEG of one size; no pattern of holes is needed. Leaves for each image
+    displacement, standard deviations and strains (HDF5, VTU, CSV, TIFF maps), report.html and
+    summary.json in DIR. In a sequence each image starts from the one before. Run the same command
+    again after an interruption: finished images are not measured again.
+
+    For example: modeharvest measure ref.tif def_*.tif --mask mask.png --out out/plate
+    """
+    from modeharvest.report.measure import measure_report
+    from modeharvest.report.model import print_report
+    from modeharvest.runs.measure import measure as measure_images
+
+    with bars() as progress:
+        summary = measure_images(
+            reference, deformed, out, mask=mask, pixel_size=pixel_size, mesh=mesh,
+            progress=progress,
+        )  # fmt: skip
+    print_report(measure_report(summary), out)
+
+
 def study(
     name: Annotated[
         str,

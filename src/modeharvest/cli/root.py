@@ -47,7 +47,7 @@ _FAMILIES: dict[str, tuple[Callable[..., None], ...]] = {
         commands.run, commands.fem, commands.image, commands.correlate, commands.validate,
     ),
     "An infinite lattice": (commands.bloch, commands.modes),
-    "Photographs of a test": (commands.harvest,),
+    "Photographs of a test": (commands.harvest, commands.measure),
     "How good a measurement is": (commands.study, benchmark.score),
     "To begin with": (commands.cases,),
 }  # fmt: skip

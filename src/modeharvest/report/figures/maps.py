@@ -161,12 +161,13 @@ def draw_field(
     values: FloatArray,
     scale: ColourScale,
     motion: DisplacementFunction | None = None,
+    unit: str = "mm",
 ) -> Figure:
     """Draw a field of the reference configuration, where it is or where ``motion`` takes it.
 
-    ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank.
+    ``values``: (rows, cols) on ``map_frame.grid``; NaN is left blank. ``unit``: of lengths.
     """
-    drawn, axes = _empty_map(map_frame)
+    drawn, axes = _empty_map(map_frame, unit=unit)
     _draw_cells(axes, map_frame, scale.of(values), motion)
     colour_bar(axes, scale)
     return drawn
@@ -255,14 +256,14 @@ def shaded(
                           cmap=scale.colours, norm=scale.normalise)  # fmt: skip
 
 
-def _empty_map(map_frame: MapFrame, width: float = WIDTH) -> tuple[Figure, Axes]:
+def _empty_map(map_frame: MapFrame, width: float = WIDTH, unit: str = "mm") -> tuple[Figure, Axes]:
     """An empty map with a scale bar."""
     left, right, bottom, top = map_frame.limits
     size = np.array([right - left, top - bottom])
     drawn, axes = bare_axes(width, size, _MAP, _BELOW, _ABOVE)
     axes.set(xlim=(left, right), ylim=(bottom, top))
     length = _round_down(0.35 * size[0])
-    style.scale_bar(axes, length, f"{length:g} mm")
+    style.scale_bar(axes, length, f"{length:g} {unit}")
     return drawn, axes
 
 

@@ -1,0 +1,212 @@
+"""The whole displacement of one photograph: its start, its brightness, its mask, its measurement.
+
+Nothing is typed in: blocks of the speckle give the motion to a pixel, and with the mask of the
+reference a first measurement gives that of the deformed image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.local.field import LocalField
+from modeharvest.idic.local.motion import first_motion
+from modeharvest.idic.photograph.matching import (
+    BLOCKS,
+    REACH_PX,
+    BlockMatch,
+    match_blocks,
+    require_same_surface,
+)
+from modeharvest.idic.photograph.material import shrunk
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.progress import Progress, silent
+
+_FAR_PX = 4 * REACH_PX
+"""How far blocks are looked for where they aren't near."""
+_ENOUGH = 0.9
+"""Share of blocks that are near, unless some have gone far."""
+_CLOSE_PX = 4.0
+"""What a polynomial may leave of nine tenths of the blocks' motion."""
+_DENSER = 5
+"""Times as many blocks where it leaves more."""
+_STRAY = 8.0
+"""Times the spread of its neighbours' motion that a block may be off their median."""
+_FIRST = FiniteElementOptions(cutoff_px=40.0, edge_px=4)
+"""Of the measurement that only the deformed image's mask is taken from."""
+_LAST = FiniteElementOptions(edge_px=1)
+"""A camera's pixel on an edge shows some background; one such row lets the edge drift off."""
+_OFF_PX = 4.0, 1.0
+"""By how much edges may be off where blocks of speckle, and a first measurement, say they are."""
+
+
+def photographed_displacement(
+    pair: ImagePair,
+    mesh: Mesh,
+    before: NodalResult | None = None,
+    names: tuple[str, str] = ("the reference", "the deformed image"),
+    progress: Progress = silent,
+) -> NodalResult:
+    """Measure the displacement of a photograph on a mesh, from the images alone.
+
+    Parameters
+    ----------
+    pair
+        Reference and deformed image, the mask of the reference. Their brightness may differ.
+    mesh
+        Of the material, T6.
+    before
+        What was found in the image before, on the same mesh.
+    names
+        Of the two images, for messages.
+
+    Raises
+    ------
+    InputError
+        If the images don't show the same surface, or don't overlap; and as for
+        :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
+    """
+    start = block_motion(pair, mesh, before, names)
+    pair = _alike(pair, mesh, start)
+    begin = partial(_known, start)
+    if pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None:
+        inner = replace(pair, deformed_mask=deformed_mask(pair.grid, mesh, start, _OFF_PX[0]))
+        first = measure_displacement(inner, begin, mesh, options=_FIRST, progress=progress)
+        mask = deformed_mask(pair.grid, mesh, first.displacement, _OFF_PX[1])
+        pair = replace(_alike(pair, mesh, first.displacement), deformed_mask=mask)
+    return measure_displacement(pair, begin, mesh, options=_LAST, progress=progress)
+
+
+def _known(values: FloatArray, points: FloatArray) -> FloatArray:
+    """Values that are known at the points that are asked for."""
+    assert values.shape == points.shape, "a T6 mesh keeps its nodes"
+    return values
+
+
+def block_motion(
+    pair: ImagePair, mesh: Mesh, before: NodalResult | None, names: tuple[str, str]
+) -> FloatArray:
+    """(n, 2) displacement of the nodes [mm] to some pixels: the last one, and what blocks moved.
+
+    A polynomial is fitted to what blocks of the speckle have moved since the image before; where
+    that isn't close to them, a spline through more of them takes its place. InputError if they
+    aren't found.
+    """
+    known = np.zeros_like(mesh.nodes) if before is None else before.displacement
+    match = _matched(pair, mesh, known, REACH_PX)
+    if match.share < _ENOUGH:
+        match = _matched(pair, mesh, known, _FAR_PX)
+    require_same_surface(match, *names)
+    added = _less(match.in_mm(pair.grid), mesh, known)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    slow, _ = first_motion(Box(low[0], high[0], low[1], high[1]), pair, added)
+    known = known + slow(mesh.nodes)
+    left = _less(match.in_mm(pair.grid), mesh, known)
+    if np.quantile(np.linalg.norm(left.u, axis=1), 0.9) < _CLOSE_PX * pair.grid.pixel_size:
+        return known
+    dense = _matched(pair, mesh, known, _FAR_PX, _DENSER * BLOCKS)
+    left = _less(dense.in_mm(pair.grid), mesh, known)
+    points, keep = np.column_stack([left.x, left.y]), _like_neighbours(left, pair.grid.pixel_size)
+    spline = RBFInterpolator(points[keep], left.u[keep], neighbors=30)
+    return np.asarray(known + spline(mesh.nodes))
+
+
+def _like_neighbours(blocks: LocalField, pixel_size: float) -> BoolArray:
+    """(n,) False for blocks that moved otherwise than their neighbours: found at a wrong place.
+
+    The normalised median test of J. Westerweel, F. Scarano, Exp. Fluids 39 (2005), doi
+    10.1007/s00348-005-0016-6.
+    """
+    points = np.column_stack([blocks.x, blocks.y])
+    around = blocks.u[cKDTree(points).query(points, k=9)[1][:, 1:]]
+    median = np.median(around, axis=1)
+    spread = np.median(np.linalg.norm(around - median[:, None], axis=-1), axis=1)
+    off = np.linalg.norm(blocks.u - median, axis=1)
+    return np.asarray(off < _STRAY * (spread + pixel_size))
+
+
+def _matched(
+    pair: ImagePair, mesh: Mesh, u: FloatArray, reach_px: int, count: int = BLOCKS
+) -> BlockMatch:
+    """Blocks, looked for around where displacements u (n, 2) of the nodes [mm] take them."""
+    tree = cKDTree(mesh.nodes)
+
+    def moved(points: FloatArray) -> FloatArray:
+        at = np.column_stack(pair.grid.to_mm(*points.T))
+        return np.column_stack(pair.grid.to_px(*(at + u[tree.query(at)[1]]).T))
+
+    return match_blocks(pair.reference, pair.deformed, pair.mask, moved, reach_px, count)
+
+
+def _less(blocks: LocalField, mesh: Mesh, u: FloatArray) -> LocalField:
+    """What blocks have moved beyond displacements u (n, 2) of the nodes [mm]."""
+    nearest = cKDTree(mesh.nodes).query(np.column_stack([blocks.x, blocks.y]))[1]
+    return replace(blocks, u=blocks.u - u[nearest])
+
+
+def deformed_mask(grid: PixelGrid, mesh: Mesh, u: FloatArray, less_px: float) -> BoolArray | None:
+    """(rows, cols) True where the deformed image shows a mesh, less a margin; None if nowhere.
+
+    ``u`` (n, 2): displacement of the nodes [mm]. None, too, if it folds an element.
+    """
+    try:
+        moved = locate(mesh.nodes + u, mesh.cells, mesh.element, grid).mask
+    except InputError:
+        return None
+    inner = shrunk(moved, less_px)
+    return inner if inner.any() else None
+
+
+def _alike(pair: ImagePair, mesh: Mesh, u: FloatArray) -> ImagePair:
+    """The pair, the deformed image's brightness and contrast turned to the reference's."""
+    at = locate(mesh.nodes, mesh.cells, mesh.element, pair.grid, nodal=u).values
+    gain, offset = brightness(pair, np.moveaxis(at, 0, -1))
+    return pair.with_images(pair.reference, gain * pair.deformed + offset)
+
+
+def brightness(pair: ImagePair, u: FloatArray) -> tuple[float, float]:
+    """Gain [-] and offset [grey levels] that give g(x + u) the mean and the contrast of f.
+
+    ``u`` (rows, cols, 2) [mm], NaN where it isn't known. Edges don't count.
+    """
+    inner = shrunk(pair.masks[0], _OFF_PX[0])
+    f, g = _compared(pair, u, inner if inner.any() else pair.masks[0])
+    there = np.isfinite(g)
+    if not there.any() or not g[there].std() > 0.0:
+        raise InputError("expected pixels of the material in both images, got none in common")
+    gain = float(f[there].std(dtype=np.float64) / g[there].std(dtype=np.float64))
+    return gain, float(f[there].mean(dtype=np.float64) - gain * g[there].mean(dtype=np.float64))
+
+
+def residual(pair: ImagePair, u: FloatArray) -> FloatArray:
+    """(rows, cols) f - gain g(x + u) - offset [grey levels]; NaN off the material and the image."""
+    gain, offset = brightness(pair, u)
+    known = pair.masks[0] & np.isfinite(u).all(axis=-1)
+    f, g = _compared(pair, u, known)
+    found = np.full(pair.grid.shape, np.nan)
+    found[known] = f - gain * g - offset
+    return found
+
+
+def _compared(
+    pair: ImagePair, u: FloatArray, where: BoolArray
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """(p,) f and g(x + u) of those pixels where u is known, NaN where that is outside the image."""
+    rows, cols = np.nonzero(where & np.isfinite(u).all(axis=-1))
+    moved = u[rows, cols] / pair.grid.pixel_size
+    g, _, _ = SplineImage.of(pair.deformed, 5).sample(rows - moved[:, 1], cols + moved[:, 0])
+    return pair.reference[rows, cols], g

@@ -1,0 +1,309 @@
+"""The whole displacement in images of any speckled surface: a folder that can be resumed.
+
+::
+
+    mask.tif  mesh.h5                      prepare   the material, and the mesh of it
+    results/NAME.h5 NAME.vtu NAME.csv      NAME      what was measured in one deformed image, see
+    results/NAME_u_mm.tif ...                        modeharvest.idic.finite_element.files
+    report.html  summary.json                        of all images
+    stages.json  timings.json                        which stages are finished, what they took
+
+Lengths are in mm if the size of a pixel is given, else in px, which every file says. The origin is
+the middle of the image, x right, y up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeharvest.fem.field import Mesh, read_mesh, read_plane_mesh, write_mesh
+from modeharvest.idic.finite_element.files import (
+    read_result,
+    write_csv,
+    write_maps,
+    write_result,
+    write_vtu,
+)
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.photograph.displacement import (
+    brightness,
+    photographed_displacement,
+    residual,
+)
+from modeharvest.idic.photograph.material import find_material
+from modeharvest.idic.solver.noise import estimated_noise
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.mapping.isoparametric import locate
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.files import read_mask, require_same_shape, write_image
+from modeharvest.imaging.photographs.photograph import (
+    Photograph,
+    read_frame,
+    read_reference,
+)
+from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.files import (
+    atomic_hdf5,
+    open_hdf5,
+    require_file,
+    require_writable,
+    sha256_of,
+    write_json,
+)
+from modeharvest.util.machine import require_memory
+from modeharvest.util.progress import Progress, silent
+from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
+
+_LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
+_CODE = ("fem", "imaging", "idic", "runs")
+"""What the numbers depend on."""
+_BYTES_PER_PIXEL = 250.0
+"""Of memory while an image is measured."""
+_MISFIT, _SLIGHT = 2.0, 0.03
+"""Residual, over the images' noise and over their contrast, beyond which that is warned of."""
+_MESH_FORMAT = "modeharvest-mesh-1"
+
+
+@dataclass(frozen=True)
+class MeasureCase:
+    """Images of a speckled surface.
+
+    ``reference``, ``deformed``: files, the latter in the order of the test, wildcards allowed.
+    ``mask``: an image, not black on material of the reference; None to find it by its speckle.
+    ``pixel_size`` [mm]; None for lengths in px. ``mesh``: of the material, of T3 or T6 elements, a
+    file that meshio reads; None to make it from the mask.
+    """
+
+    reference: Path
+    deformed: tuple[str, ...]
+    mask: Path | None = None
+    pixel_size: float | None = None
+    mesh: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixel_size is not None:
+            require_within("expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
+        for path in (self.reference, *self.files, self.mask, self.mesh):
+            if path is not None:
+                require_file(path, "a file", "check its name")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The deformed images."""
+        return named_files(Path(), self.deformed)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths, "mm" or "px"."""
+        return "px" if self.pixel_size is None else "mm"
+
+
+@dataclass(frozen=True)
+class MeasureRun(StagedRun[MeasureCase]):
+    """The stages of a measurement."""
+
+    @cached_property
+    def reference(self) -> Photograph:
+        """The reference; InputError if it shows no speckle."""
+        given = None if self.case.mask is None else read_mask(self.case.mask)
+        reference = read_reference(self.case.reference)
+        if given is not None:
+            names = str(self.case.reference), str(self.case.mask)
+            require_same_shape(reference.image, given, *names)
+        require_memory(_BYTES_PER_PIXEL * reference.image.size,
+                       f"an image of {reference.image.size / 1e6:.0f} Mpx", "crop it")  # fmt: skip
+        return reference
+
+    @cached_property
+    def grid(self) -> PixelGrid:
+        """Its pixels [mm or px]."""
+        return PixelGrid.centred(*self.reference.shape, self.case.pixel_size or 1.0)
+
+    @cached_property
+    def _key(self) -> str:
+        inputs = [self.case.reference, self.case.mask, self.case.mesh]
+        files = [None if path is None else sha256_of(path) for path in inputs]
+        return stage_key([files, self.case.pixel_size], *_CODE)
+
+    @cached_property
+    def material(self) -> tuple[BoolArray, Mesh]:
+        """(rows, cols) where the material is, and its mesh; leaves ``mask.tif``, ``mesh.h5``."""
+        mask_path, mesh_path = self.folder / "mask.tif", self.folder / "mesh.h5"
+
+        def work() -> tuple[Path, ...]:
+            mask, mesh = self._material()
+            write_image(mask_path, mask)
+            with atomic_hdf5(mesh_path) as file:
+                file.attrs.update(format=_MESH_FORMAT, unit=self.case.unit)
+                write_mesh(file, mesh)
+            return mask_path, mesh_path
+
+        def read() -> tuple[BoolArray, Mesh]:
+            with open_hdf5(mesh_path, "a mesh", "measure again", _MESH_FORMAT) as file:
+                return read_mask(mask_path), read_mesh(file)
+
+        return self.do("prepare", self._key, work, read)
+
+    def _material(self) -> tuple[BoolArray, Mesh]:
+        """The mask that is given, or is covered by the mesh, or is found; the mesh of it."""
+        case, options = self.case, FiniteElementOptions()
+        mesh = None if case.mesh is None else quadratic(read_plane_mesh(case.mesh))
+        if case.mask is not None:
+            mask = read_mask(case.mask)
+        elif mesh is not None:
+            mask = locate(mesh.nodes, mesh.cells, mesh.element, self.grid, str(case.mesh)).mask
+            if not mask.any():
+                raise InputError(
+                    f"expected a mesh on the image in {case.mesh}, got one beside it; its lengths "
+                    f"are in {case.unit}, from the middle of the image, x right, y up"
+                )
+        else:
+            mask = find_material(self.reference.image).mask
+        if mesh is None:
+            mesh = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
+        return mask, mesh
+
+    def pair(self, path: Path) -> ImagePair:
+        """The reference, a deformed image, and the mask."""
+        frame = read_frame(path, self.reference)
+        return ImagePair(self.reference.image, frame.image, self.grid, self.material[0])
+
+    def results(self) -> dict[str, NodalResult]:
+        """Measure every image, each after the one before; leaves ``results/``."""
+        files, key = self.case.files, self._key
+        for path in files:  # what is wrong with one is known before the first is measured
+            read_frame(path, self.reference)
+        found: dict[str, NodalResult] = {}
+        for k, path in enumerate(files):
+            self.progress(k, len(files), "measure images")
+            key = digest([key, path.stem, sha256_of(path)])
+            found[path.stem] = self._result(path, key, next(reversed(found.values()), None))
+        self.progress(1, 1, "measure images")
+        return found
+
+    def _result(self, path: Path, key: str, before: NodalResult | None) -> NodalResult:
+        stem = self.folder / "results" / path.stem
+        names, unit = (str(self.case.reference), str(path)), self.case.unit
+
+        def work() -> tuple[Path, ...]:
+            result = photographed_displacement(
+                self.pair(path), self.material[1], before, names, self.progress
+            )
+            tables = [stem.with_name(stem.name + kind) for kind in (".h5", ".vtu", ".csv")]
+            write_result(tables[0], result, unit)
+            write_vtu(tables[1], result, unit)
+            write_csv(tables[2], result, unit=unit)
+            return *tables, *write_maps(stem, result, unit)
+
+        return self.do(
+            f"image {path.stem}", key, work, lambda: read_result(stem.with_name(stem.name + ".h5"))
+        )
+
+    def residual(self, name: str, result: NodalResult) -> FloatArray:
+        """(rows, cols) residual of one image [grey levels], NaN off the material."""
+        path = next(path for path in self.case.files if path.stem == name)
+        return residual(self.pair(path), result.displacement_on())
+
+    def all(self) -> dict[str, Any]:
+        """Do everything that is not finished; returns the content of ``summary.json``."""
+        with exclusive(self.folder):
+            require_writable(self.folder)
+            results = self.results()
+            summary = self._summary(results)
+            from modeharvest.report.measure import measure_report
+            from modeharvest.report.model import write_page
+
+            report = measure_report(summary, results, self.residual)
+            write_page(report, self.folder / "report.html", self.progress)
+            write_json(self.folder / "summary.json", summary)
+        return summary
+
+    def _summary(self, results: dict[str, NodalResult]) -> dict[str, Any]:
+        case = self.case
+        return {
+            "title": f"Displacement from {case.reference.name}",
+            "command": "modeharvest measure " + " ".join(
+                [str(case.reference), *case.deformed]
+                + [f"--mask {case.mask}"] * (case.mask is not None)
+                + [f"--pixel-size {case.pixel_size:g}" for _ in [0] if case.pixel_size]
+                + [f"--mesh {case.mesh}"] * (case.mesh is not None)
+                + [f"--out {self.folder}"]
+            ),
+            "unit": case.unit,
+            "pixel_size_mm": case.pixel_size,
+            "shape_px": list(self.grid.shape),
+            "material_px": int(self.material[0].sum()),
+            "mask": "found by its speckle" if case.mask is case.mesh is None else "given",
+            "notes": list(self.reference.notes),
+            "images": [self._image(name, result) for name, result in results.items()],
+            "versions": versions(*_LIBRARIES),
+        }  # fmt: skip
+
+    def _image(self, name: str, result: NodalResult) -> dict[str, Any]:
+        px, mask = self.grid.pixel_size, self.material[0]
+        u = result.displacement_on()
+        inside = u[mask & np.isfinite(u).all(axis=-1)] / px
+        path = next(path for path in self.case.files if path.stem == name)
+        pair = self.pair(path)
+        gain, offset = brightness(pair, u)
+        f, material = pair.reference, pair.masks[0]
+        noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
+        warnings = list(result.warnings)
+        if result.residual_rms > max(_MISFIT * noise, _SLIGHT * float(f[material].std())):
+            warnings.append(
+                f"The residual is {result.residual_rms:.3g} grey levels, of which noise is about "
+                f"{noise:.2g}: somewhere the images don't match, see its map; give images in "
+                "between, or a mask without what is not material."
+            )
+        return {
+            "name": name,
+            "rms_px": float(np.sqrt(np.mean(inside**2))),
+            "max_px": float(np.linalg.norm(inside, axis=-1).max()),
+            "median_sd_px": float(np.median(result.standard_deviation)) / px,
+            "coverage": len(inside) / int(mask.sum()),
+            "cutoff_px": result.cutoff_px,
+            "unknowns": result.unknowns,
+            "effective_unknowns": result.effective_unknowns,
+            "pixels": result.pixels,
+            "outside_px": result.outside,
+            "residual_rms": result.residual_rms,
+            "residual_noise": result.residual_noise,
+            "gain": gain,
+            "offset": offset,
+            "library": result.library,
+            "seconds": self.stages.timings.get(f"image {name}"),
+            "image_noise": noise,
+            "warnings": warnings,
+        }
+
+
+def measure(
+    reference: Path | str,
+    deformed: Sequence[Path | str],
+    folder: Path | str,
+    *,
+    mask: Path | str | None = None,
+    pixel_size: float | None = None,
+    mesh: Path | str | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure the whole displacement of a speckled surface; see :class:`MeasureCase`.
+
+    Leaves its files in ``folder`` and returns what ``summary.json`` holds. InputError if an image,
+    the mask or the mesh can't be used.
+    """
+    case = MeasureCase(
+        Path(reference), tuple(map(str, deformed)), None if mask is None else Path(mask),
+        pixel_size, None if mesh is None else Path(mesh),
+    )  # fmt: skip
+    return MeasureRun(case, Path(folder), progress).all()

@@ -1,0 +1,249 @@
+"""``modeharvest measure``: a plate with a hole, from image files to files of its displacement."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+import tifffile
+from manufactured import inverted, speckle
+from plate_with_hole import GRID, plate_pair
+from test_cli import called, error_line
+
+from modeharvest.idic.finite_element.files import read_result, write_csv, write_result
+from modeharvest.idic.finite_element.mesh import mesh_of_mask
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.local.field import read_field
+from modeharvest.idic.photograph.displacement import block_motion
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.photographs.files import write_image
+from modeharvest.runs.measure import measure
+from modeharvest.util.errors import InputError
+
+pytest.importorskip("gmsh")
+
+GAIN, OFFSET = 0.8, 20.0
+"""Of the second deformed image's brightness, in 8-bit levels."""
+
+
+def field(points: np.ndarray, load: float) -> np.ndarray:
+    """A motion of some 10 px, a strain of 3 %, a wave of 120 px; no pattern in sight."""
+    x, y = np.moveaxis(points, -1, 0)
+    wave = 0.01 * np.stack([np.sin(2 * np.pi * y / 1.2), np.sin(2 * np.pi * x / 1.2)], axis=-1)
+    smooth = np.stack([0.08 - 0.03 * x + 0.01 * y, -0.06 + 0.02 * y - 0.02 * x**2], axis=-1)
+    return load * (smooth + wave)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plate:
+    """Files of a plate with a hole: reference, deformed images, mask; the truth of each."""
+
+    folder: Path
+    truth: dict[str, np.ndarray]
+    mask: np.ndarray
+
+    @property
+    def files(self) -> list[Path]:
+        return [self.folder / f"{name}.tif" for name in self.truth]
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory: pytest.TempPathFactory) -> Plate:
+    folder, truth = tmp_path_factory.mktemp("plate"), {}
+    for name, load, (gain, offset) in (("a", 0.5, (1.0, 0.0)), ("b", 1.0, (GAIN, OFFSET))):
+        pair = plate_pair(lambda points, load=load: field(points, load), 0.005, seed=len(truth))
+        levels = [np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)
+                  for image in (pair.reference, gain * pair.deformed + offset / 255)]  # fmt: skip
+        write_image(folder / f"{name}.tif", levels[1])
+        assert pair.truth is not None
+        truth[name] = pair.truth.displacement
+        if name == "a":
+            write_image(folder / "ref.tif", levels[0])
+            write_image(folder / "mask.tif", pair.masks[0])
+    return Plate(folder, truth, pair.masks[0])
+
+
+@pytest.fixture(scope="module")
+def measured(plate: Plate, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    measure(plate.folder / "ref.tif", plate.files, out, mask=plate.folder / "mask.tif",
+            pixel_size=GRID.pixel_size)  # fmt: skip
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(measured: Path) -> NodalResult:
+    return read_result(measured / "results/b.h5")
+
+
+def test_both_images_up_to_the_edges(plate: Plate, measured: Path) -> None:
+    for name, truth in plate.truth.items():
+        u = read_result(measured / f"results/{name}.h5").displacement_on()
+        error = (u - truth)[plate.mask] / GRID.pixel_size
+        assert np.isfinite(error).all()  # every pixel of the material
+        assert np.sqrt(np.mean(error**2)) < 0.03
+        near = np.hypot(*np.meshgrid(GRID.x, GRID.y)) < 0.35 + 10 * GRID.pixel_size
+        at_hole = (u - truth)[plate.mask & near] / GRID.pixel_size
+        assert np.sqrt(np.mean(at_hole**2)) < 0.06
+
+
+def test_summary(plate: Plate, measured: Path) -> None:
+    summary = json.loads((measured / "summary.json").read_text())
+    first, second = summary["images"]
+    truth = plate.truth["b"][plate.mask] / GRID.pixel_size
+    assert second["rms_px"] == pytest.approx(np.sqrt(np.mean(truth**2)), rel=0.01)
+    assert second["max_px"] == pytest.approx(np.linalg.norm(truth, axis=-1).max(), rel=0.01)
+    assert second["coverage"] == 1.0
+    assert first["gain"] == pytest.approx(1.0, abs=0.01)
+    assert second["gain"] == pytest.approx(1.0 / GAIN, rel=0.01)
+    assert second["seconds"] > 0
+    assert summary["unit"] == "mm"
+    page = (measured / "report.html").read_text()
+    assert page.count("<svg") == 2 * 7
+
+
+def test_finished_images_are_not_measured_again(plate: Plate, measured: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (measured / "results").iterdir()}
+    measure(plate.folder / "ref.tif", plate.files, measured, mask=plate.folder / "mask.tif",
+            pixel_size=GRID.pixel_size)  # fmt: skip
+    assert {path: path.stat().st_mtime_ns for path in (measured / "results").iterdir()} == before
+
+
+def test_hdf5_comes_back_as_it_was(result: NodalResult, tmp_path: Path) -> None:
+    path = tmp_path / "again.h5"
+    write_result(path, result, "px")
+    again = read_result(path)
+    for f in dataclasses.fields(result):
+        if f.name not in ("mesh", "timings_s"):
+            one, other = getattr(result, f.name), getattr(again, f.name)
+            assert np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
+    assert np.array_equal(result.mesh.cells, again.mesh.cells)
+    with h5py.File(path) as file:
+        assert file["displacement"].attrs["unit"] == file.attrs["unit"] == "px"
+
+
+def test_damaged_files_are_refused_in_one_line(result: NodalResult, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.h5"
+    write_result(path, result)
+    with h5py.File(path, "a") as file:
+        file["displacement"][3] = np.nan
+    with pytest.raises(InputError, match="expected finite numbers") as refused:
+        read_result(path)
+    assert "\n" not in str(refused.value)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="measure again"):
+        read_result(path)
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = "other"
+    with pytest.raises(InputError, match="got format 'other'"):
+        read_result(path)
+
+
+def test_other_files_say_the_same(result: NodalResult, measured: Path, tmp_path: Path) -> None:
+    u = result.displacement
+    found = meshio.read(measured / "results/b.vtu")
+    np.testing.assert_array_equal(found.point_data["displacement_mm"][:, :2], u)
+    F = found.point_data["F"].reshape(-1, 3, 3)[:, :2, :2]
+    np.testing.assert_allclose(found.point_data["J"], np.linalg.det(F))
+    stretches = found.point_data["stretch_1"], found.point_data["stretch_2"]
+    np.testing.assert_allclose(np.stack(stretches, -1), np.linalg.svd(F)[1], rtol=1e-9)
+    # A table of the nodes that every reader of a local DIC's field understands.
+    np.testing.assert_allclose(read_field(measured / "results/b.csv", GRID).u, u, rtol=1e-8)
+    maps = [tifffile.imread(measured / f"results/b_{name}_mm.tif") for name in ("u", "v")]
+    assert maps[0].dtype == np.float32
+    np.testing.assert_allclose(np.stack(maps, -1), result.displacement_on(), rtol=1e-6)
+    points = np.array([[0.8, 0.5], [0.0, 0.0]])
+    write_csv(tmp_path / "points.csv", result, points)
+    table = np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1)
+    np.testing.assert_allclose(table[0, 4:6], result.at(points[:1])[0], rtol=1e-8)
+    assert np.isnan(table[1, 4:]).all()  # in the hole
+
+
+def test_material_is_found_and_lengths_are_pixels(plate: Plate, tmp_path: Path) -> None:
+    summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path)
+    (image,) = summary["images"]
+    u = read_result(tmp_path / "results/a.h5").displacement_on()
+    error = u - plate.truth["a"] / GRID.pixel_size
+    both = plate.mask & np.isfinite(error).all(axis=-1)
+    assert both.sum() > 0.9 * plate.mask.sum()
+    assert np.sqrt(np.mean(error[both] ** 2)) < 0.1
+    assert summary["unit"] == "px"
+    assert image["coverage"] > 0.99
+
+
+def test_what_does_not_match_is_said(plate: Plate, tmp_path: Path) -> None:
+    image, other = (tifffile.imread(path) for path in (plate.files[0], plate.folder / "ref.tif"))
+    image[120:150, 180:220] = other[60:90, 180:220]
+    write_image(tmp_path / "patched.tif", image)
+    summary = measure(plate.folder / "ref.tif", [tmp_path / "patched.tif"], tmp_path / "out",
+                      mask=plate.folder / "mask.tif")  # fmt: skip
+    assert "the images don't match" in summary["images"][0]["warnings"][-1]
+
+
+def test_start_follows_what_no_polynomial_does() -> None:
+    def wave(points: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis(points, -1, 0)
+        return 0.08 * np.stack([np.sin(2 * np.pi * y / 1.6), np.cos(2 * np.pi * x / 1.6)], axis=-1)
+
+    grid = PixelGrid.centred(320, 320, 0.01)
+    pattern, at = speckle(1, grid), np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
+    before = inverted(wave, at, 1e-9)
+    pair = ImagePair(*(pattern(x[..., 0], x[..., 1]) for x in (at, before)), grid)
+    mesh = mesh_of_mask(pair.masks[0], grid, 24.0)
+    start = block_motion(pair, mesh, None, ("f", "g"))
+    off = np.linalg.norm(start - wave(mesh.nodes), axis=1) / grid.pixel_size
+    inner = (abs(mesh.nodes) < 1.2).all(axis=1)  # where there are blocks on all sides
+    # Whole pixels, and a block of 41 px is blind to a tenth of such a wave's 8 px.
+    assert np.median(off[inner]) < 1.5
+    assert np.quantile(off[inner], 0.99) < 4.0
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("size", "expected images of one size"),
+        ("mask size", "expected images of one size"),
+        ("black mask", "expected a mask with material"),
+        ("mesh", "expected a mesh that covers the mask"),
+        ("no contrast", "expected an image with contrast"),
+        ("noise", "expected a speckle pattern"),
+        ("other surface", "expected two images of one surface"),
+        ("missing", "no such file"),
+    ],
+)
+def test_bad_input_is_one_line(
+    plate: Plate,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    what: str,
+    message: str,
+) -> None:
+    rng, bad = np.random.default_rng(0), tmp_path / "bad.tif"
+    images = {
+        "size": rng.integers(0, 255, (50, 60)).astype(np.uint8),
+        "mask size": np.full((50, 60), 7, np.uint8),
+        "black mask": np.zeros(GRID.shape, np.uint8),
+        "no contrast": np.full(GRID.shape, 7, np.uint8),
+        "noise": rng.integers(0, 255, GRID.shape).astype(np.uint8),
+        "other surface": tifffile.imread(plate.folder / "a.tif")[::-1, ::-1],
+    }
+    if what in images:
+        write_image(bad, np.ascontiguousarray(images[what]))
+    options = ["--mask", bad if "mask" in what else plate.folder / "mask.tif"]
+    if what == "mesh":
+        nodes = [[-0.9, 0.5, 0.0], [0.0, 0.5, 0.0], [-0.9, 0.8, 0.0]]
+        meshio.Mesh(nodes, [("triangle", [[0, 1, 2]])]).write(tmp_path / "mesh.vtu")
+        options += ["--mesh", tmp_path / "mesh.vtu", "--pixel-size", "0.01"]
+    deformed = bad if what in images and "mask" not in what else plate.folder / "a.tif"
+    if what == "missing":
+        deformed = tmp_path / "nothing.tif"
+    command = ["measure", plate.folder / "ref.tif", deformed, *options, "--out", tmp_path / "out"]
+    assert called(monkeypatch, *command) == 2
+    assert message in error_line(capsys)
