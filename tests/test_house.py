@@ -21,9 +21,10 @@ WHOLE_FIELD = (
     "fem/sparse_factor.py",
     "idic/finite_element",
     "idic/photograph/displacement.py",
+    "src/modeharvest/report/figures/whole_field.py",
     "src/modeharvest/report/measure.py",
-    "src/modeharvest/report/whole_field.py",
     "src/modeharvest/runs/measure.py",
+    "src/modeharvest/runs/photographs/whole_field.py",
     "src/modeharvest/runs/whole_field.py",
     "validation/whole_field.py",
 )

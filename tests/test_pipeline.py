@@ -22,7 +22,7 @@ from modeharvest.idic.finite_element.files import read_result
 from modeharvest.runs import run
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
-from modeharvest.runs.whole_field import WholeFieldOptions
+from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 
@@ -105,7 +105,7 @@ def test_the_run_leaves_what_it_promises(finished: Path) -> None:
 
 
 def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: Path) -> None:
-    how = WholeFieldOptions(measure=True, element_px=16.0, edge_element_px=10.0)
+    how = VirtualWholeFieldOptions(measure=True, element_px=16.0, edge_element_px=10.0)
     whole = Case.read(case).model_copy(update={"whole_field": how})
     run(whole, folder)
     summary = read_json(folder / "summary.json")

@@ -21,7 +21,7 @@ from modeharvest.imaging.speckle.pattern import Ink, Speckle, SpeckleSpec
 from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.twin import Twin, TwinRun, make_twin
-from modeharvest.runs.whole_field import WholeFieldOptions
+from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 
@@ -124,9 +124,9 @@ def test_again_does_nothing_and_another_calibration_is_made_anew(tmp_path: Path)
     assert len(list(first.experiment.parent.glob("calibration_*"))) == 2
 
 
-def test_the_whole_displacement_of_a_twin_is_refused(tmp_path: Path) -> None:
-    case = CASE.model_copy(update={"whole_field": WholeFieldOptions(measure=True)})
-    with pytest.raises(InputError, match=r"a twin without \[whole_field\] measure"):
+def test_what_no_user_knows_is_refused(tmp_path: Path) -> None:
+    case = CASE.model_copy(update={"whole_field": VirtualWholeFieldOptions(material_law=True)})
+    with pytest.raises(InputError, match=r"material_law = false of a twin"):
         TwinRun(case, tmp_path).all()
 
 

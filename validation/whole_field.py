@@ -1,4 +1,4 @@
-"""The whole displacement against the truth: errors up to every edge, coverage, refitted modes."""
+"""The whole displacement: the ansatz refitted to it, and its errors against the truth."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
-from modeharvest.idic.spectra.pattern import mode_equivalent
-from modeharvest.util.arrays import FloatArray
+from modeharvest.idic.spectra.pattern import REFERENCE_MODE, mode_equivalent
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.typed import quantity
 from modeharvest.validation.scoring.score import BULK, EDGES, JUNCTIONS, LIGAMENTS, REGIONS, regions
-from modeharvest.validation.truth import Comparison, lengths
+from modeharvest.validation.truth import lengths
 
 _NORMAL_95 = 1.959964
 
@@ -51,44 +51,136 @@ class WholeFieldSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class WholeFieldComparison:
-    """A whole displacement beside the truth."""
+class WholeField:
+    """A whole displacement, and the ansatz of a correlation refitted to it."""
 
     measured: NodalResult
-    displacement: FloatArray
-    """(rows, cols, 2) measured u [mm]; NaN off the mesh."""
-    error: FloatArray
-    """(rows, cols, 2) truth - measured [mm]."""
-    standard_deviation: FloatArray
-    """(rows, cols, 2) of the measured displacement [mm]."""
     refit: Result
-    """The correlation's ansatz, fitted to what was measured."""
-    summary: WholeFieldSummary
+    seconds: float
+    """What the measurement took."""
+    start: str = ""
+    """Where the measurement began, in words."""
+
+
+def refitted(measured: NodalResult, correlated: Result, mask: BoolArray) -> Result:
+    """The ansatz of a correlation, fitted to what was measured on the pixels of a mask."""
+    u, grid = measured.displacement_on(correlated.grid), correlated.grid
+    there = mask & np.isfinite(u[..., 0])
+    return fit_displacement(u, grid, correlated.ansatz, correlated.unknowns, there)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModeBothWays:
+    """A mode by correlation, and by the ansatz refitted to the whole displacement."""
+
+    v_max_mm: float
+    correlated_v_max_mm: float
+    """Largest |v| over the mode's own part [mm]."""
+    parameters: tuple[dict[str, Any], ...]
+    """Of each its ``name``, ``unit``, ``refitted`` and ``correlated`` value."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WholeFieldNumbers:
+    """What is known of a whole displacement without the truth; rms per component."""
+
+    w_rms_px: float = quantity("w = measured − IDIC, rms", "px")
+    w_max_px: float = quantity("… largest length", "px")
+    rms_beyond_refit_px: float = quantity("measured − refitted ansatz, rms", "px")
+    rms_refit_to_idic_px: float = quantity("refitted ansatz − IDIC, rms", "px")
+    sd_px: float = quantity("standard deviation of the measured displacement, rms", "px")
+    coverage: float = quantity("share of the material measured", "–")
+    cutoff_px: float = quantity("cut-off wavelength of the regularisation", "px")
+    unknowns: int = quantity("unknowns", "–")
+    residual_rms: float = quantity("residual, rms", "levels")
+    modes: tuple[ModeBothWays, ...]
+    library: str
+    """That factorised the matrices."""
+    start: str
+    """Where the measurement began, in words."""
+    warnings: tuple[str, ...]
+    seconds: float
+    """Of the measurement, on this machine."""
+
+
+def whole_numbers(whole: WholeField, correlated: Result, mask: BoolArray) -> WholeFieldNumbers:
+    """Numbers of a whole displacement on the pixels of a mask, beside a correlation's result."""
+    measured, grid, px = whole.measured, correlated.grid, correlated.grid.pixel_size
+    u = measured.displacement_on(grid)
+    there = mask & np.isfinite(u[..., 0])
+    by_idic, by_refit = (fit.displacement()[there] for fit in (correlated, whole.refit))
+    w = u[there] - by_idic
+    return WholeFieldNumbers(
+        w_rms_px=_rms(w) / px,
+        w_max_px=float(lengths(w).max()) / px,
+        rms_beyond_refit_px=_rms(u[there] - by_refit) / px,
+        rms_refit_to_idic_px=_rms(by_refit - by_idic) / px,
+        sd_px=_rms(measured.standard_deviation) / px,
+        coverage=float(there.sum() / mask.sum()),
+        cutoff_px=measured.cutoff_px,
+        unknowns=measured.unknowns,
+        residual_rms=measured.residual_rms,
+        modes=tuple(
+            _both_ways(whole.refit, correlated, i) for i in range(len(whole.refit.ansatz.modes))
+        ),
+        library=measured.library,
+        start=whole.start,
+        warnings=measured.warnings,
+        seconds=whole.seconds,
+    )
+
+
+def _both_ways(refit: Result, correlated: Result, i: int) -> ModeBothWays:
+    mode = refit.ansatz.modes[i]
+    each = zip(mode.family.names, mode.family.units, refit.mode_parameters(i),
+               correlated.mode_parameters(i), strict=True)  # fmt: skip
+    keys = ("name", "unit", "refitted", "correlated")
+    return ModeBothWays(
+        v_max_mm=float(np.abs(_amplitude(refit, i)).max()),
+        correlated_v_max_mm=float(np.abs(_amplitude(correlated, i)).max()),
+        parameters=tuple(dict(zip(keys, values, strict=True)) for values in each),
+    )
+
+
+def _amplitude(fit: Result, i: int) -> FloatArray:
+    """v of mode i over its own part [mm]."""
+    box = fit.ansatz.modes[i].taper.cellular
+    x, y = np.linspace(box.x_min, box.x_max, 200), np.linspace(box.y_min, box.y_max, 200)
+    return fit.ansatz.v(i, fit.unknowns, x, y)
+
+
+def v_percent(fit: Result, best: Result, i: int = 0) -> float:
+    """Largest difference of v of mode i from that of the best fit, of its maximum [%]."""
+    v, at_best = _amplitude(fit, i), _amplitude(best, i)
+    return 100.0 * float(np.abs(v - at_best).max() / np.abs(at_best).max())
+
+
+def waves_percent(fit: Result, best: Result, i: int = 0) -> float:
+    """Largest difference of mode i's wave vectors from the best fit's, of their length [%]."""
+    family = best.ansatz.modes[i].family
+    found, at_best = (family.waves(f.mode_parameters(i))[:, 2:4] for f in (fit, best))
+    return 100.0 * float((lengths(found - at_best) / lengths(at_best)).max())
 
 
 def compare_whole(
-    comparison: Comparison, measured: NodalResult, specimen: Specimen, seconds: float
-) -> WholeFieldComparison:
-    """Set a whole displacement against the truth, and refit to it the ansatz of a correlation.
+    whole: WholeField, true: FloatArray, best: Result, mask: BoolArray, specimen: Specimen
+) -> WholeFieldSummary:
+    """Set a whole displacement against the truth.
 
-    comparison : of that correlation with the truth.
-    seconds : what the measurement took.
+    true : (rows, cols, 2) [mm].
+    best : the best fit to it of the ansatz that was refitted.
+    mask : (rows, cols) True on material of the undeformed specimen.
     """
-    grid, mask, px = comparison.grid, comparison.mask, comparison.grid.pixel_size
+    measured, refit, grid, px = whole.measured, whole.refit, best.grid, best.grid.pixel_size
     u = measured.displacement_on(grid)
-    error = comparison.displacement - u
+    error = true - u
     there = mask & np.isfinite(u[..., 0])
-    correlated, best = comparison.result, comparison.best
-    refit = fit_displacement(u, grid, correlated.ansatz, correlated.unknowns, there)
     apart = (refit.displacement() - best.displacement())[mask] / px
-    deviation = measured.standard_deviation_on(grid)
-    inside = np.abs(error) < _NORMAL_95 * deviation
+    inside = np.abs(error) < _NORMAL_95 * measured.standard_deviation_on(grid)
     labels = np.where(there, regions(mask, grid, specimen), -1)
     places = {name: labels == REGIONS.index(name) for name in REGIONS}
     rms = {name: _rms(error[place]) / px for name, place in places.items() if place.any()}
-    ideal = correlated.ansatz.initial_guess(comparison.strain)[correlated.ansatz.phi_slice(0)]
-    is_single = len(correlated.ansatz.modes) == 1 and ideal.size > 0
-    summary = WholeFieldSummary(
+    return WholeFieldSummary(
         rms_px=_rms(error[there]) / px,
         rms_edges_px=rms.get(EDGES),
         rms_ligaments_px=rms.get(LIGAMENTS),
@@ -101,16 +193,19 @@ def compare_whole(
         unknowns=measured.unknowns,
         interval_coverage=float(inside[there].mean()),
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in rms else None,
-        mode=(
-            tuple(mode_equivalent(refit.mode_parameters(), specimen.pitch, ideal)[0])
-            if is_single
-            else ()
-        ),
+        mode=_square_mode(refit, specimen.pitch),
         library=measured.library,
         warnings=measured.warnings,
-        seconds=seconds,
+        seconds=whole.seconds,
     )
-    return WholeFieldComparison(measured, u, error, deviation, refit, summary)
+
+
+def _square_mode(refit: Result, pitch: float) -> tuple[float, ...]:
+    """Parameters of the paper's mode nearest to the ideal one; empty for other ansatzes."""
+    families = [mode.family for mode in refit.ansatz.modes]
+    if [family.size for family in families] != [len(REFERENCE_MODE)]:
+        return ()
+    return tuple(mode_equivalent(refit.mode_parameters(), pitch, families[0].start)[0])
 
 
 def _rms(values: NDArray[Any]) -> float:

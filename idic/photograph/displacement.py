@@ -81,6 +81,21 @@ def photographed_displacement(
         :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
     """
     start = block_motion(pair, mesh, before, names)
+    return displacement_from(start, pair, mesh, progress=progress)
+
+
+def displacement_from(
+    start: FloatArray,
+    pair: ImagePair,
+    mesh: Mesh,
+    cutoff_px: float | None = None,
+    progress: Progress = silent,
+) -> NodalResult:
+    """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
+
+    ``cutoff_px``: cut-off wavelength of the regularisation [px]; None to find it. For the others
+    see :func:`photographed_displacement`.
+    """
     pair = _alike(pair, mesh, start)
     begin = partial(_known, start)
     if pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None:
@@ -88,7 +103,8 @@ def photographed_displacement(
         first = measure_displacement(inner, begin, mesh, options=_FIRST, progress=progress)
         mask = deformed_mask(pair.grid, mesh, first.displacement, _OFF_PX[1])
         pair = replace(_alike(pair, mesh, first.displacement), deformed_mask=mask)
-    return measure_displacement(pair, begin, mesh, options=_LAST, progress=progress)
+    options = replace(_LAST, cutoff_px=cutoff_px)
+    return measure_displacement(pair, begin, mesh, options=options, progress=progress)
 
 
 def _known(values: FloatArray, points: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,14 +37,14 @@ def cases(
             print(f"{shipped:18}{command:14}{title}")
 
 
+WholeField = Annotated[
+    bool | None,
+    typer.Option(help="Measure the whole displacement, up to every edge, on a mesh, or don't."),
+]
+
+
 def run(
-    case: CaseName,
-    out: OutFolder,
-    solution: SolutionFile = None,
-    whole_field: Annotated[
-        bool | None,
-        typer.Option(help="Measure the whole displacement, up to every edge, on a mesh, or don't."),
-    ] = None,
+    case: CaseName, out: OutFolder, solution: SolutionFile = None, whole_field: WholeField = None
 ) -> None:
     """Run a whole case: simulate, image, correlate, validate.
 
@@ -130,10 +129,10 @@ def _stages(
     from modeharvest.runs.case import Case
 
     checked = Case.read(case)
-    if whole_field is not None:
-        how = replace(checked.whole_field, measure=whole_field)
-        checked = checked.model_copy(update={"whole_field": how})
     from modeharvest.runs.experiment import Run
+    from modeharvest.runs.whole_field import change_of
+
+    checked = checked.model_copy(update=change_of(checked.whole_field, whole_field))
 
     with bars() as progress:
         yield Run(checked, out, progress, solution)
@@ -194,6 +193,7 @@ def harvest(
             help="Print a commented EXPERIMENT.toml with every option, and stop.",
         ),
     ] = False,
+    whole_field: WholeField = None,
 ) -> None:
     """Harvest modes from photographs of a test: v0, v1 and phi1 with error bars.
 
@@ -207,7 +207,7 @@ def harvest(
     from modeharvest.runs.photographs.pipeline import harvest as harvest_photographs
 
     with bars() as progress:
-        summary = harvest_photographs(experiment, out, progress)
+        summary = harvest_photographs(experiment, out, progress, whole_field)
     print_report(photographs_report(summary), out)
 
 

@@ -18,6 +18,7 @@ from modeharvest.report.figures.experiment import (
     snapshot_panels,
 )
 from modeharvest.report.figures.fits import convergence_card, panel_sections, shape_numbers
+from modeharvest.report.figures.whole_field import whole_panel_numbers
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -308,16 +309,8 @@ def panel_numbers(key: str, snapshot: Snapshot) -> str:
     """One line of numbers under the picture of a panel; empty if there is nothing to add."""
     if key == "residual":
         return f"rms {snapshot['rms_residual']:.3g} of full scale"
-    if key == "whole-error":
-        at = snapshot["whole_field"]
-        return (
-            f"rms {at['rms_px']:.2g} px per component on {100 * at['coverage']:.4g} % of the "
-            f"material, {at['rms_edges_px'] or 0.0:.2g} px within 10 px of an edge; largest length "
-            f"{at['max_px']:.2g} px"
-        )
-    if key == "whole-deviation":
-        covered = 100 * snapshot["whole_field"]["interval_coverage"]
-        return f"{covered:.3g} % of the truth in intervals of 95 %"
+    if key.startswith("whole-"):
+        return whole_panel_numbers(key, snapshot["whole_field"])
     part = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}.get(key, "")
     details = snapshot.get("details_px", {}).get(part)
     if details is None:

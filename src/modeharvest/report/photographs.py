@@ -14,6 +14,7 @@ from modeharvest.report.figures import fits
 from modeharvest.report.figures import photographs as figures
 from modeharvest.report.figures.curves import draw_onset, draw_waves
 from modeharvest.report.figures.photographs import PhotographState
+from modeharvest.report.figures.whole_field import whole_cards, whole_panel_numbers
 from modeharvest.report.model import (
     Card,
     Cell,
@@ -34,7 +35,7 @@ from modeharvest.runs.photographs.results import Harvest
 Summary = Mapping[str, Any]
 Frame = Mapping[str, Any]
 
-_PANELED = ("photographs", "found", "residual-and-model-error", "uncertainty", "errors")
+_PANELED = ("photographs", "found", "whole", "residual-and-model-error", "uncertainty", "errors")
 """Sections of panels, in this order."""
 
 
@@ -57,6 +58,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         known="These photographs were made by a simulation, so the truth is known. ",
         source="Fig. “real” of the paper. ", pattern=Markup("v<sub>1</sub>φ<sub>1</sub>"),
     )  # fmt: skip
+    sections = [section for section in sections if section.cards or section.name != "whole"]
     steps = [fits.convergence_card(s, frames[s.frame.name]["outcome_why"]) for s in states]
     last, hero = summary["frames"][-1], None
     if states:
@@ -172,6 +174,8 @@ def _model_error_key(frame: Frame) -> KeyNumber:
 def panel_numbers(key: str, frame: Frame) -> str:
     """One line of numbers under a picture; empty if there is nothing to add."""
     local = frame["local"]
+    if key.startswith("whole-"):
+        return whole_panel_numbers(key, frame["whole_field"])
     if key == "image":
         return f"{frame['name']}; compression {percent(frame['strain_x'])} along x, " + (
             f"{percent(frame['strain_y'])} along y"
@@ -213,6 +217,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
                    part=part.name)
           for k, part in enumerate(parts) for c, axis in enumerate("xy")),
         *fits.ansatz_panels("found", "real", modes),
+        *figures.WHOLE_MAPS.panels(),
         fits.Panel.of(last, "residual", figures.draw_residual, text="photograph-residual",
                       exact=True),
         fits.Panel.of(last, "w", figures.draw_w, lambda state: state.frame.local is not None,
@@ -223,7 +228,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
         panels += [*_error_panels(f"v{i + 1}", "v", i), *_error_panels(f"fluc{i + 1}", "fluc", i)]
     for part, text in {"true_w": "true-w", "best": "best", "loss": "loss"}.items():
         drawn = partial(figures.draw_error_against_truth, part=part)
-        panels.append(fits.Panel.of("errors", part, drawn, _has_truth, text))
+        panels.append(fits.Panel.of("errors", part, drawn, figures.has_truth, text))
     return [panel for panel in panels if any(map(panel.shows, states))]
 
 
@@ -244,11 +249,6 @@ def _error_panels(field: str, text: str, i: int | None = None) -> list[fits.Pane
                  n=(i or 0) + 1)
         for cause, shown in causes.items()
     ]  # fmt: skip
-
-
-def _has_truth(state: PhotographState) -> bool:
-    truth = state.harvest.truth
-    return truth is not None and state.frame.name in truth.frames
 
 
 def _has_spectrum(state: PhotographState) -> bool:
@@ -375,6 +375,7 @@ def number_cards(summary: Summary, shown: Sequence[Frame], names: Mapping[str, s
                          on_terminal=True)  # fmt: skip
     return [
         *Card.tabular(frames, wide=True),
+        *whole_cards([(names[f["name"]], f["whole_field"]) for f in shown if f.get("whole_field")]),
         *_amplitude_cards(shown, names),
         *mode_cards(shown, names),
         *_wave_cards(shown, names),

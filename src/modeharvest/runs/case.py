@@ -24,7 +24,7 @@ from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.distortion.lens import CameraDistortion
 from modeharvest.imaging.distortion.target import CalibrationTarget
 from modeharvest.imaging.spec import ImagingSpec
-from modeharvest.runs.whole_field import WholeFieldOptions
+from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
 from modeharvest.util.typed import CHECKS, described, made, nearest, require_types, to_plain
@@ -203,7 +203,7 @@ class Case(CaseModel):
         ImagingSpec, of_kind({"camera": CameraDistortion}, "imaging.distortion", "distortion")
     ] = ImagingSpec()
     correlation: SquareLatticeOptions = SquareLatticeOptions()
-    whole_field: WholeFieldOptions = WholeFieldOptions()
+    whole_field: VirtualWholeFieldOptions = VirtualWholeFieldOptions()
     calibration: CalibrationTarget | None = None
 
     def plain(self) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,15 +29,17 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.measure import measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
 from modeharvest.runs.case import Case, shipped_cases, shipped_solution
 from modeharvest.runs.precompile import precompiling
-from modeharvest.runs.whole_field import WholeFields
+from modeharvest.runs.whole_field import WholeFields, name_of
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
-from modeharvest.util.files import make_folder, read_json, write_json
+from modeharvest.util.files import read_json, write_json
 from modeharvest.util.machine import on_first
+from modeharvest.util.progress import Progress
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.validation.summary import (
     MeasuredExperiment,
@@ -46,7 +49,11 @@ from modeharvest.validation.summary import (
     snapshot_summary,
 )
 from modeharvest.validation.truth import Comparison
-from modeharvest.validation.whole_field import WholeFieldComparison, compare_whole
+from modeharvest.validation.whole_field import (
+    WholeField,
+    WholeFieldSummary,
+    compare_whole,
+)
 
 _COMPLETE = "complete"
 T = TypeVar("T")
@@ -130,21 +137,24 @@ class Run(StagedRun[Case]):
         images, correlated = self._correlated()
         how = options.of(self.case.experiment, images.grid.pixel_size)
 
+        def one(strain: float, progress: Progress) -> NodalResult:
+            pair, start = images.pair(strain, camera=options.camera), self._result_path(strain)
+            return measure_displacement(pair, Result.read(start), options=how, progress=progress)
+
         def work() -> list[Path]:
-            make_folder(self._whole_fields.folder)
-            results, camera = self._results(images), options.camera
             return [
                 path
                 for strain in images.strains
                 for path in self._whole_fields.measure(
-                    images.pair(strain, camera=camera), strain, results[strain], how, self.progress
+                    name_of(strain), f"strain {100 * strain:.2f} %", partial(one, strain),
+                    self.progress,
                 )
-            ]
+            ]  # fmt: skip
 
-        key = self._measure_key(correlated)
-        return self.do(
-            "measure", key, work, lambda: {e: self._whole_fields.read(e) for e in images.strains}
-        )
+        def read() -> dict[float, NodalResult]:
+            return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
+
+        return self.do("measure", self._measure_key(correlated), work, read)
 
     def validate(self) -> dict[str, Any]:
         """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
@@ -241,15 +251,18 @@ class Run(StagedRun[Case]):
             pictures = draw_figures(experiment_figures(data), self.progress)
             numbers = list(snapshots)
             for k, whole in enumerate(wholes):
-                numbers[k] = replace(numbers[k], whole_field=whole.summary)
+                numbers[k] = replace(numbers[k], whole_field=whole[1])
             summary = experiment_summary(measured, case.plain(), numbers).plain()
         write_page(experiment_report(summary, data), page, pictures=pictures)
         return summary
 
-    def _compare_whole(self, comparisons: Sequence[Comparison], k: int) -> WholeFieldComparison:
-        comparison, fields = comparisons[k], self._whole_fields
-        measured, seconds = fields.read(comparison.strain), fields.seconds(comparison.strain)
-        return compare_whole(comparison, measured, self.case.experiment.specimen, seconds)
+    def _compare_whole(
+        self, comparisons: Sequence[Comparison], k: int
+    ) -> tuple[WholeField, WholeFieldSummary]:
+        known, fields = comparisons[k], self._whole_fields
+        whole = fields.refitted(name_of(known.strain), known.result, known.mask)
+        specimen = self.case.experiment.specimen
+        return whole, compare_whole(whole, known.displacement, known.best, known.mask, specimen)
 
     def _images(self) -> ImageSet:
         advice = "make it again with 'modeharvest image'"

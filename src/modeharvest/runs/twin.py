@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.result import Result
@@ -40,12 +41,14 @@ from modeharvest.runs.experiment import Run
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthCheck
+from modeharvest.runs.photographs.whole_field import whole_checks
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, write_json
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
+from modeharvest.validation.whole_field import compare_whole
 
 _SIDECAR = "twin.json"
 
@@ -187,26 +190,30 @@ class TwinRun(StagedRun[Case]):
     def all(self) -> dict[str, Any]:
         """Make, harvest, compare; returns the content of the harvest's ``summary.json``.
 
-        Raises InputError if the case asks for the whole displacement.
+        Raises InputError if the whole displacement is to be measured with what no user knows.
         """
-        if self.case.whole_field.measure:
+        how = self.case.whole_field
+        if how.material_law or not how.camera:
             raise InputError(
-                "expected a twin without [whole_field] measure = true (or --whole-field): the "
-                "whole displacement is measured of virtual experiments only; leave it out"
+                "whole_field: expected camera = true and material_law = false of a twin, which is "
+                f"measured from its photographs alone, got {how.camera} and {how.material_law}"
             )
         with exclusive(self.folder):
             solution = Run(self.case, self.folder, self.progress, self.solution).solved()
             twin = make_twin(self.case, solution, self.folder / "twin", self.progress)
             case, folder = PhotographCase.read(twin.experiment), self.folder / "harvest"
+            case = case.model_copy(update={"whole_field": how.of_photographs})
             harvesting = HarvestRun(case, folder, self.progress, str(twin.experiment))
-            return harvesting.all(compare_with_truth(twin, harvesting, self.progress))
+            specimen = self.case.experiment.specimen
+            return harvesting.all(compare_with_truth(twin, harvesting, specimen, self.progress))
 
 
 def compare_with_truth(
-    twin: Twin, harvesting: HarvestRun, progress: Progress = silent
+    twin: Twin, harvesting: HarvestRun, specimen: Specimen, progress: Progress = silent
 ) -> HarvestTruth:
     """Set a harvest, which knows nothing of the truth, against that of its twin."""
     images, geometry, results = twin.images, harvesting.geometry, harvesting.results()
+    wholes = harvesting.whole_fields.found if harvesting.whole_fields else {}
     frames, rows = {}, []
     for k, (name, measured) in enumerate(results.items()):
         progress(k, len(results), "compare with the truth")
@@ -215,8 +222,12 @@ def compare_with_truth(
         inside = np.asarray(np.isfinite(true).all(axis=-1))
         result = measured.result
         best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
-        frames[name] = FrameTruth(true, best)
         rows += _frame_rows(name, result, best, true, inside, geometry.region.cellular)
+        errors = None
+        if name in wholes:
+            errors = compare_whole(wholes[name], true, best, inside, specimen)
+            rows += whole_checks(name, wholes[name].refit, best, errors, inside)
+        frames[name] = FrameTruth(true, best, errors)
     if harvesting.optics.distortion is not None:
         rows.append(_lens_row(harvesting.optics.distortion, twin.distortion, images.grid))
     return HarvestTruth(frames, twin.distortion, tuple(rows))

@@ -1,10 +1,10 @@
-"""The whole displacement of a virtual experiment: how its images are measured, and the files."""
+"""The whole displacement as a stage of a run: how it is measured, and the files."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,14 @@ from modeharvest.idic.finite_element.files import read_result, write_result, wri
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     Law,
-    measure_displacement,
 )
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
-from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, write_json
+from modeharvest.util.files import make_folder, read_json, write_json
 from modeharvest.util.progress import Progress
+from modeharvest.validation.whole_field import WholeField, refitted
 
 _SECONDS = "timings.json"
 
@@ -33,16 +32,12 @@ class WholeFieldOptions:
 
     measure: bool = False
     """Whether it is measured at all: that costs more than the rest of the run."""
-    camera: bool = True
-    """Whether in the images as a camera gives them, quantised, or in the exact ones."""
     element_px: float = 24.0
     """Edge length of the elements [px]."""
     edge_element_px: float = 12.0
     """The same along edges."""
     cutoff_px: float | None = None
     """Cut-off wavelength of the regularisation [px]; None: found from the images."""
-    material_law: bool = False
-    """Whether to regularise by the equilibrium of the experiment's own material."""
 
     def __post_init__(self) -> None:
         self.on_mesh(None)
@@ -52,6 +47,26 @@ class WholeFieldOptions:
         return FiniteElementOptions(
             self.element_px, self.edge_element_px, cutoff_px=self.cutoff_px, law=law
         )
+
+
+def change_of(how: WholeFieldOptions, measure: bool | None) -> dict[str, WholeFieldOptions]:
+    """What changes in a case that is to measure or not; nothing for None, as the case says."""
+    return {} if measure is None else {"whole_field": replace(how, measure=measure)}
+
+
+@dataclass(frozen=True)
+class VirtualWholeFieldOptions(WholeFieldOptions):
+    """How it is measured in a virtual experiment, of which more is known."""
+
+    camera: bool = True
+    """Whether in the images as a camera gives them, quantised, or in the exact ones."""
+    material_law: bool = False
+    """Whether to regularise by the equilibrium of the experiment's own material."""
+
+    @property
+    def of_photographs(self) -> WholeFieldOptions:
+        """The options that photographs have, too."""
+        return WholeFieldOptions(*(getattr(self, f.name) for f in fields(WholeFieldOptions)))
 
     def of(self, experiment: Experiment, pixel_size: float) -> FiniteElementOptions:
         """The engine's options for an experiment, whose two ends along x are loaded."""
@@ -65,53 +80,64 @@ class WholeFieldOptions:
         return self.on_mesh(Law(experiment.material, is_loaded))
 
 
+def name_of(strain: float) -> str:
+    """Of the files of a virtual experiment at a strain."""
+    return f"displacement_{round(1e4 * strain):04d}"
+
+
 @dataclass(frozen=True)
 class WholeFields:
-    """The files of whole displacements in a folder, one for each strain, and what they took."""
+    """The files of whole displacements in a folder, by the names of images, and what they took."""
 
     folder: Path
 
-    def path(self, strain: float) -> Path:
-        """The HDF5 file of a strain; the VTU beside it has the same name."""
-        return self.folder / f"displacement_{round(1e4 * strain):04d}.h5"
+    def path(self, name: str) -> Path:
+        """The HDF5 file of an image; the VTU beside it has the same name."""
+        return self.folder / f"{name}.h5"
 
     def measure(
         self,
-        pair: ImagePair,
-        strain: float,
-        start: Result,
-        options: FiniteElementOptions,
+        name: str,
+        of: str,
+        work: Callable[[Progress], NodalResult],
         progress: Progress,
     ) -> tuple[Path, Path]:
-        """Measure a pair of images at a strain and write what was found; returns the files.
+        """Measure by ``work`` and write what was found; returns the files.
 
-        Raises InputError where there is nothing to measure on, with the way around.
+        ``of``: whose it is, for messages. Raises InputError where there is nothing to measure on,
+        with the way around.
         """
-        begin, path = time.perf_counter(), self.path(strain)
+        begin, path = time.perf_counter(), self.path(name)
 
-        def tell(done: float, total: float, what: str) -> None:
-            progress(done, total, f"{what}, strain {100 * strain:.2f} %")
+        def report(done: float, total: float, what: str) -> None:
+            progress(done, total, f"{what}, {of}")
 
         try:
-            found = measure_displacement(pair, start, options=options, progress=tell)
+            found = work(report)
         except InputError as error:
             raise InputError(
-                f"whole displacement at strain {strain:g}: {error}; or leave it out: "
-                "[whole_field] measure = false, --no-whole-field"
+                f"whole displacement, {of}: {error}; or leave it out: [whole_field] measure = "
+                "false, --no-whole-field"
             ) from error
+        make_folder(self.folder)
         write_result(path, found)
         write_vtu(path.with_suffix(".vtu"), found)
-        seconds = {**self._seconds(), path.stem: time.perf_counter() - begin}
+        seconds = {**self._seconds(), name: time.perf_counter() - begin}
         write_json(self.folder / _SECONDS, seconds)
         return path, path.with_suffix(".vtu")
 
-    def read(self, strain: float) -> NodalResult:
-        """The whole displacement at a strain; InputError if its file is missing or damaged."""
-        return read_result(self.path(strain))
+    def read(self, name: str) -> NodalResult:
+        """The whole displacement of an image; InputError if its file is missing or damaged."""
+        return read_result(self.path(name))
 
-    def seconds(self, strain: float) -> float:
+    def refitted(self, name: str, correlated: Result, mask: BoolArray) -> WholeField:
+        """It with the ansatz of a correlation, refitted to it on the pixels of a mask."""
+        measured = self.read(name)
+        return WholeField(measured, refitted(measured, correlated, mask), self.seconds(name))
+
+    def seconds(self, name: str) -> float:
         """What its measurement took [s]."""
-        return float(self._seconds().get(self.path(strain).stem, float("nan")))
+        return float(self._seconds().get(name, float("nan")))
 
     def _seconds(self) -> Mapping[str, float]:
         path = self.folder / _SECONDS

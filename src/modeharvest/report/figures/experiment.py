@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from modeharvest.fem.field import Solution
@@ -17,9 +16,10 @@ from modeharvest.imaging.imageset import ImageSet
 from modeharvest.report.figures import fits, style
 from modeharvest.report.figures.boundaries import MeshBoundary
 from modeharvest.report.figures.maps import ColourScale, draw_blend, draw_field, draw_image
+from modeharvest.report.figures.whole_field import WholeMaps
 from modeharvest.util.arrays import FloatArray
 from modeharvest.validation.truth import Comparison, lengths, pattern_field
-from modeharvest.validation.whole_field import WholeFieldComparison
+from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class ExperimentData:
     """Of each its spectral densities and what is read off them; may still be computed."""
     pitch: float
     """Unit cell size l [mm]."""
-    wholes: Sequence[WholeFieldComparison] = ()
-    """Of each the whole displacement and the truth, if measured; may still be computed."""
+    wholes: Sequence[tuple[WholeField, WholeFieldSummary]] = ()
+    """Of each the whole displacement and its errors, if measured; may still be computed."""
 
     @cached_property
     def states(self) -> list[SnapshotState]:
@@ -81,11 +81,6 @@ class SnapshotState(fits.FittedState):
     def comparison(self) -> Comparison:
         """With the truth."""
         return self.data.comparisons[self.k]
-
-    @property
-    def whole(self) -> WholeFieldComparison:
-        """The whole displacement beside the truth."""
-        return self.data.wholes[self.k]
 
 
 def snapshot_label(strain: float, branch: str, critical: float | None) -> str:
@@ -138,36 +133,10 @@ def _length_of(name: str) -> Callable[[SnapshotState], Figure]:
     return draw
 
 
-def is_whole(state: SnapshotState) -> bool:
-    """Whether its whole displacement was measured."""
-    return len(state.data.wholes) > 0
-
-
-def _measured_w(state: SnapshotState) -> Figure:
-    """Measured u - v0 - v1 phi1, on the colours of the true one."""
-    map_frame = state.view.map_frame()
-    true = fits.UM * map_frame.average(lengths(state.comparison.w))
-    w = lengths(state.whole.displacement - state.result.displacement())
-    scale = ColourScale.size(true, "µm", 0.998)
-    return draw_field(map_frame, fits.UM * map_frame.average(w), scale, state.motion)
-
-
-def _whole_error(state: SnapshotState) -> Figure:
-    return fits.draw_length(state, state.view.map_frame().average(lengths(state.whole.error)))
-
-
-def _principal_strain(state: SnapshotState) -> Figure:
-    """The logarithmic strain of larger size, tension positive."""
-    map_frame, measured = state.view.map_frame(), state.whole.measured
-    values = np.linalg.eigvalsh(measured.logarithmic_strain)
-    larger = np.where(np.abs(values[:, :1]) > np.abs(values[:, 1:]), values[:, :1], values[:, 1:])
-    strain = map_frame.average(measured.on_pixels(larger, state.view.grid)[..., 0])
-    return draw_field(map_frame, strain, ColourScale.signed(strain, "", 0.998), state.motion)
-
-
-def _deviation(state: SnapshotState) -> Figure:
-    sd = lengths(state.whole.standard_deviation)
-    return fits.draw_length(state, state.view.map_frame().average(sd))
+_WHOLE_MAPS: WholeMaps[SnapshotState] = WholeMaps(
+    lambda state: state.data.wholes[state.k][0], lambda state: state.comparison,
+    lambda state: len(state.data.wholes) > 0,
+)  # fmt: skip
 
 
 def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
@@ -181,8 +150,5 @@ def snapshot_panels(modes: int) -> list[fits.Panel[SnapshotState]]:
         fits.Panel.of("errors", "w", _length_of("w"), figure=fields, late=True),
         fits.Panel.of("errors", "best", _length_of("best_error"), late=True),
         fits.Panel.of("errors", "loss", _length_of("idic_to_best"), late=True),
-        fits.Panel.of("whole", "whole-w", _measured_w, figure=fields, late=True, shows=is_whole),
-        fits.Panel.of("whole", "whole-error", _whole_error, late=True, shows=is_whole),
-        fits.Panel.of("whole", "whole-strain", _principal_strain, late=True, shows=is_whole),
-        fits.Panel.of("whole", "whole-deviation", _deviation, late=True, shows=is_whole),
+        *_WHOLE_MAPS.panels(fields, "whole-w"),
     ]

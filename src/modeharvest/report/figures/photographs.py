@@ -33,7 +33,8 @@ from modeharvest.report.figures.curves import draw_density
 from modeharvest.report.figures.fits import UM
 from modeharvest.report.figures.maps import ColourScale
 from modeharvest.report.figures.style import BLUE, GOLD, GREEN, GREY, INK, RED
-from modeharvest.runs.photographs.results import Harvest, HarvestedFrame
+from modeharvest.report.figures.whole_field import WholeMaps
+from modeharvest.runs.photographs.results import FrameTruth, Harvest, HarvestedFrame
 from modeharvest.util.arrays import FloatArray
 
 MOST_SHOWN = 6
@@ -251,9 +252,8 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
 
     "true_w" is truth - IDIC, "best" truth - best fit, "loss" best fit - IDIC.
     """
-    harvest, map_frame = state.harvest, state.view.map_frame()
-    assert harvest.truth is not None
-    known = harvest.truth.frames[state.frame.name]
+    harvest, map_frame, known = state.harvest, state.view.map_frame(), truth_of(state)
+    assert known is not None
     rows, cols = map_frame.pixels
     x, y = harvest.grid.x[cols], harvest.grid.y[rows]
     fields: dict[str, Callable[[], FloatArray]] = {
@@ -266,6 +266,19 @@ def draw_error_against_truth(state: PhotographState, part: str) -> Figure:
     length = np.linalg.norm(fields[first]() - fields[second](), axis=-1)
     return fits.draw_length(state, np.where(harvest.mask[np.ix_(rows, cols)], length, np.nan))
 
+
+def truth_of(state: PhotographState) -> FrameTruth | None:
+    """The truth of a photograph, where it is known."""
+    truth = state.harvest.truth
+    return None if truth is None else truth.frames.get(state.frame.name)
+
+
+def has_truth(state: PhotographState) -> bool:
+    """Whether that is known."""
+    return truth_of(state) is not None
+
+
+WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(lambda state: state.frame.whole, truth_of)
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]
 _LEGEND = 0.26  # [in]

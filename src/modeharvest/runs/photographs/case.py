@@ -17,6 +17,7 @@ from modeharvest.idic.local.subsets import SubsetOptions
 from modeharvest.idic.photograph.geometry import Corners, SpecimenTable
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.runs.case import CaseModel
+from modeharvest.runs.whole_field import WholeFieldOptions
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.typed import nearest
 
@@ -156,6 +157,7 @@ class PhotographCase(CaseModel):
     local: LocalTable = LocalTable()
     noise: NoiseTable = NoiseTable()
     correlation: PhotographOptions = PhotographOptions()
+    whole_field: WholeFieldOptions = WholeFieldOptions()
 
     _base: Path = PrivateAttr(Path())
 

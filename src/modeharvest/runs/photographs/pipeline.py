@@ -6,6 +6,7 @@
     prepared/                           prepare     photographs without distortion, masks
     results/NAME.json  NAME.npz         correlate   what was found, and the field it started from
     results/NAME_start.json                         where it started from, in words
+    whole_field/                        measure     whole displacements, where they are asked for
     report.html  summary.json           report      everything that was found
     stages.json timings.json                        which stages are finished, what they took
 """
@@ -34,6 +35,8 @@ from modeharvest.runs.photographs.results import (
     harvested_frame,
 )
 from modeharvest.runs.photographs.summary import harvest_summary
+from modeharvest.runs.photographs.whole_field import PhotographWholeFields
+from modeharvest.runs.whole_field import change_of
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, silent
@@ -107,11 +110,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         prepared = self.prepared()
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
         found: dict[str, MeasuredPhotograph] = {}
-        how, local = self.case.plain(), self.case.local.files
-        key = digest([self._prepared_key(), [how["correlation"], how["local"]]])
-        fields = prepare.of_each_photograph(self.case, local, "local.files")
-        for name in prepared.names:
-            key = digest([key, name, sha256_of(fields[name]) if name in fields else ""])
+        for name, key in self._keys.items():
             measured = self._measured(prepared, name, found, key)
             if measured is not None:
                 found[name] = measured
@@ -119,6 +118,27 @@ class HarvestRun(StagedRun[PhotographCase]):
             name, reason = self.failures()[0]
             raise InputError(f"{name}: {reason}")
         return found
+
+    @cached_property
+    def _keys(self) -> dict[str, str]:
+        """Of the stages that correlate, each depending on those before it."""
+        how, local, keys = self.case.plain(), self.case.local.files, {}
+        key = digest([self._prepared_key(), [how["correlation"], how["local"]]])
+        fields = prepare.of_each_photograph(self.case, local, "local.files")
+        for name in self.prepared().names:
+            key = digest([key, name, sha256_of(fields[name]) if name in fields else ""])
+            keys[name] = key
+        return keys
+
+    @cached_property
+    def whole_fields(self) -> PhotographWholeFields | None:
+        """The stages that measure whole displacements; None where the case says not to."""
+        if not self.case.whole_field.measure:
+            return None
+        return PhotographWholeFields(
+            self.case, self.folder, self.progress,
+            prepared=self.prepared(), results=self.results(), keys=self._keys,
+        )  # fmt: skip
 
     def failures(self) -> tuple[tuple[str, str], ...]:
         """Names of the photographs that were read but could not be measured, and why."""
@@ -129,10 +149,11 @@ class HarvestRun(StagedRun[PhotographCase]):
         """All that is known of the test, for the report."""
         case, prepared, region = self.case, self.prepared(), self.geometry.region
         results, source = self.results(), Path(self.source)
-        frames = []
+        frames, wholes = [], self.whole_fields
         for k, (name, measured) in enumerate(results.items()):
             self.progress(k, len(results), "error bars")
-            frames.append(harvested_frame(case, prepared, self.geometry, name, measured))
+            frame = harvested_frame(case, prepared, self.geometry, name, measured)
+            frames.append(frame if wholes is None else wholes.added(frame))
         moments = [amplitude_of(frame, region.cellular) for frame in frames]
         return Harvest(
             title=case.title or "Photographs of a test",
@@ -249,15 +270,20 @@ class HarvestRun(StagedRun[PhotographCase]):
 
 
 def harvest(
-    case: str | Path | CaseModel, folder: Path | str, progress: Progress = silent
+    case: str | Path | CaseModel,
+    folder: Path | str,
+    progress: Progress = silent,
+    whole_field: bool | None = None,
 ) -> dict[str, Any]:
     """Harvest modes from photographs of a test; what ``modeharvest harvest`` does.
 
-    ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files.
+    ``case``: the path of its TOML file, or the case itself; ``folder``: where to leave the files;
+    ``whole_field``: whether to measure whole displacements, None for what the case says.
     Returns the content of ``summary.json``. Raises InputError if the case can't be used; before
     anything is computed, if a file is missing.
     """
     found = PhotographCase.of(case)
+    found = found.model_copy(update=change_of(found.whole_field, whole_field))
     prepare.require_inputs(found)
-    source = "CASE" if case is found else str(case)
+    source = "CASE" if isinstance(case, CaseModel) else str(case)
     return HarvestRun(found, Path(folder), progress, source).all()

@@ -30,6 +30,7 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
+from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,8 @@ class HarvestedFrame:
     """Spectrum and pattern of every part that has modes of its own, in one order for all
     photographs."""
     local: LocalField | None = None
+    whole: WholeField | None = None
+    """The whole displacement, if it was measured."""
     start_text: tuple[str, ...] = ()
     """Where the correlation started from."""
     warnings: tuple[str, ...] = ()
@@ -109,6 +112,8 @@ class FrameTruth:
     """(rows, cols, 2) [mm], NaN off the material; may be memory-mapped."""
     best: Result
     """The best fit of the frame's ansatz to it."""
+    whole: WholeFieldSummary | None = None
+    """How far from it the whole displacement is, if that was measured."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from modeharvest.idic.uncertainty.covariance import propagated_sd
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.runs.photographs.prepare import calibration_text
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame, rms_errors
+from modeharvest.runs.photographs.whole_field import whole_summary
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.typed import picked, to_plain
 
@@ -145,6 +146,7 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
             and rms_errors(frame, frame.by_model_error, harvest.cellular),
         },
         "local": _local(harvest, frame),
+        "whole_field": whole_summary(harvest, frame),
         "modes": [mode_numbers(harvest, frame, i) for i in frame.modes],
         "pattern_reading": () if frame.pattern is None else frame.pattern.text,
         "start": frame.start_text,

@@ -1,0 +1,156 @@
+"""The whole displacement on a page: its maps, of any kind of run, and tables of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.report.figures import fits
+from modeharvest.report.figures.fits import UM, Panel, S
+from modeharvest.report.figures.maps import ColourScale, MapFrame, draw_field
+from modeharvest.report.model import Card, Cell, ReportTable
+from modeharvest.util.typed import quantities
+from modeharvest.validation.truth import lengths
+from modeharvest.validation.whole_field import WholeField, WholeFieldNumbers, WholeFieldSummary
+
+Numbers = Mapping[str, Any]
+"""A whole displacement's in ``summary.json``."""
+
+
+class HasTruth(Protocol):
+    """Knows the true displacement."""
+
+    @property
+    def displacement(self) -> NDArray[Any]:
+        """(rows, cols, 2) at the images' pixels [mm]."""
+
+
+@dataclass(frozen=True)
+class WholeMaps(Generic[S]):
+    """Maps of the whole displacement of states."""
+
+    whole: Callable[[S], WholeField | None]
+    truth: Callable[[S], HasTruth | None]
+    """Of a state, where they are known; may wait for them."""
+    is_known: Callable[[S], bool] | None = None
+    """Whether both are, where finding out may wait otherwise."""
+
+    def panels(self, figure: str = "-", scale: str = "whole-scale") -> list[Panel[S]]:
+        """Their panels; ``figure``: in the paper; ``scale``: name of the text on w's colours."""
+
+        def shows(state: S) -> bool:
+            return self.is_known(state) if self.is_known else self.whole(state) is not None
+
+        def known(state: S) -> bool:
+            return shows(state) and (self.is_known is not None or self.truth(state) is not None)
+
+        return [
+            Panel.of("whole", "whole-w", self._w, shows, scale, figure, late=True),
+            Panel.of("whole", "whole-error", self._error, known, late=True),
+            Panel.of("whole", "whole-strain", self._principal_strain, shows, late=True),
+            Panel.of("whole", "whole-deviation", self._deviation, shows, late=True),
+        ]
+
+    def _measured(self, state: S) -> NodalResult:
+        whole = self.whole(state)
+        assert whole is not None
+        return whole.measured
+
+    def _w(self, state: S) -> Figure:
+        """Measured u - v0 - sum v_i phi_i, on the colours of the true one where it is known."""
+        frame, result = state.view.map_frame(), state.result
+        grid = _pixels(frame, state.view.grid)
+        by_idic = result.displacement(grid)
+        w = UM * lengths(self._measured(state).displacement_on(grid) - by_idic)
+        true, shown = self.truth(state), w
+        if true is not None:
+            shown = UM * lengths(true.displacement[np.ix_(*frame.pixels)] - by_idic)
+        return draw_field(frame, w, ColourScale.size(shown, "µm", 0.998), state.motion)
+
+    def _error(self, state: S) -> Figure:
+        true, measured = self.truth(state), self._measured(state).displacement_on(state.view.grid)
+        assert true is not None
+        error = lengths(true.displacement - measured)
+        return fits.draw_length(state, state.view.map_frame().average(error))
+
+    def _principal_strain(self, state: S) -> Figure:
+        """The logarithmic strain of larger size, tension positive."""
+        frame, measured = state.view.map_frame(), self._measured(state)
+        values = np.linalg.eigvalsh(measured.logarithmic_strain)
+        is_first = np.abs(values[:, :1]) > np.abs(values[:, 1:])
+        larger = np.where(is_first, values[:, :1], values[:, 1:])
+        strain = measured.on_pixels(larger, _pixels(frame, state.view.grid))[..., 0]
+        return draw_field(frame, strain, ColourScale.signed(strain, "", 0.998), state.motion)
+
+    def _deviation(self, state: S) -> Figure:
+        frame, measured = state.view.map_frame(), self._measured(state)
+        sd = measured.standard_deviation_on(_pixels(frame, state.view.grid))
+        return fits.draw_length(state, lengths(sd))
+
+
+def _pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
+    """The images' pixels in the middle of a map's cells."""
+    rows, cols = frame.pixels
+    x, y = grid.to_mm(rows[0], cols[0])
+    return PixelGrid(len(rows), len(cols), frame.factor * grid.pixel_size, float(x), float(y))
+
+
+def whole_panel_numbers(key: str, numbers: Numbers) -> str:
+    """One line under the picture of a panel; empty if there is nothing to add."""
+    if key == "whole-w" and "w_rms_px" in numbers:
+        return (
+            f"rms {numbers['w_rms_px']:.3g} px per component, largest length "
+            f"{numbers['w_max_px']:.3g} px"
+        )
+    if key == "whole-error":
+        return (
+            f"rms {numbers['rms_px']:.2g} px per component on {100 * numbers['coverage']:.4g} % of "
+            f"the material, {numbers['rms_edges_px'] or 0.0:.2g} px within 10 px of an edge; "
+            f"largest length {numbers['max_px']:.2g} px"
+        )
+    if key == "whole-deviation" and "interval_coverage" in numbers:
+        return f"{100 * numbers['interval_coverage']:.3g} % of the truth in intervals of 95 %"
+    return ""
+
+
+def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
+    """Tables of whole displacements in photographs, each with its label: numbers, modes."""
+    if not found:
+        return []
+    labels, numbers = zip(*found, strict=True)
+    kinds = (WholeFieldNumbers, WholeFieldSummary)
+    heads = {name: f"{label} [{unit}]" if unit not in ("", "–") else label
+             for kind in kinds for label, unit, name in quantities(kind)}  # fmt: skip
+    rows: list[tuple[Cell, ...]] = [
+        (head, *(n.get(name) for n in numbers)) for name, head in heads.items()
+    ]
+    rows = [row for row in rows if any(value is not None for value in row[1:])]
+    table = ReportTable("Whole displacement", ("rms: per component", *labels), rows,
+                        "whole-numbers", on_terminal=True)  # fmt: skip
+    both = ("refitted to the whole displacement", "by IDIC")
+    columns = ("", "", *(f"{label}: {way}" for label in labels for way in both))
+    modes = ReportTable("Modes by both ways", columns, list(_mode_rows(numbers)), "whole-modes")
+    return [*Card.tabular(table, wide=True), *Card.tabular(modes, wide=True)]
+
+
+def _mode_rows(numbers: Sequence[Numbers]) -> Iterable[tuple[Cell, ...]]:
+    """Of every mode its largest amplitude and its parameters, by both ways in each photograph."""
+    for i in range(max(len(n["modes"]) for n in numbers)):
+        modes: list[Numbers] = [
+            n["modes"][i] if i < len(n["modes"]) else {"parameters": ()} for n in numbers
+        ]
+        largest = [mode.get(key) for mode in modes for key in ("v_max_mm", "correlated_v_max_mm")]
+        yield (f"largest |v{i + 1}|", "mm", *largest)
+        found = [{p["name"]: p for p in mode["parameters"]} for mode in modes]
+        units = {name: p["unit"] for column in found for name, p in column.items()}
+        for name, unit in units.items():
+            ways = (column.get(name, {}) for column in found)
+            values = [p.get(key) for p in ways for key in ("refitted", "correlated")]
+            yield (f"{name} of φ{i + 1}", unit, *values)

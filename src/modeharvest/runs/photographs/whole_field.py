@@ -1,0 +1,226 @@
+"""The whole displacement in photographs of a test, from what was correlated: a stage of a harvest.
+
+::
+
+    whole_field/NAME.h5  NAME.vtu    what was measured, on a mesh of the material
+    whole_field/NAME_refit.json      the correlation's ansatz, refitted to it
+    whole_field/NAME_start.json      where it started from, or why it could not be measured
+
+Each photograph starts from its own correlation. Where that did not find the displacement, it
+starts from the images, and from the photograph before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
+from modeharvest.idic.finite_element.pixels import continued
+from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.photograph.displacement import displacement_from, photographed_displacement
+from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise
+from modeharvest.idic.result import Result
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.idic.uncertainty.identifiability import identifiability
+from modeharvest.imaging.pair import ImagePair
+from modeharvest.imaging.spline import SplineImage
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.prepare import PreparedPhotographs
+from modeharvest.runs.photographs.results import Harvest, HarvestedFrame, TruthCheck
+from modeharvest.runs.whole_field import WholeFields
+from modeharvest.util.arrays import BoolArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.files import read_json, write_json
+from modeharvest.util.progress import Progress
+from modeharvest.util.stages import StagedRun, digest
+from modeharvest.util.typed import made, to_plain
+from modeharvest.validation.whole_field import (
+    WholeField,
+    WholeFieldSummary,
+    refitted,
+    v_percent,
+    waves_percent,
+    whole_numbers,
+)
+
+_ASTRAY = (Outcome.LOCAL_MINIMUM, Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
+"""Outcomes of a correlation that is no start."""
+_MISFIT, _SLIGHT = 2.0, 0.03
+"""Residual, over the images' noise and over their contrast, beyond which that is warned of."""
+
+_REFIT_WAVES, _REFIT_AMPLITUDE = 0.05, 0.5
+"""What must come out by the whole displacement [%], both against the best fit."""
+
+
+@dataclass(frozen=True)
+class _WholeRecord:
+    """``NAME_start.json``."""
+
+    failed: str
+    start: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotographWholeFields(StagedRun[PhotographCase]):
+    """Whole displacements of the photographs of a harvest, in its folder."""
+
+    prepared: PreparedPhotographs
+    results: Mapping[str, MeasuredPhotograph]
+    """Of the correlations, in the order of the test."""
+    keys: Mapping[str, str]
+    """Of the stages that left them."""
+
+    @cached_property
+    def found(self) -> dict[str, WholeField]:
+        """Measure every photograph that was correlated; leaves ``whole_field/``.
+
+        One that can't be measured is left out, and its frame has a warning.
+        """
+        found: dict[str, WholeField] = {}
+        key = digest(to_plain(self.case.whole_field))
+        for name in self.results:
+            key = digest([key, self.keys[name]])
+            whole = self._whole(name, next(reversed(found), None), found, key)
+            if whole is not None:
+                found[name] = whole
+        return found
+
+    def added(self, frame: HarvestedFrame) -> HarvestedFrame:
+        """A frame with its whole displacement, and warnings of it."""
+        whole, failed = self.found.get(frame.name), self._record(frame.name).failed
+        warnings = (failed,) if whole is None else whole.measured.warnings
+        return replace(frame, whole=whole, warnings=(*frame.warnings, *warnings))
+
+    @cached_property
+    def _files(self) -> WholeFields:
+        return WholeFields(self.folder / "whole_field")
+
+    @cached_property
+    def _mesh(self) -> Mesh:
+        how, prepared = self.case.whole_field, self.prepared
+        sizes = how.element_px, how.edge_element_px
+        return quadratic(mesh_of_mask(prepared.mask(), prepared.grid, *sizes))
+
+    def _whole(
+        self, name: str, before: str | None, found: Mapping[str, WholeField], key: str
+    ) -> WholeField | None:
+        correlated, last = self.results[name].result, None if before is None else found[before]
+        start, refit = self._path(f"{name}_start"), self._path(f"{name}_refit")
+
+        def work() -> tuple[Path, ...]:
+            is_usable = correlated.outcome not in _ASTRAY
+
+            def measured(progress: Progress) -> NodalResult:
+                pair, mesh = self._pair(name, before, found), self._mesh
+                if is_usable:
+                    at = correlated.ansatz.displacement_at(correlated.unknowns, mesh.nodes)
+                    cutoff = self.case.whole_field.cutoff_px
+                    return self._warned(displacement_from(at, pair, mesh, cutoff, progress), name)
+                names, known = ("the reference", name), None if last is None else last.measured
+                found_anew = photographed_displacement(pair, mesh, known, names, progress)
+                return self._warned(found_anew, name)
+
+            try:
+                files = self._files.measure(name, name, measured, self.progress)
+                refitted(self._files.read(name), correlated, self.prepared.mask()).write(refit)
+            except InputError as error:
+                write_json(start, to_plain(_WholeRecord(str(error))))
+                return (start,)
+            text = "the result of its correlation" if is_usable else "blocks of the speckle"
+            text += "" if is_usable or last is None else " and the photograph before"
+            write_json(start, to_plain(_WholeRecord("", text)))
+            return *files, refit, start
+
+        def read() -> WholeField | None:
+            record = self._record(name)
+            if record.failed:
+                return None
+            seconds = self._files.seconds(name)
+            return WholeField(self._files.read(name), Result.read(refit), seconds, record.start)
+
+        return self.do(f"whole field {name}", key, work, read)
+
+    def _pair(self, name: str, before: str | None, found: Mapping[str, WholeField]) -> ImagePair:
+        """A photograph and its reference, whose brightness is made the photograph's."""
+        pair, correlated = self.prepared.pair(name), self.results[name].result
+        reference, mask = pair.reference, pair.mask
+        if before is not None and self.case.correlation.formulation == "updated":
+            shown, inside = self._pulled_back(before, found[before].measured)
+            reference, mask = shown, self.prepared.mask() & inside
+        grid = pair.grid
+        gain, offset = correlated.ansatz.gain_and_offset(correlated.unknowns, grid.x, grid.y)
+        reference = ((reference - offset) / gain).astype(np.float32)
+        return replace(pair, reference=reference, mask=mask)
+
+    def _pulled_back(
+        self, name: str, measured: NodalResult
+    ) -> tuple[NDArray[np.float32], BoolArray]:
+        """A photograph g at x + u, in the reference's brightness, and where that is known."""
+        correlated, u = self.results[name].result, measured.displacement_on()
+        grid = measured.grid
+        rows, cols = np.nonzero(np.isfinite(u[..., 0]))
+        moved = u[rows, cols] / grid.pixel_size
+        beyond = continued(self.prepared.image(name), self.prepared.mask(name))
+        spline = SplineImage.of(beyond, correlated.order)
+        image = np.full(grid.shape, np.nan, dtype=np.float32)
+        image[rows, cols] = spline.sample(rows - moved[:, 1], cols + moved[:, 0])[0]
+        gain, offset = correlated.ansatz.gain_and_offset(correlated.unknowns, grid.x, grid.y)
+        inside = np.isfinite(image)
+        return np.where(inside, gain * image + offset, 0.0).astype(np.float32), inside
+
+    def _warned(self, measured: NodalResult, name: str) -> NodalResult:
+        """With a warning where the images don't match although noise is small."""
+        pair = self.prepared.pair(name)
+        noise = image_noise(pair, self.prepared.noise)
+        expected = float(np.hypot(noise.reference, noise.deformed))
+        contrast = float(pair.reference[pair.masks[0]].std())
+        if measured.residual_rms <= max(_MISFIT * expected, _SLIGHT * contrast):
+            return measured
+        text = (
+            f"The residual of the whole displacement is {measured.residual_rms:.3g} grey levels, "
+            f"of which noise is about {expected:.2g}: somewhere the images don't match."
+        )
+        return replace(measured, warnings=(*measured.warnings, text))
+
+    def _record(self, name: str) -> _WholeRecord:
+        return made(_WholeRecord, read_json(self._path(f"{name}_start")))
+
+    def _path(self, stem: str) -> Path:
+        return self._files.folder / f"{stem}.json"
+
+
+def whole_summary(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
+    """What ``summary.json`` says of a frame's whole displacement; None without."""
+    if frame.whole is None:
+        return None
+    known = harvest.truth.frames.get(frame.name) if harvest.truth else None
+    errors = asdict(known.whole) if known and known.whole else {}
+    return {**errors, **asdict(whole_numbers(frame.whole, frame.result, harvest.mask))}
+
+
+def whole_checks(
+    name: str, refit: Result, best: Result, errors: WholeFieldSummary, inside: NDArray[np.bool_]
+) -> list[TruthCheck]:
+    """What of one photograph's whole displacement was found, against the truth."""
+    of, edges = f"{name}: whole displacement", errors.rms_edges_px
+    rows = [
+        TruthCheck(f"{of}: truth − measured, rms", errors.rms_px, "as measured", True, "px"),
+        TruthCheck(f"{of}: … within 10 px of an edge", edges or 0.0, "as measured", True, "px"),
+    ]
+    has_pattern = best.ansatz.modes and best.ansatz.modes[0].family.size
+    if not has_pattern or identifiability(best, inside).unobservable:
+        return rows
+    v, waves = v_percent(refit, best), waves_percent(refit, best)
+    words = f"{of}: v1 of the refitted ansatz − of the best fit, largest, of its maximum"
+    limit = f"≤ {_REFIT_AMPLITUDE:g}"
+    rows.append(TruthCheck(words, v, limit, v <= _REFIT_AMPLITUDE, "%"))
+    words, limit = f"{of}: wave vectors likewise", f"≤ {_REFIT_WAVES:g}"
+    return [*rows, TruthCheck(words, waves, limit, waves <= _REFIT_WAVES, "%")]

@@ -1,0 +1,181 @@
+"""The whole displacement in photographs of a test: measured beside the modes, up to the edges."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from documented_keys import undocumented
+from numpy.typing import NDArray
+from synthetic_photographs import Displacement, Photographed, lattice_points, of
+from test_cli import called, error_line
+
+from modeharvest.idic.ansatz import Ansatz
+from modeharvest.idic.chebyshev import Box
+from modeharvest.idic.correlate import fit_displacement
+from modeharvest.idic.finite_element.files import read_result
+from modeharvest.idic.modes import square_family
+from modeharvest.idic.result import Result
+from modeharvest.idic.solver.gauss_newton import Outcome
+from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import PhotographCase
+from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
+from modeharvest.util.errors import InputError
+
+pytest.importorskip("gmsh")
+
+PITCH, PIXEL = 1.9, 0.035
+W_PX = 0.8
+CELLULAR, DOMAIN = Box.centred(4 * PITCH, 4 * PITCH), Box.centred(4 * PITCH + 1.6, 4 * PITCH + 1.6)
+HOLES = lattice_points(PITCH * np.eye(2), CELLULAR, (PITCH / 2, PITCH / 2))
+ANSATZ = Ansatz.on(DOMAIN, [(square_family("junction"), CELLULAR)], PITCH)
+SCENE = Photographed(PixelGrid.centred(310, 310, PIXEL), DOMAIN, HOLES, 1.4)
+STATES = {"frame_1": 0.03, "frame_2": 0.05}
+FloatArray = NDArray[np.float64]
+
+
+def w(points: FloatArray) -> FloatArray:
+    """Two waves per cell, which no ansatz of a pattern of two cells can describe [mm]."""
+    x, y = np.moveaxis(2.0 * np.pi * points / PITCH, -1, 0)
+    return W_PX * PIXEL * np.stack([np.sin(y), np.sin(x)], axis=-1)
+
+
+def truth(strain: float) -> Displacement:
+    known = of(ANSATZ, ANSATZ.initial_guess(strain, 3.0))
+    return lambda points: known(points) + strain / 0.05 * w(points)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photographs")
+    SCENE.save(folder, {name: truth(strain) for name, strain in STATES.items()})
+    return folder
+
+
+def experiment(folder: Path, more: str = "", formulation: str = "total") -> Path:
+    path = folder / "experiment.toml"
+    path.write_text(
+        '[images]\nreference = "reference.tif"\ndeformed = ["frame*.tif"]\n'
+        f"[scale]\npixel_size = {PIXEL}\n[specimen]\ncell_size = {PITCH}\n"
+        f"[correlation]\nv0_degree = 2\nv_degree = 1\nformulation = '{formulation}'\n"
+        f"gain_degree = 0\n{more}"
+    )
+    return path
+
+
+def rms_px(field: FloatArray, inside: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(np.mean(field[inside] ** 2)) / PIXEL)
+
+
+@pytest.fixture(scope="module")
+def harvested(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    harvest(experiment(photographs), out, whole_field=True)
+    return out
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "summary.json").read_text()))
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_what_the_ansatz_cannot_describe_is_measured(
+    photographs: Path, harvested: Path, formulation: str, tmp_path: Path
+) -> None:
+    folder = harvested
+    if formulation == "updated":
+        folder, text = tmp_path, "[whole_field]\nmeasure = true\n"
+        run = HarvestRun(PhotographCase.read(experiment(photographs, text, formulation)), folder)
+        assert run.whole_fields is not None
+        assert list(run.whole_fields.found) == list(STATES)
+    for name, strain in STATES.items():
+        measured = read_result(folder / "whole_field" / f"{name}.h5")
+        error = measured.displacement_on() - truth(strain)(SCENE.points)
+        there = SCENE.mask & np.isfinite(error[..., 0])
+        assert there.sum() > 0.999 * SCENE.mask.sum()
+        correlated = Result.read(folder / "results" / f"{name}.json")
+        by_idic = correlated.displacement() - truth(strain)(SCENE.points)
+        # Noise of 1 % and masks found to a pixel leave 0.1 px; the ansatz leaves w.
+        assert rms_px(error, there) < 0.12
+        assert rms_px(error, there) < 0.4 * rms_px(by_idic, there)
+        assert (folder / "whole_field" / f"{name}.vtu").is_file()
+
+
+def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) -> None:
+    found = summary(harvested)
+    assert not undocumented(found, "harvest.md")
+    last = found["frames"][-1]["whole_field"]
+    expected = rms_px(w(SCENE.points), SCENE.mask)
+    assert last["w_rms_px"] == pytest.approx(expected, rel=0.1)
+    assert last["w_rms_px"] < last["w_max_px"]
+    assert last["coverage"] > 0.999
+    assert last["start"] == "the result of its correlation"
+    (mode,) = last["modes"]
+    assert [p["name"] for p in mode["parameters"]] == list(square_family("junction").names)
+    refit = Result.read(harvested / "whole_field" / "frame_2_refit.json")
+    assert [p["refitted"] for p in mode["parameters"]] == pytest.approx(
+        list(refit.mode_parameters())
+    )
+    true = truth(STATES["frame_2"])(SCENE.points)
+    best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
+    apart = rms_px(refit.displacement() - best.displacement(), SCENE.mask)
+    # What noise of 1 % and masks found to a pixel leave; w pulls IDIC away from it.
+    assert apart < 0.02
+    correlated = Result.read(harvested / "results" / "frame_2.json")
+    assert apart < 0.3 * rms_px(correlated.displacement() - best.displacement(), SCENE.mask)
+    page = (harvested / "report.html").read_text("utf-8")
+    for words in ("Microfluctuation field, measured", "Principal strain", "Modes by both ways"):
+        assert words in page
+
+
+def test_again_repeats_nothing(photographs: Path, harvested: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in harvested.glob("whole_field/*")}
+    text = "[whole_field]\nmeasure = true\n"
+    run = HarvestRun(PhotographCase.read(experiment(photographs, text)), harvested)
+    assert run.whole_fields is not None
+    assert len(run.whole_fields.found) == 2
+    assert {p: p.stat().st_mtime_ns for p in harvested.glob("whole_field/*")} == before
+
+
+def test_it_is_left_out_unless_asked_for(photographs: Path, tmp_path: Path) -> None:
+    run = HarvestRun(PhotographCase.read(experiment(photographs)), tmp_path)
+    assert run.whole_fields is None
+    assert run.harvest().frames[0].whole is None
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("element_px = 2.0", "element_px"),
+        ("material_law = true", "unknown key whole_field.material_law"),
+        ("mesure = true", "did you mean 'measure'"),
+    ],
+)
+def test_bad_input(
+    photographs: Path, tmp_path: Path, line: str, message: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    path = experiment(photographs, f"[whole_field]\n{line}\n")
+    assert called(monkeypatch, "harvest", path, "--out", tmp_path / "out") == 2
+    assert message in error_line(capsys)
+
+
+def test_where_there_is_no_mesh_the_modes_are_harvested_all_the_same(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise InputError("expected wider ligaments")
+
+    monkeypatch.setattr("modeharvest.runs.photographs.whole_field.mesh_of_mask", fail)
+    text = "[whole_field]\nmeasure = true\n"
+    found = HarvestRun(PhotographCase.read(experiment(photographs, text)), tmp_path).harvest()
+    assert len(found.frames) == 2
+    for frame in found.frames:
+        assert frame.whole is None
+        assert frame.result.outcome is Outcome.CONVERGED
+        message = frame.warnings[-1]
+        assert f"whole displacement, {frame.name}: expected wider ligaments" in message
+        assert "--no-whole-field" in message
