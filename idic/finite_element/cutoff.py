@@ -22,11 +22,14 @@ wavelength 1.4 times as long changes, in the mean square around each node.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from modeharvest.idic.finite_element.system import Body, add_at
+from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.fields import mean_around, nodal_gradient
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.util.arrays import FloatArray
 
 _PROBES = 4
@@ -116,24 +119,42 @@ def newton_step(body: Body, at: Linearised, cutoff: float) -> FloatArray:
     return body.factor(at.M, at.R, weight).solve(at.gradient - weight * at.penalty)
 
 
-def deviations(body: Body, at: Linearised, cutoff: float) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations by noise, and bias by smoothing, of u.
+class Deviations(NamedTuple):
+    """Standard deviations of u and of its gradient."""
 
-    Returns
-    -------
-    by_noise
-        (n, 2) for noise of standard deviation 1 [mm]: the rms of A^-1 e for random e of the
-        covariance M.
-    bias
-        (n, 2) rms around each node [mm].
+    by_noise: FloatArray
+    bias: FloatArray
+    """(n, 2) of u by noise and by smoothing [mm]."""
+    gradient: FloatArray
+    """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
+
+
+def deviations(body: Body, at: Linearised, cutoff: float, noise: float) -> Deviations:
+    """Estimate what noise and smoothing make of u.
+
+    By noise, the rms of A^-1 e for random e of the covariance M times that of the noise; by
+    smoothing, the rms around each node of what a longer cut-off wavelength changes.
+
+    cutoff : wavelength [mm].
+    noise : its standard deviation at long wavelengths [grey levels].
     """
+    mesh = body.mesh
     longer = newton_step(body, at, _STEP * cutoff)
     change = (longer - newton_step(body, at, cutoff)).reshape(-1, 2)
     factor = body.factor(at.M, at.R, body.weight(at.M, at.R, cutoff))
-    found = factor.solve(body.samples(at.blocks, _SAMPLES))
-    by_noise = np.sqrt(np.mean(found**2, axis=1)).reshape(-1, 2)
-    cells = body.mesh.cells
-    around, count = np.zeros_like(change), np.zeros((len(change), 1))
-    add_at(around, cells, np.repeat((change[cells] ** 2).mean(axis=1, keepdims=True), 6, axis=1))
-    add_at(count, cells, np.ones((*cells.shape, 1)))
-    return by_noise, np.sqrt(around / np.maximum(count, 1.0))
+    found = noise * factor.solve(body.samples(at.blocks, _SAMPLES)).reshape(-1, 2, _SAMPLES)
+    slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)
+    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes) / _SAMPLES
+    slope = nodal_gradient(mesh, change)
+    bias = np.einsum("nij,nkl->nijkl", slope, slope)
+    return Deviations(
+        np.sqrt(np.mean(found**2, axis=2)),
+        np.sqrt(smoothed(mesh, change**2)),
+        (spread + smoothed(mesh, bias)).reshape(-1, 4, 4),
+    )
+
+
+def smoothed(mesh: Mesh, nodal: FloatArray) -> FloatArray:
+    """(n, ...) means of nodal values over the elements around each node."""
+    means = nodal[mesh.cells].mean(axis=1, keepdims=True)
+    return mean_around(mesh, np.repeat(means, mesh.cells.shape[1], axis=1))

@@ -4,6 +4,8 @@ The HDF5 file can be read with h5py alone::
 
     nodes (n, 2)    cells (m, 6)    @element @format @unit @info (JSON: all that is not an array)
     displacement, start, standard_deviation, noise_deviation (n, 2)    each with @unit
+    gradient_covariance (n, 4, 4)
+    fields/NAME (n, ...) float32, with @unit: what follows from them, see ``fields.FIELDS``
 
 Lengths are in mm, or in px where the size of a pixel isn't known; ``unit`` says which.
 """
@@ -11,35 +13,57 @@ Lengths are in mm, or in px where the size of a pixel isn't known; ``unit`` says
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import meshio
 import numpy as np
 
 from modeharvest.fem.field import COMPRESSED, read_mesh, write_mesh
-from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.fem.materials import Material
+from modeharvest.idic.finite_element.fields import FIELDS
+from modeharvest.idic.finite_element.result import NodalResult, Where
+from modeharvest.idic.result import Result
 from modeharvest.imaging.photographs.files import write_image
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, atomic_hdf5, open_hdf5
 from modeharvest.util.typed import made, to_plain
 
-FORMAT = "modeharvest-nodal-displacement-1"
+FORMAT = "modeharvest-nodal-displacement-2"
 _TYPES = get_type_hints(NodalResult)
 _ARRAYS = [name for name, kind in _TYPES.items() if kind == FloatArray]
 _PLAIN = [name for name in _TYPES if name not in (*_ARRAYS, "mesh", "timings_s")]
 """Two measurements leave the same bytes, so their seconds are kept elsewhere."""
-_TENSORS = {"F": "xx xy yx yy", "green_lagrange": "xx yy xy", "logarithmic": "xx yy xy"}
-_VECTORS = {"displacement": ("u", "v up"), "standard_deviation": ("sd_u", "sd_v")}
-"""What components of fields are called in tables."""
+_VECTORS = {
+    "displacement": ("u", "v up"),
+    "standard_deviation": ("sd_u", "sd_v"),
+    "microfluctuation": ("w_x", "w_y up"),
+}
+"""What components of lengths are called in tables."""
 
 
-def write_result(path: Path | str, result: NodalResult, unit: str = "mm") -> None:
+class Given(NamedTuple):
+    """What else than the measurement is known."""
+
+    material: Material | None = None
+    """In plane strain, for stresses."""
+    correlation: Result | None = None
+    """For w, what its ansatz leaves."""
+
+
+NO_MORE = Given()
+"""Images alone."""
+
+
+def write_result(
+    path: Path | str, result: NodalResult, unit: str = "mm", given: Given = NO_MORE
+) -> None:
     """Write all of a result but its seconds as HDF5, losslessly and atomically.
 
-    ``unit`` of its lengths: "mm" or "px".
+    ``unit`` of its lengths: "mm" or "px"; for readers without modeharvest also all fields that
+    follow.
     """
     with atomic_hdf5(path) as file:
         plain = {name: to_plain(getattr(result, name)) for name in _PLAIN}
@@ -47,8 +71,15 @@ def write_result(path: Path | str, result: NodalResult, unit: str = "mm") -> Non
         write_mesh(file, result.mesh)
         for name in _ARRAYS:
             file.create_dataset(name, data=getattr(result, name), **COMPRESSED)
+        for name in field_names(given):
+            if name in _ARRAYS:
+                continue
+            values = field_at(result, name, None, given).astype(np.float32)
+            data = file.create_dataset(f"fields/{name}", data=values, **COMPRESSED)
+            known = FIELDS.get(name.removeprefix("sd_"))
+            data.attrs["unit"] = known.unit if known else unit
         for name in ("nodes", *_ARRAYS):
-            file[name].attrs["unit"] = unit
+            file[name].attrs["unit"] = "" if name == "gradient_covariance" else unit
 
 
 def read_result(path: Path | str) -> NodalResult:
@@ -59,41 +90,50 @@ def read_result(path: Path | str) -> NodalResult:
             raise InputError(f"expected {', '.join(_PLAIN)} in its attribute info, got others")
         arrays = {name: np.asarray(file[name], dtype=np.float64) for name in _ARRAYS}
         for name, values in arrays.items():
-            if values.shape != mesh.nodes.shape or not np.isfinite(values).all():
+            shape = (len(mesh.nodes), *((4, 4) if name == "gradient_covariance" else (2,)))
+            if values.shape != shape or not np.isfinite(values).all():
                 raise InputError(
-                    f"expected finite numbers of shape {mesh.nodes.shape} as {name}, got shape "
+                    f"expected finite numbers of shape {shape} as {name}, got shape "
                     f"{values.shape} with {int((~np.isfinite(values)).sum())} that are not"
                 )
         plain: dict[str, Any] = {name: made(_TYPES[name], info[name]) for name in _PLAIN}
         return NodalResult(mesh=mesh, **plain | arrays)
 
 
-def nodal_fields(result: NodalResult) -> dict[str, FloatArray]:
-    """Everything that is written at nodes, by its name: (n,), (n, 2) or (n, 2, 2).
+def field_names(given: Given = NO_MORE) -> list[str]:
+    """Names of all that is written: of lengths, of ``fields.FIELDS``, "sd_..." of its deviations.
 
-    Displacement and its standard deviation [mm]; deformation gradient F, Green-Lagrange and
-    logarithmic strain, J = det F, principal stretches and the direction of the larger one [-].
+    w needs a correlation, stresses a material.
     """
-    F = result.deformation_gradient
-    square, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", F, F))
-    stretches = np.sqrt(np.maximum(square, 0.0))
-    return {
-        "displacement": result.displacement,
-        "standard_deviation": result.standard_deviation,
-        "F": F,
-        "green_lagrange": result.green_lagrange,
-        "logarithmic": result.logarithmic_strain,
-        "J": np.linalg.det(F),
-        "stretch_1": stretches[:, 1],
-        "stretch_2": stretches[:, 0],
-        "direction_1": directions[:, :, 1],
-    }
+    lengths = [name for name in _VECTORS if given.correlation or name != "microfluctuation"]
+    names = [name for name, field in FIELDS.items() if given.material or not field.needs_material]
+    return [*lengths, *names, *(f"sd_{name}" for name in names)]
 
 
-def write_vtu(path: Path | str, result: NodalResult, unit: str = "mm") -> None:
+def field_at(
+    result: NodalResult, name: str, where: Where = None, given: Given = NO_MORE
+) -> FloatArray:
+    """(n, ...), (rows, cols, ...) or (k, ...) one of them at the nodes, at pixels or at points."""
+    if name == "displacement":
+        return result.values_at(result.displacement, where)
+    if name == "standard_deviation":
+        return result.deviation_at(result.standard_deviation, where)
+    if name == "microfluctuation":
+        if given.correlation is None:
+            raise InputError("expected a correlation for the field 'microfluctuation', got none")
+        return result.microfluctuation(given.correlation, where)
+    if name.startswith("sd_"):
+        return result.field_deviation(name.removeprefix("sd_"), where, given.material)
+    return result.field(name, where, given.material)
+
+
+def write_vtu(
+    path: Path | str, result: NodalResult, unit: str = "mm", given: Given = NO_MORE
+) -> None:
     """Write mesh and fields for ParaView, atomically; vectors and tensors in three dimensions."""
     fields = {}
-    for name, values in nodal_fields(result).items():
+    for name in field_names(given):
+        values = field_at(result, name, None, given)
         padded = np.zeros((len(values), *(3,) * (values.ndim - 1)))
         padded[tuple(slice(size) for size in values.shape)] = values
         label = f"{name}_{unit}" if name in _VECTORS else name
@@ -105,56 +145,62 @@ def write_vtu(path: Path | str, result: NodalResult, unit: str = "mm") -> None:
 
 
 def columns_at(
-    result: NodalResult, points: FloatArray | None = None, unit: str = "mm"
+    result: NodalResult,
+    points: FloatArray | None = None,
+    unit: str = "mm",
+    given: Given = NO_MORE,
 ) -> dict[str, FloatArray]:
     """Columns (k,) of a table at points (k, 2) [mm], or at the nodes; NaN beside the mesh."""
-    columns: dict[str, FloatArray] = {}
-    for name, values in nodal_fields(result).items():
-        for label, nodal in _components(name, values, unit).items():
-            if points is None:
-                columns[label] = nodal
-            elif name == "standard_deviation":  # which stays positive so
-                columns[label] = np.exp(result.at(points, np.log(nodal)[:, None])[:, 0])
-            else:
-                columns[label] = result.at(points, nodal[:, None])[:, 0]
     x, y = (result.mesh.nodes if points is None else np.asarray(points, dtype=np.float64)).T
     row, col = result.grid.to_px(x, y)
-    return {f"x [{unit}]": x, f"y up [{unit}]": y, "row": row, "column": col, **columns}
+    columns = {f"x [{unit}]": x, f"y up [{unit}]": y, "row": row, "column": col}
+    for name in field_names(given):
+        columns |= _components(name, field_at(result, name, points, given), unit)
+    return columns
 
 
-def _components(name: str, values: FloatArray, unit: str) -> Mapping[str, FloatArray]:
-    """The components (n,) of a nodal field, by what they are called in tables."""
+def _components(name: str, values: FloatArray, unit: str) -> dict[str, FloatArray]:
+    """The components (...) of a field, by what they are called in tables."""
     if name in _VECTORS:
         labels = [f"{label} [{unit}]" for label in _VECTORS[name]]
-        return dict(zip(labels, values.T, strict=True))
-    if name in _TENSORS:
-        return {
-            f"{name}_{part}": values[:, "xy".index(part[0]), "xy".index(part[1])]
-            for part in _TENSORS[name].split()
-        }
-    if values.ndim == 2:
-        return {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xy")}
-    return {name: values}
+        return dict(zip(labels, np.moveaxis(values, -1, 0), strict=True))
+    field = FIELDS[name.removeprefix("sd_")]
+    end = f" [{field.unit}]" if field.unit else ""
+    found = field.components(values)
+    return {"_".join(filter(None, (name, part))) + end: found[part] for part in found}
 
 
 def write_csv(
-    path: Path | str, result: NodalResult, points: FloatArray | None = None, unit: str = "mm"
+    path: Path | str,
+    result: NodalResult,
+    points: FloatArray | None = None,
+    unit: str = "mm",
+    given: Given = NO_MORE,
 ) -> None:
     """Write all fields at points (k, 2) [mm], or at the nodes, as CSV, atomically."""
-    columns = columns_at(result, points, unit)
+    columns = columns_at(result, points, unit, given)
     table = np.column_stack(list(columns.values()))
     with atomic(path) as temporary:
         np.savetxt(temporary, table, "%.9g", ",", header=",".join(columns), comments="")
 
 
-def write_maps(stem: Path, result: NodalResult, unit: str = "mm") -> tuple[Path, ...]:
-    """Write u, v and their standard deviations at the pixels as float32 TIFF, NaN off the material.
+def write_maps(
+    stem: Path,
+    result: NodalResult,
+    unit: str = "mm",
+    names: Sequence[str] = ("displacement", "standard_deviation", "logarithmic"),
+    given: Given = NO_MORE,
+) -> tuple[Path, ...]:
+    """Write fields at the pixels as float32 TIFF, NaN off the material.
 
-    Files are called ``stem`` and what they hold: "stem_u_mm.tif".
+    ``names`` are those of :func:`field_names`. Files are called ``stem`` and what they hold:
+    "stem_u_mm.tif", "stem_logarithmic_xy.tif", "stem_cauchy_xx_MPa.tif".
     """
-    u, sd = result.displacement_on(), result.standard_deviation_on()
-    maps = {"u": u[..., 0], "v": u[..., 1], "sd_u": sd[..., 0], "sd_v": sd[..., 1]}
-    paths = tuple(stem.with_name(f"{stem.name}_{name}_{unit}.tif") for name in maps)
-    for path, values in zip(paths, maps.values(), strict=True):
-        write_image(path, values)
-    return paths
+    paths = []
+    for name in names:
+        values = field_at(result, name, result.grid, given)
+        for label, component in _components(name, values, unit).items():
+            plain = label.replace(" up", "").replace(" [", "_").replace("]", "")
+            paths.append(stem.with_name(f"{stem.name}_{plain}.tif"))
+            write_image(paths[-1], component)
+    return tuple(paths)

@@ -307,16 +307,16 @@ class _Measurement:
         excess = self._excess()
         here = risk(self.body, at, self.cutoff_px, px, excess)
         noise = here.noise * np.sqrt(excess)
-        by_noise, bias = deviations(self.body, at, self.cutoff_px * px)
-        by_noise = noise * by_noise
+        sd = deviations(self.body, at, self.cutoff_px * px, noise)
         self._lap("standard deviations")
         outside = int(self.pixels.start[-1]) - at.pixels
         return NodalResult(
             mesh=self.body.mesh,
             displacement=self.u.reshape(-1, 2),
             start=self.body.start,
-            standard_deviation=np.hypot(by_noise, bias),
-            noise_deviation=by_noise,
+            standard_deviation=np.hypot(sd.by_noise, sd.bias),
+            noise_deviation=sd.by_noise,
+            gradient_covariance=sd.gradient,
             grid=self.pair.grid,
             cutoff_px=self.cutoff_px,
             tried=self.tried,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import Material
 from modeharvest.idic.finite_element.cutoff import Risk
+from modeharvest.idic.finite_element.fields import deviation_of, field_of, nodal_gradient
+from modeharvest.idic.result import Result
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import shape_functions, shape_gradients
@@ -22,6 +26,8 @@ from modeharvest.util.errors import InputError
 _BEYOND_PX = 2.0
 """How far beyond the mesh's edge its fields are continued: the edge is known to half a pixel."""
 _CHUNK = 500_000
+Where = PixelGrid | FloatArray | None
+"""Pixels, points (k, 2) [mm], or the nodes."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,8 @@ class NodalResult:
     """(n, 2) of u by noise and smoothing [mm]."""
     noise_deviation: FloatArray
     """(n, 2) of u by noise alone [mm]."""
+    gradient_covariance: FloatArray
+    """(n, 4, 4) of the components xx, xy, yx, yy of F by noise and smoothing [-]."""
     grid: PixelGrid
     """The pixels of the images."""
     cutoff_px: float
@@ -80,15 +88,16 @@ class NodalResult:
         return self.displacement.size
 
     def on_pixels(self, nodal: FloatArray, grid: PixelGrid | None = None) -> FloatArray:
-        """(rows, cols, c) values of nodal fields (n, c); NaN farther than 2 px from the mesh."""
+        """(rows, cols, ...) fields (n, ...) at pixels; NaN farther than 2 px from the mesh."""
         mesh, grid = self.mesh, grid or self.grid
         located = locate(mesh.nodes, mesh.cells, mesh.element, grid)
-        values = interpolate(located, mesh.cells, mesh.element, np.ascontiguousarray(nodal))
-        _continue(mesh, grid, located, nodal, values)
-        return np.moveaxis(values, 0, -1)
+        flat = np.ascontiguousarray(nodal.reshape(len(nodal), -1))
+        values = interpolate(located, mesh.cells, mesh.element, flat)
+        _continue(mesh, grid, located, flat, values)
+        return np.moveaxis(values, 0, -1).reshape(*grid.shape, *nodal.shape[1:])
 
     def at(self, points: FloatArray, nodal: FloatArray | None = None) -> FloatArray:
-        """(k, c) values at points (k, 2) [mm], u [mm] by default; NaN beside the mesh."""
+        """(k, ...) nodal fields (n, ...), by default u [mm], at points (k, 2) [mm]; or NaN."""
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2:
             raise InputError(f"expected points of shape (k, 2), got {points.shape}")
@@ -96,10 +105,10 @@ class NodalResult:
         row, col = self.grid.to_px(points[:, 0], points[:, 1])
         found = locate_points(mesh.nodes, mesh.cells, mesh.element, self.grid, row[None], col[None])
         element, xi = found.element[0], found.xi[0]
-        values = np.full((len(points), nodal.shape[1]), np.nan)
+        values = np.full((len(points), *nodal.shape[1:]), np.nan)
         there = element >= 0
         N = shape_functions(mesh.element, xi[there])
-        values[there] = np.einsum("ka,kac->kc", N, nodal[mesh.cells[element[there]]])
+        values[there] = np.einsum("ka,ka...->k...", N, nodal[mesh.cells[element[there]]])
         return values
 
     def displacement_on(self, grid: PixelGrid | None = None) -> FloatArray:
@@ -108,37 +117,57 @@ class NodalResult:
 
     def standard_deviation_on(self, grid: PixelGrid | None = None) -> FloatArray:
         """(rows, cols, 2) standard deviation of u at pixels [mm]."""
-        smallest = 1e-12 * self.grid.pixel_size
-        return np.exp(self.on_pixels(np.log(np.maximum(self.standard_deviation, smallest)), grid))
+        return self.deviation_at(self.standard_deviation, grid or self.grid)
 
-    @property
+    def field(self, name: str, where: Where = None, material: Material | None = None) -> FloatArray:
+        """One of ``fields.FIELDS``: strains, and with a material stresses.
+
+        Returns (n, ...) at the nodes, (rows, cols, ...) at the pixels of a grid, (k, ...) at points
+        (k, 2) [mm]; NaN beside the mesh.
+        """
+        F = self.values_at(self.deformation_gradient, where)
+        found = field_of(name, F.reshape(-1, 2, 2), material)
+        return found.reshape(*F.shape[:-2], *found.shape[1:])
+
+    def field_deviation(
+        self, name: str, where: Where = None, material: Material | None = None
+    ) -> FloatArray:
+        """Standard deviation of :meth:`field` by noise and smoothing of u; the same shapes."""
+        sd = deviation_of(name, self.deformation_gradient, self.gradient_covariance, material)
+        return self.deviation_at(sd, where)
+
+    def microfluctuation(self, result: Result, where: Where = None) -> FloatArray:
+        """(n, 2), (rows, cols, 2) or (k, 2) w = u - v0 - sum v_i phi_i [mm], of a correlation's."""
+        w = self.displacement - result.ansatz.displacement_at(result.unknowns, self.mesh.nodes)
+        return self.values_at(w, where)
+
+    def values_at(self, nodal: FloatArray, where: Where) -> FloatArray:
+        """Values of nodal fields (n, ...) at the nodes, at pixels or at points."""
+        if where is None:
+            return nodal
+        return (
+            self.on_pixels(nodal, where) if isinstance(where, PixelGrid) else self.at(where, nodal)
+        )
+
+    def deviation_at(self, nodal: FloatArray, where: Where) -> FloatArray:
+        """The same of standard deviations, which stay positive."""
+        smallest = 1e-12 * max(self.grid.pixel_size, 1e-3)
+        return np.exp(self.values_at(np.log(np.maximum(nodal, smallest)), where))
+
+    @cached_property
     def deformation_gradient(self) -> FloatArray:
         """(n, 2, 2) F = I + du/dX at the nodes, the mean of the elements around each [-]."""
-        mesh = self.mesh
-        local = shape_gradients(mesh.element, _NODES)
-        x, u = mesh.nodes[mesh.cells], self.displacement[mesh.cells]
-        inverse = np.linalg.inv(np.einsum("eki,qkj->eqij", x, local))
-        gradient = np.einsum("eki,qkj,eqjl->eqil", u, local, inverse, optimize=True)
-        total, count = np.zeros((len(mesh.nodes), 2, 2)), np.zeros(len(mesh.nodes))
-        np.add.at(total, mesh.cells, gradient)
-        np.add.at(count, mesh.cells, 1.0)
-        return np.asarray(np.eye(2) + total / np.maximum(count, 1.0)[:, None, None])
+        return np.eye(2) + nodal_gradient(self.mesh, self.displacement)
 
     @property
     def green_lagrange(self) -> FloatArray:
         """(n, 2, 2) E = (F'F - I)/2 at the nodes [-]."""
-        F = self.deformation_gradient
-        return np.asarray(0.5 * (np.einsum("nki,nkj->nij", F, F) - np.eye(2)))
+        return self.field("green_lagrange")
 
     @property
     def logarithmic_strain(self) -> FloatArray:
         """(n, 2, 2) Hencky's strain ln U at the nodes, U^2 = F'F [-]."""
-        stretch, direction = np.linalg.eigh(np.eye(2) + 2.0 * self.green_lagrange)
-        half_log = 0.5 * np.log(np.maximum(stretch, 1e-12))
-        return np.asarray(np.einsum("nik,nk,njk->nij", direction, half_log, direction))
-
-
-_NODES = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]], dtype=np.float64)
+        return self.field("logarithmic")
 
 
 def _continue(

@@ -29,6 +29,7 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
+from modeharvest.idic.finite_element.files import Given
 from modeharvest.idic.finite_element.measure import measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
@@ -137,9 +138,12 @@ class Run(StagedRun[Case]):
         images, correlated = self._correlated()
         how = options.of(self.case.experiment, images.grid.pixel_size)
 
+        law = None if how.law is None else how.law.material
+        results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
+
         def one(strain: float, progress: Progress) -> NodalResult:
-            pair, start = images.pair(strain, camera=options.camera), self._result_path(strain)
-            return measure_displacement(pair, Result.read(start), options=how, progress=progress)
+            pair = images.pair(strain, camera=options.camera)
+            return measure_displacement(pair, results[strain], options=how, progress=progress)
 
         def work() -> list[Path]:
             return [
@@ -147,7 +151,7 @@ class Run(StagedRun[Case]):
                 for strain in images.strains
                 for path in self._whole_fields.measure(
                     name_of(strain), f"strain {100 * strain:.2f} %", partial(one, strain),
-                    self.progress,
+                    self.progress, Given(law, results[strain]),
                 )
             ]  # fmt: skip
 

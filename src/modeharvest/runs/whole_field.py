@@ -10,7 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.idic.finite_element.files import read_result, write_result, write_vtu
+from modeharvest.idic.finite_element.files import (
+    NO_MORE,
+    Given,
+    read_result,
+    write_result,
+    write_vtu,
+)
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     Law,
@@ -101,11 +107,12 @@ class WholeFields:
         of: str,
         work: Callable[[Progress], NodalResult],
         progress: Progress,
+        given: Given = NO_MORE,
     ) -> tuple[Path, Path]:
         """Measure by ``work`` and write what was found; returns the files.
 
-        ``of``: whose it is, for messages. Raises InputError where there is nothing to measure on,
-        with the way around.
+        ``of``: whose it is, for messages; ``given``: for stresses and w. Raises InputError
+        where there is nothing to measure on, with the way around.
         """
         begin, path = time.perf_counter(), self.path(name)
 
@@ -120,8 +127,8 @@ class WholeFields:
                 "false, --no-whole-field"
             ) from error
         make_folder(self.folder)
-        write_result(path, found)
-        write_vtu(path.with_suffix(".vtu"), found)
+        write_result(path, found, given=given)
+        write_vtu(path.with_suffix(".vtu"), found, given=given)
         seconds = {**self._seconds(), name: time.perf_counter() - begin}
         write_json(self.folder / _SECONDS, seconds)
         return path, path.with_suffix(".vtu")

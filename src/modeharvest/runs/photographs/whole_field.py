@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.finite_element.files import Given
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
@@ -129,7 +130,9 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
                 return self._warned(found_anew, name)
 
             try:
-                files = self._files.measure(name, name, measured, self.progress)
+                files = self._files.measure(
+                    name, name, measured, self.progress, Given(None, correlated)
+                )
                 refitted(self._files.read(name), correlated, self.prepared.mask()).write(refit)
             except InputError as error:
                 write_json(start, to_plain(_WholeRecord(str(error))))

@@ -1,0 +1,168 @@
+"""Strains and stresses that follow from a deformation gradient: one table of names and units.
+
+Standard deviations are those of F carried over: D C D', with the covariance C of the four
+components of F and the derivatives D of a field by central differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeharvest.fem.field import Mesh
+from modeharvest.fem.materials import JetMatrix, Material, stress_and_tangent
+from modeharvest.imaging.mapping.elements import reference_element, shape_gradients
+from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
+from modeharvest.util.typed import nearest
+
+_STEP = 1e-6
+"""Of the components of F, in central differences [-]."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """What follows from F (k, 2, 2), and for stresses from a material: (k,), (k, 2), (k, 2, 2)."""
+
+    parts: str
+    """What its components are called, in their order; of a symmetric tensor each once."""
+    of: Callable[[FloatArray, Material | None], FloatArray]
+    unit: str = ""
+    needs_material: bool = False
+
+    def components(self, values: FloatArray) -> dict[str, FloatArray]:
+        """Components (...) of values (..., 2, 2), (..., 2) or (...), by what they are called."""
+        names = self.parts.split()
+        if not names:
+            return {"": values}
+        return {
+            name: values[..., "xy".index(name[0]), "xy".index(name[1])]
+            if len(name) == 2
+            else values[..., "xy".index(name)]
+            for name in names
+        }
+
+
+def determinant(F: FloatArray) -> FloatArray:
+    """(k,) J [-]; NaN, silently, where F is."""
+    return np.asarray(F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0])
+
+
+def stretches(F: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(k,) larger and smaller principal stretch [-], direction of the larger one [rad].
+
+    The direction is that in the reference, from x towards y, in (-pi/2, pi/2].
+    """
+    C = np.einsum("...ki,...kj->...ij", F, F)
+    half, difference = 0.5 * (C[..., 0, 0] + C[..., 1, 1]), 0.5 * (C[..., 0, 0] - C[..., 1, 1])
+    larger = np.sqrt(half + np.hypot(difference, C[..., 0, 1]))
+    # Not the root of the difference, which cancels.
+    smaller = np.abs(determinant(F)) / np.maximum(larger, 1e-12)
+    return larger, smaller, 0.5 * np.arctan2(C[..., 0, 1], difference)
+
+
+def _direction(F: FloatArray) -> FloatArray:
+    angle = stretches(F)[2]
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _green_lagrange(F: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (np.einsum("...ki,...kj->...ij", F, F) - np.eye(2)))
+
+
+def _logarithmic(F: FloatArray) -> FloatArray:
+    larger, smaller, angle = stretches(F)
+    first, second = (np.log(np.maximum(stretch, 1e-12)) for stretch in (larger, smaller))
+    cos, sin = np.cos(2.0 * angle), np.sin(2.0 * angle)
+    turned = np.stack([np.stack([cos, sin], -1), np.stack([sin, -cos], -1)], -1)
+    mean, deviator = 0.5 * (first + second), 0.5 * (first - second)
+    return np.asarray(mean[..., None, None] * np.eye(2) + deviator[..., None, None] * turned)
+
+
+def _of_material(
+    of: Callable[[Material, FloatArray], FloatArray],
+) -> Callable[[FloatArray, Material | None], FloatArray]:
+    """A field of a material and F, NaN where F isn't a deformation: det F <= 0 or NaN."""
+
+    def found(F: FloatArray, material: Material | None) -> FloatArray:
+        assert material is not None
+        there = determinant(F) > 0.0
+        values = of(material, np.where(there[:, None, None], F, np.eye(2)))
+        return np.where(there.reshape(-1, *(1,) * (values.ndim - 1)), values, np.nan)
+
+    return found
+
+
+def _first_piola(material: Material, F: FloatArray) -> FloatArray:
+    return stress_and_tangent(material, F)[0]
+
+
+def _cauchy(material: Material, F: FloatArray) -> FloatArray:
+    J = determinant(F)[:, None, None]
+    return np.asarray(np.einsum("kij,klj->kil", _first_piola(material, F), F) / J)
+
+
+def _energy_density(material: Material, F: FloatArray) -> FloatArray:
+    return np.asarray(material.energy(JetMatrix(F)).value)
+
+
+_ALL, _SYMMETRIC = "xx xy yx yy", "xx yy xy"
+FIELDS: dict[str, Field] = {
+    "F": Field(_ALL, lambda F, _: F),
+    "green_lagrange": Field(_SYMMETRIC, lambda F, _: _green_lagrange(F)),
+    "logarithmic": Field(_SYMMETRIC, lambda F, _: _logarithmic(F)),
+    "J": Field("", lambda F, _: determinant(F)),
+    "stretch_1": Field("", lambda F, _: stretches(F)[0]),
+    "stretch_2": Field("", lambda F, _: stretches(F)[1]),
+    "direction_1": Field("x y", lambda F, _: _direction(F)),
+    "P": Field(_ALL, _of_material(_first_piola), "MPa", True),
+    "cauchy": Field(_SYMMETRIC, _of_material(_cauchy), "MPa", True),
+    "energy_density": Field("", _of_material(_energy_density), "MPa", True),
+}
+"""By their names: F; J = det F; the larger and smaller principal stretch and the larger one's
+direction in the reference; E = (F'F - I)/2; Hencky's ln U, U^2 = F'F; in plane strain the first
+Piola-Kirchhoff stress P = dW/dF, Cauchy's PF'/J, and the energy W of the reference's volume.
+"""
+
+
+def field_of(name: str, F: FloatArray, material: Material | None = None) -> FloatArray:
+    """(k, ...) a field at F (k, 2, 2); InputError for an unknown one, or without a material."""
+    if name not in FIELDS:
+        raise InputError(f"expected a field, got {name!r}{nearest(name, [*FIELDS])}")
+    if FIELDS[name].needs_material and material is None:
+        raise InputError(f"expected a material for the field {name!r}, got none")
+    return FIELDS[name].of(F, material)
+
+
+def deviation_of(
+    name: str, F: FloatArray, covariance: FloatArray, material: Material | None = None
+) -> FloatArray:
+    """(k, ...) standard deviation of a field at F, from the covariance (k, 4, 4) of xx xy yx yy."""
+    slopes = []
+    for step in _STEP * np.eye(4).reshape(4, 2, 2):
+        ahead, behind = (field_of(name, F + s * step, material) for s in (1, -1))
+        if name == "direction_1":  # either sign is the same direction
+            ahead *= np.sign(np.sum(ahead * behind, axis=1, keepdims=True))
+        slopes.append((ahead - behind) / (2.0 * _STEP))
+    D = np.stack(slopes, axis=-1)
+    return np.asarray(np.sqrt(np.maximum(np.einsum("k...i,kij,k...j->k...", D, covariance, D), 0)))
+
+
+def nodal_gradient(mesh: Mesh, nodal: FloatArray) -> FloatArray:
+    """(n, c, 2) gradient of nodal fields (n, c), the mean of the elements around each node."""
+    local = shape_gradients(mesh.element, reference_element(mesh.element).nodes)
+    x, u = mesh.nodes[mesh.cells], nodal[mesh.cells]
+    slopes = np.einsum("qkj,eqjl->eqkl", local, np.linalg.inv(np.einsum("eki,qkj->eqij", x, local)))
+    gradient = np.einsum("ekc,eqkl->eqcl", u, slopes, optimize=True)
+    return mean_around(mesh, gradient)
+
+
+def mean_around(mesh: Mesh, values: FloatArray) -> FloatArray:
+    """(n, ...) means over the elements around each node of values (m, k, ...) at theirs."""
+    flat, n = mesh.cells.ravel(), len(mesh.nodes)
+    columns = values.reshape(flat.size, -1).T
+    total = np.stack([np.bincount(flat, column, n) for column in columns], axis=1)
+    count = np.maximum(np.bincount(flat, minlength=n), 1)
+    return np.asarray((total / count[:, None]).reshape(n, *values.shape[2:]))
