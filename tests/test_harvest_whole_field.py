@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
+from modeharvest.runs.photographs.whole_field import PhotographWholeFields
 from modeharvest.util.errors import InputError
 
 pytest.importorskip("gmsh")
@@ -138,6 +140,25 @@ def test_again_repeats_nothing(photographs: Path, harvested: Path) -> None:
     assert run.whole_fields is not None
     assert len(run.whole_fields.found) == 2
     assert {p: p.stat().st_mtime_ns for p in harvested.glob("whole_field/*")} == before
+
+
+def test_without_a_correlation_the_images_are_the_start(
+    photographs: Path, harvested: Path, tmp_path: Path
+) -> None:
+    """From the first photograph's displacement, too."""
+    case = PhotographCase.read(experiment(photographs, "[whole_field]\nmeasure = true\n"))
+    results = dict(HarvestRun(case, harvested).results())
+    astray = results["frame_2"].result
+    lost = replace(astray, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.0 * astray.unknowns)
+    results["frame_2"] = replace(results["frame_2"], result=lost)
+    stages = PhotographWholeFields(
+        case, tmp_path, prepared=HarvestRun(case, harvested).prepared(),
+        results=results, keys=dict.fromkeys(results, ""),
+    )  # fmt: skip
+    found = stages.found["frame_2"]
+    assert found.start == "blocks of the speckle and the photograph before"
+    error = found.measured.displacement_on() - truth(STATES["frame_2"])(SCENE.points)
+    assert rms_px(error, SCENE.mask & np.isfinite(error[..., 0])) < 0.12
 
 
 def test_it_is_left_out_unless_asked_for(photographs: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from test_cli import called, error_line
 
 from modeharvest.cli.root import main
 from modeharvest.fem.field import Solution
@@ -124,6 +125,18 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: 
     before = stamps(folder)
     run(whole, folder)
     assert not changed(before, stamps(folder))
+
+
+def test_the_stages_commands_measure_it_too(
+    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = case, "--out", folder, "--whole-field"
+    assert called(monkeypatch, "validate", *where) == 2
+    assert "make them with 'modeharvest correlate'" in error_line(capsys)
+    assert called(monkeypatch, "correlate", *where) == 0
+    assert capsys.readouterr().out.count("whole displacement: ") == 2
+    assert called(monkeypatch, "validate", *where) == 0
+    assert all("whole_field" in s for s in read_json(folder / "summary.json")["snapshots"])
 
 
 def test_summary_holds_the_documented_keys_and_sound_numbers(finished: Path) -> None:

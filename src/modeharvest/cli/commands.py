@@ -103,20 +103,25 @@ def image(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None
         warn(warning)
 
 
-def correlate(case: CaseName, out: OutFolder) -> None:
-    """Measure the images by micromorphic IDIC: DIR/correlation."""
-    with _stages(case, out) as stages:
-        results = stages.correlate()
+def correlate(case: CaseName, out: OutFolder, whole_field: WholeField = None) -> None:
+    """Measure the images by micromorphic IDIC: DIR/correlation, and DIR/whole_field if asked to."""
+    with _stages(case, out, whole_field=whole_field) as stages:
+        results, wholes = stages.correlate(), stages.measure()
     for strain, result in results.items():
         print(f"{100 * strain:6.2f} %  {result.outcome.name.lower()}: {result.outcome.value}")
+    for strain, whole in wholes.items():
+        at = f"{100 * strain:6.2f} %  whole displacement"
+        print(f"{at}: {whole.unknowns} unknowns, cut-off {whole.cutoff_px:.3g} px")
 
 
-def validate(case: CaseName, out: OutFolder, solution: SolutionFile = None) -> None:
+def validate(
+    case: CaseName, out: OutFolder, solution: SolutionFile = None, whole_field: WholeField = None
+) -> None:
     """Compare what was measured with the truth: DIR/report.html and DIR/summary.json."""
     from modeharvest.report.experiment import experiment_report
     from modeharvest.report.model import print_report
 
-    with _stages(case, out, solution) as stages:
+    with _stages(case, out, solution, whole_field) as stages:
         summary = stages.validate()
     print_report(experiment_report(summary), out)
 

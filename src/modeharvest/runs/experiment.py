@@ -170,7 +170,7 @@ class Run(StagedRun[Case]):
         if self.case.whole_field.measure and not self.stages.is_finished("measure", measured):
             raise InputError(
                 f"expected whole displacements of this case in {self._whole_fields.folder}, found "
-                "none that are finished and whole; make them with 'modeharvest run'"
+                "none that are finished and whole; make them with 'modeharvest correlate'"
             )
         path, page = self.folder / "summary.json", self.folder / "report.html"
 
