@@ -8,6 +8,8 @@ alike, and numpy reflects and places them. Mid-side nodes of hole edges lie on t
 from __future__ import annotations
 
 import math
+import pickle
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -358,3 +360,8 @@ def _add_loop(loop: Collection[FloatArray], size: float) -> int:
         curves.append(geo.addSpline([ends[0], *interior, ends[1]]))
         geo.mesh.setTransfiniteCurve(curves[-1], max(1, round(length / size)) + 1)
     return int(geo.addCurveLoop(curves))
+
+
+if __name__ == "__main__":  # so that a child can have a time limit: gmsh can't be interrupted
+    block = mesh_outlines(*pickle.load(sys.stdin.buffer))
+    sys.stdout.buffer.write(pickle.dumps((block.nodes, block.cells)))

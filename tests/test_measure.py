@@ -177,6 +177,26 @@ def test_material_is_found_and_lengths_are_pixels(plate: Plate, tmp_path: Path) 
     assert image["coverage"] > 0.99
 
 
+def test_what_of_a_mask_is_not_measured_is_said(plate: Plate, tmp_path: Path) -> None:
+    mask = plate.mask.copy()
+    assert not mask[:16].any()
+    mask[4:12, 50:150] = True  # background
+    mask[100:104, 70:74] = False  # dirt
+    write_image(tmp_path / "mask.tif", mask)
+    summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path / "out",
+                      mask=tmp_path / "mask.tif")  # fmt: skip
+    island, hole = summary["warnings"]
+    assert island.startswith("1 island(s) of the mask without speckle, 800 px")
+    assert hole.startswith("Holes in the mask smaller than 36 px were filled, 16 px")
+    mask[4:12, 50:150], mask[100:104, 70:74] = False, True
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "out/mask.tif") > 0, mask)
+    # They are said again when nothing is measured again.
+    again = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path / "out",
+                    mask=tmp_path / "mask.tif")  # fmt: skip
+    assert again["warnings"] == summary["warnings"]
+    assert "without speckle, 800 px" in (tmp_path / "out/report.html").read_text()
+
+
 def test_what_does_not_match_is_said(plate: Plate, tmp_path: Path) -> None:
     image, other = (tifffile.imread(path) for path in (plate.files[0], plate.folder / "ref.tif"))
     image[120:150, 180:220] = other[60:90, 180:220]
@@ -211,6 +231,9 @@ def test_start_follows_what_no_polynomial_does() -> None:
         ("mask size", "expected images of one size"),
         ("black mask", "expected a mask with material"),
         ("mesh", "expected a mesh that covers the mask"),
+        ("mesh beside", "expected a mesh on the image"),
+        ("mesh twice", "expected elements that don't overlap"),
+        ("blank mask", "expected speckle on the material"),
         ("no contrast", "expected an image with contrast"),
         ("noise", "expected a speckle pattern"),
         ("other surface", "expected two images of one surface"),
@@ -230,6 +253,7 @@ def test_bad_input_is_one_line(
         "size": rng.integers(0, 255, (50, 60)).astype(np.uint8),
         "mask size": np.full((50, 60), 7, np.uint8),
         "black mask": np.zeros(GRID.shape, np.uint8),
+        "blank mask": np.uint8(255) * (np.hypot(*np.meshgrid(GRID.x, GRID.y)) < 0.3),
         "no contrast": np.full(GRID.shape, 7, np.uint8),
         "noise": rng.integers(0, 255, GRID.shape).astype(np.uint8),
         "other surface": tifffile.imread(plate.folder / "a.tif")[::-1, ::-1],
@@ -237,9 +261,13 @@ def test_bad_input_is_one_line(
     if what in images:
         write_image(bad, np.ascontiguousarray(images[what]))
     options = ["--mask", bad if "mask" in what else plate.folder / "mask.tif"]
-    if what == "mesh":
-        nodes = [[-0.9, 0.5, 0.0], [0.0, 0.5, 0.0], [-0.9, 0.8, 0.0]]
-        meshio.Mesh(nodes, [("triangle", [[0, 1, 2]])]).write(tmp_path / "mesh.vtu")
+    meshes = {"mesh": ([0.0, 0.0], 1), "mesh beside": ([90.0, 0.0], 1), "mesh twice": ([0, 0], 2)}
+    if what in meshes:
+        move, times = meshes[what]
+        corners = np.array([[-0.9, 0.5], [0.0, 0.5], [-0.9, 0.8]]) + move
+        nodes = np.column_stack([np.tile(corners, (times, 1)), np.zeros(3 * times)])
+        cells = [("triangle", np.arange(3 * times).reshape(-1, 3))]
+        meshio.Mesh(nodes, cells).write(tmp_path / "mesh.vtu")
         options += ["--mesh", tmp_path / "mesh.vtu", "--pixel-size", "0.01"]
     deformed = bad if what in images and "mask" not in what else plate.folder / "a.tif"
     if what == "missing":

@@ -7,7 +7,7 @@ import pytest
 from plate_with_hole import GRID, HALF_SIZE, RADIUS, is_material
 
 from modeharvest.fem.field import Mesh, boundary_sides
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, outlines, quadratic
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, outlines, quadratic
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.util.errors import InputError
 
@@ -51,13 +51,36 @@ def test_islands_are_bodies_and_specks_are_left_out() -> None:
     mask[50:70, 50:70] = False  # a hole of the first
     mask[10:14, 200:204] = True  # a speck
     mask[150:154, 160:164] = False  # dirt
-    found = outlines(mask, 12.0)
-    assert sorted(len(part) for part in found.parts) == [1, 2]
-    assert [word.split(" of ")[0] for word in found.ignored] == ["island", "hole"]
+    assert sorted(len(part) for part in outlines(mask, 12.0)) == [1, 2]
+    found = meshable(mask, 12.0)
+    assert [text.split(" ")[0] for text in found.changes] == ["Holes", "1"]
+    assert "16 px at row 10, column 200" in found.changes[1]
+    mask[10:14, 200:204], mask[150:154, 160:164] = False, True
+    np.testing.assert_array_equal(found.mask, mask)
     mesh = mesh_of_mask(mask, GRID, 12.0)
     covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID).mask
     assert (mask & ~covered).sum() < 100
     assert not covered[55:65, 55:65].any()
+
+
+def test_narrow_material_is_left_out() -> None:
+    mask = PLATE.copy()
+    mask[60:120, 30:60] = mask[60:120, 62:80] = False  # 2 px between them
+    found = meshable(mask, 12.0)
+    assert "was left out" in found.changes[0]
+    assert not found.mask[70:110, 60:62].any()
+    assert (mask & ~found.mask).sum() < 2 * 60 + 40  # and of corners a pixel or so
+    mesh_of_mask(found.mask, GRID, 24.0, 12.0)
+
+
+@pytest.mark.parametrize("width", [2, 4, 5, 8])
+def test_slits_have_outlines_that_do_not_cross(width: int) -> None:
+    mask = np.ones(GRID.shape, dtype=bool)
+    mask[60:160, 100 : 100 + width] = False
+    mesh = mesh_of_mask(mask, GRID, 24.0, 12.0)
+    covered = locate(mesh.nodes, mesh.cells, mesh.element, GRID)
+    assert covered.doubly_covered == 0
+    assert (mask & ~covered.mask).sum() < 100
 
 
 def test_no_material() -> None:
@@ -78,10 +101,17 @@ def test_linear_triangles_become_quadratic() -> None:
     assert len(np.unique(found.cells)) == len(np.unique(mesh.cells))
 
 
+def test_any_order_and_loose_nodes() -> None:
+    mesh = Mesh([[0, 0], [9, 9], [0, 1], [1, 0], [1, 1]], [[0, 2, 3], [4, 3, 2]], "T3")
+    found = quadratic(mesh)
+    assert len(found.nodes) == 4 + 5
+    assert (found.nodes <= 1.0).all()
+
+
 def test_other_and_folded_elements_are_refused() -> None:
     square = Mesh([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2, 3]], "Q4")
     with pytest.raises(InputError, match="expected a mesh of T3 or T6 elements"):
         quadratic(square)
-    folded = Mesh([[0, 0], [0, 1], [1, 0]], [[0, 1, 2]], "T3")
+    folded = Mesh([[0, 0], [0, 1], [1, 0], [1, 1]], [[0, 1, 2], [1, 2, 3]], "T3")
     with pytest.raises(InputError, match="positive Jacobians"):
         quadratic(folded)

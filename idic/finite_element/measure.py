@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from modeharvest.idic.finite_element.cutoff import (
     newton_step,
     risk,
 )
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.pixels import (
     ElementPixels,
     continued,
@@ -146,8 +146,12 @@ def measure_displacement(
     progress : listener.
     """
     options = options or FiniteElementOptions()
+    warnings: tuple[str, ...] = ()
     if mesh is None:
-        mesh = mesh_of_mask(pair.masks[0], pair.grid, options.element_px, options.edge_element_px)
+        edge = options.edge_element_px
+        mask, warnings = meshable(pair.masks[0], edge)
+        pair = replace(pair, mask=mask)
+        mesh = mesh_of_mask(mask, pair.grid, options.element_px, edge)
     mesh = quadratic(mesh)
     begin = (
         start.ansatz.displacement_at(start.unknowns, mesh.nodes)
@@ -159,7 +163,7 @@ def measure_displacement(
             f"expected a start of finite displacements {mesh.nodes.shape} at the nodes, got "
             f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
         )
-    course = _Measurement(pair, Body(mesh, begin), options)
+    course = _Measurement(pair, Body(mesh, begin), options, warnings)
     for k, stage in enumerate(options.stages):
         progress(k, len(options.stages) + 1, "whole displacement")
         course.through(stage)
@@ -172,7 +176,9 @@ def measure_displacement(
 class _Measurement:
     """A measurement on its way: the images of a stage, the displacement of the nodes."""
 
-    def __init__(self, pair: ImagePair, body: Body, options: FiniteElementOptions) -> None:
+    def __init__(
+        self, pair: ImagePair, body: Body, options: FiniteElementOptions, warnings: tuple[str, ...]
+    ) -> None:
         self.pair, self.body, self.options = pair, body, options
         self.u = body.start.ravel().copy()
         self.history: list[Step] = []
@@ -183,7 +189,7 @@ class _Measurement:
         self.pixels: ElementPixels
         self.share = 0.0
         self.tried: tuple[Risk, ...] = ()
-        self.warnings: tuple[str, ...] = ()
+        self.warnings = warnings
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = options.order or (5 if self.speckle_px >= 6.5 else 11)
 
@@ -262,7 +268,7 @@ class _Measurement:
         self.body.law = Imbalance(mesh, law.material, law.loaded(mesh.nodes))
         found = self._regularised(_FIRST_WITH_LAW_PX, given).noise
         if found > _WORSE * before:
-            self.warnings = (
+            self.warnings += (
                 f"The material law doesn't fit: with it the residual's noise is {found:.4g} grey "
                 f"levels, without it {before:.4g}; measure without it, or correct the law.",
             )

@@ -6,6 +6,10 @@ itself, with its corners put back: within some 0.2 px of a smooth edge, holes in
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,18 +33,90 @@ _ROUNDED_PX = 4
 _CORNER = np.deg2rad(40.0)
 _ARM_PX = 12
 """How far from a corner its two sides are looked at; the nearest third of that is rounded off."""
+_LEAST_SINE = 0.2
+"""Of the angle between the two sides of a corner."""
 _NARROWEST_PX = 3.0
 """Material between two holes that can still be meshed."""
 
 
-class Outlines(NamedTuple):
-    """The outlines of the material in a mask."""
+_SECONDS, _SECONDS_PER_ELEMENT = 60.0, 2e-3
+"""That gmsh may take: many times what it takes where no outlines cross."""
+_LEAST_ISLAND, _LEAST_HOLE = 4.0, 0.25
+"""Areas of what is meshed, over the square of an element's edge [-]."""
+_MARGIN = 1.1
+"""That a mask's pixels have over the smoothed outline around them, at most."""
+_OPENINGS_PX = (2.0, 3.0, 4.0)
+"""Radii of disks that fit on what is left, tried in turn where material is too narrow."""
+_ISLANDS_NAMED = 3
 
-    parts: tuple[tuple[tuple[FloatArray, ...], ...], ...]
-    """For each island its loops, the outer one first; curves (k, 2) of (column, -row) [px], whose
-    corners are where one curve ends."""
-    ignored: tuple[str, ...]
-    """Islands and holes too small for elements, in words."""
+Loops = tuple[tuple[FloatArray, ...], ...]
+"""Of an island, the outer one first: curves (k, 2) of (column, -row) [px], whose corners are where
+one curve ends."""
+
+
+class Meshable(NamedTuple):
+    """What of a mask can be meshed."""
+
+    mask: BoolArray
+    """(rows, cols) True on material that elements fit on."""
+    changes: tuple[str, ...]
+    """What was left out or filled, in sentences."""
+
+
+def meshable(mask: BoolArray, element_px: float) -> Meshable:
+    """Fill the holes, and leave out islands and ligaments, that elements of so many px don't fit.
+
+    ``element_px``: edge length along edges [px].
+    """
+    changes = []
+    kept = mask | ~_large(~mask, _LEAST_HOLE * element_px**2)
+    filled = int((kept & ~mask).sum())
+    if filled:
+        changes.append(
+            f"Holes in the mask smaller than {_LEAST_HOLE * element_px**2:.0f} px were filled, "
+            f"{filled} px in all."
+        )
+    wide = kept
+    for radius in _OPENINGS_PX:
+        if _narrowest(wide) >= _NARROWEST_PX:
+            break
+        wide = _opened(kept, radius)
+    if wide is not kept:
+        changes.append(
+            f"Material narrower than {2.0 * radius:g} px was left out, "
+            f"{int((kept & ~wide).sum())} px in all."
+        )
+        kept = wide
+    least = _MARGIN * _LEAST_ISLAND * element_px**2
+    large = _large(kept, least)
+    small, count = ndimage.label(kept & ~large)
+    if count and large.any():
+        sizes = np.bincount(small.ravel())[1:]
+        where = [f"{sizes[k]} px at row {int(i[0].start)}, column {int(i[1].start)}"
+                 for k, i in enumerate(ndimage.find_objects(small)[:_ISLANDS_NAMED])]  # fmt: skip
+        changes.append(
+            f"{count} island{'s' * (count > 1)} of the mask smaller than {least:.0f} px "
+            f"{'was' if count == 1 else 'were'} left out: {'; '.join(where)}"
+            f"{'; ...' if count > len(where) else ''}."
+        )
+        kept = large
+    return Meshable(kept, tuple(changes))
+
+
+def _opened(mask: BoolArray, radius: float) -> BoolArray:
+    """What of a mask a disk of this radius [px] can cover; beyond the image there is none."""
+    core = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] > radius
+    if not core.any():
+        return np.zeros_like(mask)
+    return np.asarray(mask & (ndimage.distance_transform_edt(~core) <= radius))
+
+
+def _large(mask: BoolArray, least_px: float) -> BoolArray:
+    """A mask's connected parts of at least so many pixels."""
+    parts, _ = ndimage.label(mask)
+    large = np.bincount(parts.ravel()) >= least_px
+    large[0] = False
+    return np.asarray(large[parts])
 
 
 def mesh_of_mask(
@@ -50,13 +126,11 @@ def mesh_of_mask(
 
     InputError if there is no island of at least four elements, or gmsh isn't there.
     """
-    try:
-        from modeharvest.fem.meshing import mesh_outlines
-    except ModuleNotFoundError as error:
+    if find_spec("gmsh") is None:
         raise InputError(
             "expected gmsh to make a mesh from a mask, found none; 'pip install gmsh', or give a "
             "mesh"
-        ) from error
+        )
     # Elements longer than a ligament is wide would make chords of its two edges cross.
     edge = min(edge_element_px or element_px, _narrowest(mask))
     if edge < _NARROWEST_PX:
@@ -64,16 +138,39 @@ def mesh_of_mask(
             f"expected material at least {_NARROWEST_PX:g} px wide between holes, got {edge:.1f} "
             "px; take images of more pixels, or fill the holes in the mask"
         )
-    parts, ignored = outlines(mask, edge)
+    parts = outlines(mask, edge)
     if not parts:
         raise InputError(
             f"expected a mask with material for elements of {element_px:g} px, got "
-            f"{int(mask.sum())} px of it ({'; '.join(ignored) or 'none'}); take smaller elements"
+            f"{int(mask.sum())} px of it, in islands smaller than four elements; check the mask"
         )
-    block = mesh_outlines(parts, element_px, edge)
-    x, y = grid.to_mm(-block.nodes[:, 1], block.nodes[:, 0])
-    cells = _counter_clockwise(block.nodes, block.cells)
+    nodes, cells = _meshed_in_child(parts, element_px, edge, int(mask.sum()))
+    x, y = grid.to_mm(-nodes[:, 1], nodes[:, 0])
+    over = (_twice_area(nodes, cells) < 0.0)[:, None]
+    cells = np.where(over, cells[:, _REVERSED["T6"]], cells)
     return quadratic(Mesh(np.stack([x, y], axis=1), cells, "T6"))
+
+
+def _meshed_in_child(
+    parts: tuple[Loops, ...], element_px: float, edge_px: float, area_px: int
+) -> tuple[FloatArray, IntArray]:
+    """Nodes (n, 2) [px] and T6 elements by gmsh in a process apart, which may crash or not end."""
+    seconds = _SECONDS + _SECONDS_PER_ELEMENT * area_px / min(element_px, edge_px) ** 2
+    command = [sys.executable, "-P", "-m", "modeharvest.fem.meshing"]
+    given = pickle.dumps((parts, element_px, edge_px))
+    try:
+        done = subprocess.run(command, input=given, capture_output=True, timeout=seconds)
+        failed = done.returncode != 0
+        got = (done.stderr.decode(errors="replace").strip().splitlines() or ["a crash"])[-1]
+    except subprocess.TimeoutExpired:
+        failed, got = True, f"none in {seconds:.0f} s"
+    if failed:
+        raise InputError(
+            f"expected a mesh within the mask's outlines from gmsh, got {got}; smooth the mask, "
+            "fill its narrow holes, or give a mesh"
+        )
+    nodes, cells = pickle.loads(done.stdout)
+    return nodes, cells
 
 
 def _narrowest(mask: BoolArray) -> float:
@@ -89,8 +186,14 @@ def _narrowest(mask: BoolArray) -> float:
 def quadratic(mesh: Mesh) -> Mesh:
     """The mesh itself if it is of T6 elements; T3 elements get mid-side nodes.
 
-    InputError if the elements are of another type, or folded.
+    Nodes of no element are left out; elements that all go clockwise are turned over. InputError if
+    the elements are of another type, or folded.
     """
+    used = np.unique(mesh.cells)
+    if len(used) < len(mesh.nodes):
+        mesh = Mesh(mesh.nodes[used], np.searchsorted(used, mesh.cells), mesh.element)
+    if mesh.element in _REVERSED and (_twice_area(mesh.nodes, mesh.cells) < 0.0).all():
+        mesh = Mesh(mesh.nodes, mesh.cells[:, _REVERSED[mesh.element]], mesh.element)
     if mesh.element == "T3":
         ends = np.sort(mesh.cells[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
         sides, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
@@ -106,31 +209,35 @@ def quadratic(mesh: Mesh) -> Mesh:
     return mesh
 
 
-def _counter_clockwise(nodes: FloatArray, cells: IntArray) -> IntArray:
+_REVERSED = {"T3": [0, 2, 1], "T6": [0, 2, 1, 5, 4, 3]}
+"""Node numbers the other way round."""
+
+
+def _twice_area(nodes: FloatArray, cells: IntArray) -> FloatArray:
+    """(m,) of the triangles of elements' corners, positive if counter-clockwise."""
     a, b, c = (nodes[cells[:, k]] for k in range(3))
     d, e = b - a, c - a
-    area = d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0]
-    return np.where((area < 0.0)[:, None], cells[:, [0, 2, 1, 5, 4, 3]], cells)
+    return np.asarray(d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0])
 
 
-def outlines(mask: BoolArray, element_px: float) -> Outlines:
-    """Find the outlines of a mask, for elements of so many px."""
+def outlines(mask: BoolArray, element_px: float) -> tuple[Loops, ...]:
+    """Find the outlines of a mask, of each island, for elements of so many px.
+
+    Islands and holes too small for such elements are left out; :func:`meshable` says which.
+    """
     inside = np.pad(mask, 8)
     islands = ndimage.label(inside)[0]
     blurred = ndimage.gaussian_filter(inside.astype(np.float32), _BLUR_PX)
     # Where both sides are the same island a blur must not close a slit, nor join two islands.
     nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
     loops: dict[int, list[tuple[float, FloatArray]]] = {}
-    ignored = []
     for contour in find_contours(blurred, 0.5):
         points = np.stack([contour[-2::-1, 1], -contour[-2::-1, 0]], axis=1)
         along = np.roll(points, -1, axis=0)
         area = 0.5 * float(np.sum(points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
         row, col = np.rint(contour[0]).astype(int)
         island = int(islands[tuple(nearest[:, row, col])])
-        if abs(area) < (4.0 if _is_outer(area) else 0.25) * element_px**2:
-            what = "island" if _is_outer(area) else "hole"
-            ignored.append(f"{what} of {abs(area):.0f} px at row {row - 8}, column {col - 8}")
+        if abs(area) < (_LEAST_ISLAND if _is_outer(area) else _LEAST_HOLE) * element_px**2:
             continue
         loops.setdefault(island, []).append((area, points + np.array([-8.0, 8.0])))
     parts = []
@@ -140,7 +247,7 @@ def outlines(mask: BoolArray, element_px: float) -> Outlines:
             continue  # a hole of an island that is too small itself
         others = [loop for loop in found if loop is not outer]
         parts.append(tuple(_smooth(points, element_px) for _, points in (outer, *others)))
-    return Outlines(tuple(parts), tuple(ignored))
+    return tuple(parts)
 
 
 def _is_outer(area: float) -> bool:
@@ -202,7 +309,7 @@ def _corners(points: FloatArray) -> IntArray:
 
 
 def _intersection(points: FloatArray, corner: int) -> FloatArray:
-    """Where the lines through the two sides of a corner meet."""
+    """Where the lines through the two sides of a corner meet; the corner if that is elsewhere."""
     lines = []
     for sign in (1, -1):
         side = points[(corner + sign * np.arange(_ARM_PX // 3, _ARM_PX + 1)) % len(points)]
@@ -211,4 +318,9 @@ def _intersection(points: FloatArray, corner: int) -> FloatArray:
         normal = np.array([-direction[1], direction[0]])
         lines.append((normal, float(normal @ middle)))
     (a, c), (b, d) = lines
-    return np.linalg.solve(np.stack([a, b]), np.array([c, d]))
+    normals = np.stack([a, b])
+    if abs(np.linalg.det(normals)) < _LEAST_SINE:  # the end of a slit has another corner near
+        return np.asarray(points[corner])
+    found = np.linalg.solve(normals, np.array([c, d]))
+    far = np.linalg.norm(found - points[corner]) >= _ROUNDED_PX
+    return np.asarray(points[corner] if far else found)

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
+from scipy.ndimage import label, mean
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
@@ -28,11 +29,13 @@ from modeharvest.idic.photograph.matching import (
     require_same_surface,
 )
 from modeharvest.idic.photograph.material import shrunk
+from modeharvest.idic.solver.noise import estimated_noise, slope_noise
+from modeharvest.idic.solver.pyramid import smoothed
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
-from modeharvest.util.arrays import BoolArray, FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 
@@ -50,6 +53,8 @@ _FIRST = FiniteElementOptions(cutoff_px=40.0, edge_px=4)
 """Of the measurement that only the deformed image's mask is taken from."""
 _LAST = FiniteElementOptions(edge_px=1)
 """A camera's pixel on an edge shows some background; one such row lets the edge drift off."""
+_BLUR_PX, _SPECKLE = 1.5, 3.0
+"""Of the reference, and the power of its slopes over that of noise, where there is speckle."""
 _OFF_PX = 4.0, 1.0
 """By how much edges may be off where blocks of speckle, and a first measurement, say they are."""
 
@@ -111,6 +116,33 @@ def _known(values: FloatArray, points: FloatArray) -> FloatArray:
     """Values that are known at the points that are asked for."""
     assert values.shape == points.shape, "a T6 mesh keeps its nodes"
     return values
+
+
+def speckled(image: FloatImage, mask: BoolArray) -> tuple[BoolArray, tuple[str, ...]]:
+    """The islands of a mask that show speckle in an image (rows, cols), and what of it doesn't.
+
+    The mask is True on material. Slopes of speckle are compared with those of the image's noise,
+    both blurred, because few speckles are as small as pixels. InputError if there is none.
+    """
+    noise = estimated_noise(image, mask).sd ** 2 * slope_noise(5, _BLUR_PX)
+    slopes = np.gradient(smoothed(image, mask, _BLUR_PX))
+    power = 0.5 * (slopes[0] ** 2 + slopes[1] ** 2)
+    islands, count = label(mask)
+    numbers = np.arange(1, count + 1)
+    is_blank = mean(power, islands, numbers) < np.maximum(_SPECKLE * noise, 1e-12)
+    blank = np.isin(islands, numbers[is_blank])
+    if count and is_blank.all():
+        raise InputError(
+            "expected speckle on the material, got nothing but noise there; check the mask: it is "
+            "not black on the material, and black elsewhere"
+        )
+    if not is_blank.any():
+        return mask, ()
+    row, col = np.argwhere(blank)[0]
+    return mask & ~blank, (
+        f"{int(is_blank.sum())} island(s) of the mask without speckle, {int(blank.sum())} px, "
+        f"the first at row {row}, column {col}, were left out.",
+    )
 
 
 def block_motion(

@@ -75,7 +75,10 @@ def measure_report(
             KeyNumber("coverage", number(100 * last["coverage"], 4), "%", "of the material"),
         ],
         sections=[*maps, Section("numbers", "Numbers", Card.tabular(table, wide=True))],
-        warnings=[f"{i['name']}: {text}" for i in images for text in i["warnings"]],
+        warnings=[
+            *summary["warnings"],
+            *(f"{i['name']}: {text}" for i in images for text in i["warnings"]),
+        ],
         notes=[
             f"The mask of the material was {summary['mask']}: mask.tif.",
             f"Lengths in all files are in {summary['unit']}, from the middle of the image, x right "

@@ -14,11 +14,12 @@ the middle of the image, x right, y up.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,12 +32,13 @@ from modeharvest.idic.finite_element.files import (
     write_vtu,
 )
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.photograph.displacement import (
     brightness,
     photographed_displacement,
     residual,
+    speckled,
 )
 from modeharvest.idic.photograph.material import find_material
 from modeharvest.idic.solver.noise import estimated_noise
@@ -71,6 +73,10 @@ _BYTES_PER_PIXEL = 250.0
 """Of memory while an image is measured."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which that is warned of."""
+_LEAST_PX = 1000
+"""Pixels that a mesh covers, at least: some four elements."""
+_BESIDE = 0.01
+"""Part of a mesh that lies beside the image, beyond which that is warned of."""
 _MESH_FORMAT = "modeharvest-mesh-1"
 
 
@@ -108,6 +114,16 @@ class MeasureCase:
         return "px" if self.pixel_size is None else "mm"
 
 
+class MeshedMaterial(NamedTuple):
+    """What is measured."""
+
+    mask: BoolArray
+    mesh: Mesh
+    """(rows, cols) where the material is, and its T6 mesh [mm or px]."""
+    warnings: tuple[str, ...]
+    """What of the mask that was given, or found, is not measured."""
+
+
 @dataclass(frozen=True)
 class MeasureRun(StagedRun[MeasureCase]):
     """The stages of a measurement."""
@@ -136,47 +152,71 @@ class MeasureRun(StagedRun[MeasureCase]):
         return stage_key([files, self.case.pixel_size], *_CODE)
 
     @cached_property
-    def material(self) -> tuple[BoolArray, Mesh]:
-        """(rows, cols) where the material is, and its mesh; leaves ``mask.tif``, ``mesh.h5``."""
+    def material(self) -> MeshedMaterial:
+        """The material; leaves ``mask.tif``, ``mesh.h5``."""
         mask_path, mesh_path = self.folder / "mask.tif", self.folder / "mesh.h5"
 
         def work() -> tuple[Path, ...]:
-            mask, mesh = self._material()
-            write_image(mask_path, mask)
+            found = self._material() if self.case.mesh is None else self._meshed(self.case.mesh)
+            write_image(mask_path, found.mask)
             with atomic_hdf5(mesh_path) as file:
-                file.attrs.update(format=_MESH_FORMAT, unit=self.case.unit)
-                write_mesh(file, mesh)
+                warnings = json.dumps(found.warnings)
+                file.attrs.update(format=_MESH_FORMAT, unit=self.case.unit, warnings=warnings)
+                write_mesh(file, found.mesh)
             return mask_path, mesh_path
 
-        def read() -> tuple[BoolArray, Mesh]:
+        def read() -> MeshedMaterial:
             with open_hdf5(mesh_path, "a mesh", "measure again", _MESH_FORMAT) as file:
-                return read_mask(mask_path), read_mesh(file)
+                warnings = tuple(json.loads(file.attrs["warnings"]))
+                return MeshedMaterial(read_mask(mask_path), read_mesh(file), warnings)
 
         return self.do("prepare", self._key, work, read)
 
-    def _material(self) -> tuple[BoolArray, Mesh]:
-        """The mask that is given, or is covered by the mesh, or is found; the mesh of it."""
-        case, options = self.case, FiniteElementOptions()
-        mesh = None if case.mesh is None else quadratic(read_plane_mesh(case.mesh))
-        if case.mask is not None:
-            mask = read_mask(case.mask)
-        elif mesh is not None:
-            mask = locate(mesh.nodes, mesh.cells, mesh.element, self.grid, str(case.mesh)).mask
-            if not mask.any():
-                raise InputError(
-                    f"expected a mesh on the image in {case.mesh}, got one beside it; its lengths "
-                    f"are in {case.unit}, from the middle of the image, x right, y up"
-                )
-        else:
-            mask = find_material(self.reference.image).mask
-        if mesh is None:
-            mesh = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
-        return mask, mesh
+    def _material(self) -> MeshedMaterial:
+        """What can be measured of the mask that is given, or is found by its speckle."""
+        given, options, image = self.case.mask, FiniteElementOptions(), self.reference.image
+        mask = find_material(image).mask if given is None else read_mask(given)
+        mask, blank = speckled(image, mask)
+        mask, changes = meshable(mask, options.edge_element_px)
+        mesh = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
+        return MeshedMaterial(mask, mesh, (*blank, *changes))
+
+    def _meshed(self, path: Path) -> MeshedMaterial:
+        """A mesh that is given, and what it covers of the mask, which is all of it if there is one.
+
+        InputError if that isn't on the image, or overlaps itself.
+        """
+        mesh, unit = quadratic(read_plane_mesh(path)), self.case.unit
+        warnings: tuple[str, ...] = ()
+        located = locate(mesh.nodes, mesh.cells, mesh.element, self.grid, str(path))
+        covered, here = located.mask, f"in {unit}, from the middle of the image, x right, y up"
+        if covered.sum() < _LEAST_PX:
+            raise InputError(
+                f"expected a mesh on the image in {path}, got one that covers {covered.sum()} of "
+                f"its pixels; its lengths are {here}: give --pixel-size if they are in mm, or "
+                "move the mesh"
+            )
+        if located.doubly_covered > _BESIDE * covered.sum():
+            raise InputError(
+                f"expected elements that don't overlap in {path}, got {located.doubly_covered} px "
+                "in more than one; repair the mesh"
+            )
+        x, y = mesh.nodes.T
+        row, col = self.grid.to_px(x, y)
+        rows, cols = self.grid.shape
+        beside = float(np.mean((abs(row - rows / 2) > rows / 2) | (abs(col - cols / 2) > cols / 2)))
+        if beside > _BESIDE:
+            warnings = (
+                f"{100 * beside:.0f} % of the mesh's nodes lie beside the image, where nothing is "
+                f"measured; its lengths are {here}.",
+            )
+        given = self.case.mask
+        return MeshedMaterial(covered if given is None else read_mask(given), mesh, warnings)
 
     def pair(self, path: Path) -> ImagePair:
         """The reference, a deformed image, and the mask."""
         frame = read_frame(path, self.reference)
-        return ImagePair(self.reference.image, frame.image, self.grid, self.material[0])
+        return ImagePair(self.reference.image, frame.image, self.grid, self.material.mask)
 
     def results(self) -> dict[str, NodalResult]:
         """Measure every image, each after the one before; leaves ``results/``."""
@@ -197,7 +237,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
         def work() -> tuple[Path, ...]:
             result = photographed_displacement(
-                self.pair(path), self.material[1], before, names, self.progress
+                self.pair(path), self.material.mesh, before, names, self.progress
             )
             tables = [stem.with_name(stem.name + kind) for kind in (".h5", ".vtu", ".csv")]
             write_result(tables[0], result, unit)
@@ -242,15 +282,16 @@ class MeasureRun(StagedRun[MeasureCase]):
             "unit": case.unit,
             "pixel_size_mm": case.pixel_size,
             "shape_px": list(self.grid.shape),
-            "material_px": int(self.material[0].sum()),
+            "material_px": int(self.material.mask.sum()),
             "mask": "found by its speckle" if case.mask is case.mesh is None else "given",
             "notes": list(self.reference.notes),
+            "warnings": list(self.material.warnings),
             "images": [self._image(name, result) for name, result in results.items()],
             "versions": versions(*_LIBRARIES),
         }  # fmt: skip
 
     def _image(self, name: str, result: NodalResult) -> dict[str, Any]:
-        px, mask = self.grid.pixel_size, self.material[0]
+        px, mask = self.grid.pixel_size, self.material.mask
         u = result.displacement_on()
         inside = u[mask & np.isfinite(u).all(axis=-1)] / px
         path = next(path for path in self.case.files if path.stem == name)
