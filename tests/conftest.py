@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -37,6 +38,16 @@ def _dolfinx_is_missing() -> bool:
     """Whether to skip; never under `scripts/env`, where a missing dolfinx is a failure."""
     required = os.environ.get("MODEHARVEST_REQUIRE_DOLFINX") == "1"
     return not required and importlib.util.find_spec("dolfinx") is None
+
+
+@pytest.fixture(scope="module")
+def coarse_pictures() -> Iterator[None]:
+    """Draw the fields of reports with few pixels, where a test is not about its pictures."""
+    from modeharvest.report.figures import style
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "DPI", 65)
+        yield
 
 
 def pytest_configure(config: pytest.Config) -> None:

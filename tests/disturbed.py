@@ -16,6 +16,7 @@ Each attempt is a fork of this process, which has imported what takes long and c
 from __future__ import annotations
 
 import ctypes
+import gc
 import hashlib
 import importlib.util
 import json
@@ -182,8 +183,10 @@ def main() -> None:
     for module in _MODULES:
         if importlib.util.find_spec(module) is not None:  # gmsh may be missing
             importlib.import_module(module)
+    sys.modules["modeharvest.report.figures.style"].DPI = 65  # type: ignore[attr-defined]
     numba.njit(lambda x: x)(0)  # has the compiler import the rest of itself; begins no threads
     assert "mpi4py.MPI" not in sys.modules, "MPI, once begun, can't be forked"
+    gc.freeze()  # no attempt looks through what is there already
     while line := sys.stdin.readline():
         print(disturb_all(*json.loads(line)), flush=True)
 

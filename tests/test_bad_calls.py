@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -442,23 +445,69 @@ def test_a_full_or_closed_terminal_is_no_fault(tail: str, code: int, said: str) 
     assert done.stderr.count("\n") == bool(said)
 
 
-INTERRUPTED = """
+class Swallows:
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)  # as Ctrl-C during a destructor
+
+
+def plain() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def taken_for_an_error() -> None:
+    try:
+        plain()
+    except BaseException as error:
+        raise RuntimeError from error
+
+
+def dropped() -> None:
+    with suppress(BaseException):
+        plain()
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as a terminal has it: a shell may have it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("interrupted", [Swallows, plain, taken_for_an_error, dropped])
+def test_ctrl_c_is_never_swallowed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    interrupted: Callable[[], object],
+) -> None:  # fmt: skip
+    def work(name: str) -> str:
+        with messages.bars() as progress:
+            interrupted()
+            progress(1, 2, "work")
+            return "it went on"
+
+    monkeypatch.setattr("modeharvest.runs.case.case_text", work)
+    assert called(monkeypatch, "cases", "paper-virtual") == 130
+    printed = capsys.readouterr()
+    assert printed.err.count("interrupted;") == 1
+    assert "Traceback" not in printed.err
+    assert "went on" not in printed.out
+
+
+AT_THE_END = """
 import signal, sys
 from modeharvest.cli import root
-from modeharvest.cli.messages import bars
 from modeharvest.runs import case
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 class Swallows:
     def __del__(self):
-        signal.raise_signal(signal.SIGINT)  # as Ctrl-C during a destructor
+        signal.raise_signal(signal.SIGINT)
 
 def work(name):
-    with bars() as progress:
-        {work}
-        progress(1, 2, "work")
-        print("it went on")
+    Swallows()
+    return "it went on"
 
 case.case_text = work
 sys.argv = ["modeharvest", "cases", "paper-virtual"]
@@ -466,29 +515,8 @@ root.main()
 """
 
 
-@pytest.mark.parametrize(
-    "work",
-    [
-        "Swallows()",
-        "signal.raise_signal(signal.SIGINT)",
-        "\n        try:\n            signal.raise_signal(signal.SIGINT)\n"
-        "        except BaseException as error:\n            raise RuntimeError from error",
-        "\n        try:\n            signal.raise_signal(signal.SIGINT)\n"
-        "        except BaseException:\n            pass",
-    ],
-    ids=["in a destructor", "plain", "taken for an error", "dropped"],
-)
-def test_ctrl_c_is_never_swallowed(work: str) -> None:
-    done = run("-c", INTERRUPTED.format(work=work))
-    assert done.returncode == 130, done.stderr
-    assert done.stderr.count("interrupted;") == 1
-    assert "Traceback" not in done.stderr
-    assert "went on" not in done.stdout
-
-
 def test_ctrl_c_counts_even_at_the_end() -> None:
-    script = INTERRUPTED.replace('progress(1, 2, "work")', "pass")
-    assert run("-c", script.format(work="Swallows()")).returncode == 130
+    assert run("-c", AT_THE_END).returncode == 130
 
 
 # --- environments -------------------------------------------------------------------------

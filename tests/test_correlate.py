@@ -224,10 +224,7 @@ def test_holes_are_kept_out_of_blur_and_sampling(images: Images, ansatz: Ansatz)
     # Discs of another grey level in both images, moving with the material, masks given.
     true = ansatz.displacement(truth(ansatz), GRID.x, GRID.y)
     x, y = np.meshgrid(GRID.x, GRID.y)
-    at = np.stack([x, y], axis=-1)
-    origin = at - true
-    for _ in range(30):
-        origin = at - ansatz.displacement_at(truth(ansatz), np.clip(origin, -1.7, 1.7))
+    origin = manufactured.reference_points(ansatz, truth(ansatz))
 
     def solid(px: FloatArray, py: FloatArray) -> NDArray[np.bool_]:
         return np.asarray(np.hypot((px % 1.0) - 0.5, (py % 1.0) - 0.5) > 0.3)

@@ -122,7 +122,7 @@ PIPELINES = {
     "harvest": Pipeline("harvest test.toml", write_photographs, (40_000, 1_400_000)),
     "study": Pipeline(f"study study.toml {GIVEN} --workers 1", write_study, (40_000, 600_000)),
     "fem": Pipeline("fem fem.toml", write_fem, (8_192, 40_000)),
-    "modes": Pipeline("modes cell.toml", write_lattice, (8_192, 150_000)),
+    "modes": Pipeline("modes cell.toml", write_lattice, (8_192, 300_000)),
 }
 NEEDS_DOLFINX = ("fem", "modes")
 

@@ -27,6 +27,8 @@ from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
 from modeharvest.runs.photographs.prepare import named_files
 from modeharvest.util.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
 PIXEL, NOISE = 0.05, 0.01
 EXPERIMENT = f"""
 title = "A test"

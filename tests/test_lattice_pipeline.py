@@ -34,7 +34,7 @@ from modeharvest.runs.lattice.case import (
 from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 from modeharvest.util.files import read_json
 
-pytestmark = pytest.mark.dolfinx
+pytestmark = [pytest.mark.dolfinx, pytest.mark.usefixtures("coarse_pictures")]
 
 COARSE = """
 title = "A coarse lattice"
@@ -42,7 +42,7 @@ title = "A coarse lattice"
 kind = "square"
 pitch = 1.0
 diameter = 0.8696
-mesh_size = 0.12
+mesh_size = 0.15
 [material]
 kind = "two-term-I1"
 [loading]

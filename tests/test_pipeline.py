@@ -43,7 +43,7 @@ seed = 3
 measure = false
 """
 
-pytestmark = pytest.mark.dolfinx
+pytestmark = [pytest.mark.dolfinx, pytest.mark.usefixtures("coarse_pictures")]
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from modeharvest.util.files import atomic
 from modeharvest.util.progress import Progress, silent
 
 if TYPE_CHECKING:
+    import jinja2
     import pandas as pd
     from matplotlib.figure import Figure
 
@@ -364,10 +365,18 @@ def write_page(
     ``report``: what to write. ``path``: the HTML file. ``progress``: listener. ``pictures``: what
     :func:`draw_figures` has made of its figures before; they are drawn without.
     """
-    import jinja2
-
     if pictures is None:
         pictures = draw_figures(report.figures, progress)
+    page = _template().render(report=report, pictures=pictures)
+    with atomic(path) as temporary:
+        temporary.write_text(page, "utf-8")
+
+
+@cache
+def _template() -> jinja2.Template:
+    """The page, compiled."""
+    import jinja2
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(str(resources.files(__package__))), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -377,9 +386,7 @@ def write_page(
         "mark": lambda cell: isinstance(cell, Mark),
         "measured": lambda cell: isinstance(cell, Measured),
     }
-    page = environment.get_template("page.html").render(report=report, pictures=pictures)
-    with atomic(path) as temporary:
-        temporary.write_text(page, "utf-8")
+    return environment.get_template("page.html")
 
 
 def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
