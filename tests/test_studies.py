@@ -41,6 +41,8 @@ from modeharvest.validation.studies.study import ImagePairSpec, StudySetting, Vi
 from modeharvest.validation.studies.systematic import FACTORS, SystematicStudy, one_level
 from modeharvest.validation.workers import run_case, store
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
 PAPER = shipped_solution("paper-virtual")
 TINY = """
 title = "A <tiny> study"
