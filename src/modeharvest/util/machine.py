@@ -18,6 +18,8 @@ from modeharvest.util.errors import InputError
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUP = Path("/proc/self/cgroup")
+_LITTLE = 1e6
+"""Bytes that need not be asked for: less than an import takes."""
 _UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
 
@@ -32,6 +34,8 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
     ``needed``: a rough estimate [bytes], infinite or NaN is too much; ``what`` needs it: "an image
     of 9000 x 9000 px"; ``remedy``: what to change.
     """
+    if needed < _LITTLE:
+        return
     there = available_bytes()
     if not needed <= there:
         raise InputError(
