@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from perforated import OBLIQUE, holed_cell
 from plate_with_hole import GRID, is_material, plate_pair, quadratic_field
 from scipy.sparse import csr_array, diags_array
@@ -28,23 +29,48 @@ def straight(mesh: Mesh) -> Mesh:
     return Mesh(nodes, mesh.cells, "T6")
 
 
-def test_smoothness_vanishes_for_affine_fields_alone(mesh: Mesh) -> None:
-    R = smoothness_matrix(mesh).toarray()
-    values, vectors = np.linalg.eigh(R)
-    assert (values[:3] < 1e-9 * values[-1]).all()
-    assert values[3] > 1e4 * abs(values[:3]).max()
-    affine = np.column_stack([np.ones(len(mesh.nodes)), mesh.nodes])
-    inside = np.linalg.lstsq(vectors[:, :3], affine, rcond=None)[0]
-    np.testing.assert_allclose(vectors[:, :3] @ inside, affine, atol=1e-6)
-
-
-def test_smoothness_of_a_quadratic_is_its_second_gradients(mesh: Mesh) -> None:
+def test_smoothness_vanishes_for_quadratic_fields_alone(mesh: Mesh) -> None:
     mesh = straight(mesh)
     x, y = mesh.nodes.T
-    u = 1.5 * x**2 + 2.0 * x * y - 0.5 * y**2
-    a, b, c = (mesh.nodes[mesh.cells[:, k]] for k in range(3))
-    area = 0.5 * abs(np.linalg.det(np.stack([b - a, c - a], axis=1))).sum()
-    assert u @ smoothness_matrix(mesh) @ u == pytest.approx((9.0 + 2 * 4.0 + 1.0) * area, rel=1e-9)
+    values, vectors = np.linalg.eigh(smoothness_matrix(mesh).toarray())
+    assert (values[:6] < 1e-9 * values[-1]).all()
+    assert values[6] > 1e3 * abs(values[:6]).max()
+    quadratic = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
+    inside = np.linalg.lstsq(vectors[:, :6], quadratic, rcond=None)[0]
+    np.testing.assert_allclose(vectors[:, :6] @ inside, quadratic, atol=1e-6)
+
+
+def test_curved_elements_leave_affine_fields_smooth(mesh: Mesh) -> None:
+    R, affine = smoothness_matrix(mesh), np.column_stack([np.ones(len(mesh.nodes)), mesh.nodes])
+    assert abs(R @ affine).max() < 1e-12 * abs(R).max()
+
+
+def test_waves_cost_the_sixth_power_of_their_wave_number() -> None:
+    """So does a cut-off wavelength mean a wavelength, whatever the elements."""
+    cost = {}
+    for size in (16, 32):
+        mesh = square(size)
+        R = smoothness_matrix(mesh)
+        for waves in (1, 2):
+            u = np.cos(2.0 * np.pi * waves * mesh.nodes[:, 0])
+            cost[size, waves] = float(u @ R @ u)
+    assert cost[32, 2] / cost[32, 1] == pytest.approx(64.0, rel=0.05)
+    assert cost[32, 1] / cost[16, 1] == pytest.approx(1.0, rel=0.05)
+
+
+def square(count: int) -> Mesh:
+    """A unit square of 2 count^2 triangles."""
+    at = np.arange(2 * count + 1) / (2 * count)
+    nodes = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    number = np.arange(len(nodes)).reshape(len(at), len(at))
+    i, j = (2 * k.ravel() for k in np.meshgrid(np.arange(count), np.arange(count)))
+
+    def cells(*offsets: tuple[int, int]) -> NDArray[np.int64]:
+        return np.stack([number[j + b, i + a] for a, b in offsets], axis=1)
+
+    lower = cells((0, 0), (2, 0), (0, 2), (1, 0), (1, 1), (0, 1))
+    upper = cells((2, 2), (0, 2), (2, 0), (1, 2), (1, 1), (2, 1))
+    return Mesh(nodes, np.vstack([lower, upper]), "T6")
 
 
 def test_every_side_inside_has_two_cells(mesh: Mesh) -> None:

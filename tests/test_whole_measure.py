@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from manufactured import speckle
 from plate_with_hole import GRID, plate_pair, quadratic_field
+from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
@@ -43,13 +44,18 @@ def noisy() -> tuple[ImagePair, NodalResult]:
     return pair, measure_displacement(pair, at_rest, options=COARSE)
 
 
+def require_what_the_spline_does(pair: ImagePair, result: NodalResult) -> None:
+    """Errors of exact images: the spline's, and beside edges those of continued pixels."""
+    error, depth = error_px(pair, result), ndimage.distance_transform_edt(pair.masks[0])
+    assert np.sqrt(np.mean(error[depth[pair.masks[0]] > 10.0] ** 2)) < 1.2e-3
+    assert np.sqrt(np.mean(error**2)) < 4e-3
+    assert abs(error).max() < 0.1
+
+
 def test_quadratic_field_from_rest() -> None:
     pair = plate_pair(quadratic_field)
     result = measure_displacement(pair, at_rest, options=COARSE)
-    error = error_px(pair, result)
-    # What the spline does to exact images: 1e-3 px, and more beside edges.
-    assert np.sqrt(np.mean(error**2)) < 3e-3
-    assert abs(error).max() < 0.1
+    require_what_the_spline_does(pair, result)
     F = result.deformation_gradient
     x, y = result.mesh.nodes.T
     expected = np.stack([0.97 + 0.01 * y, 0.01 + 0.01 * x, -0.016 * x, 1.02 + 0 * x], axis=-1)
@@ -59,7 +65,7 @@ def test_quadratic_field_from_rest() -> None:
 def test_start_that_is_right_stays() -> None:
     pair = plate_pair(quadratic_field)
     result = measure_displacement(pair, quadratic_field, options=COARSE)
-    assert np.sqrt(np.mean(error_px(pair, result) ** 2)) < 3e-3
+    require_what_the_spline_does(pair, result)
 
 
 def test_wave_under_noise(noisy: tuple[ImagePair, NodalResult]) -> None:

@@ -5,15 +5,15 @@ component c at node i.
 
 Smoothness, without a material law:
 
-    u'Ru = sum over elements int |grad grad u|^2 dA
-         + sum over interior sides (2/h) int |[grad u]|^2 ds,
+    u'Ru = sum over interior sides int (1/h) |[grad grad u]|^2 + (100/h^3) |[grad u]|^2 ds,
 
-[.] being the jump across a side of length h: zero for affine displacements alone, and natural
-(free) at all boundaries. It is the energy of a bent plate in the interior-penalty form of G. Engel
-et al., Comput. Methods Appl. Mech. Eng. 191 (2002), doi 10.1016/S0045-7825(02)00286-4. A wave of
-length T costs (2 pi/T)^4 times its mean square, so that a weight of (l/T)^4 v'Mv/v'Rv for any wave
-v halves what of it is at the wavelength l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild, Exp. Mech. 51
-(2011), doi 10.1007/s11340-010-9407-6.
+[.] being the jump across a side of length h; second gradients are an element's mean. It is zero for
+quadratic displacements, and natural (free) at all boundaries: what finite elements have of the
+integral of |grad grad grad u|^2, whose minimum under noise is the smoothing spline of third order,
+with the jumps of gradients as interior penalty (G. Engel et al., Comput. Methods Appl. Mech. Eng.
+191 (2002), doi 10.1016/S0045-7825(02)00286-4). A wave of length T costs (2 pi/T)^6 times its mean
+square, so that a weight of (l/T)^6 v'Mv/v'Rv for any wave v halves what of it is at the wavelength
+l: H. Leclerc, J.-N. Perie, S. Roux, F. Hild, Exp. Mech. 51 (2011), doi 10.1007/s11340-010-9407-6.
 
 With a law: where nothing loads the body its internal forces f vanish, at interior nodes as on free
 edges. Penalised is their sum of squares |D f(u)|^2, D leaving out the loaded nodes, not the energy:
@@ -36,8 +36,8 @@ from modeharvest.imaging.mapping.elements import reference_element, shape_gradie
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
 
-_PENALTY = 2.0
-"""Of jumps across sides, against second gradients [-]."""
+_PENALTY = 100.0
+"""Of jumps of gradients across sides, against those of second gradients [-]."""
 _QUADRATURE = np.array([[1 / 6, 1 / 6], [2 / 3, 1 / 6], [1 / 6, 2 / 3]])
 _LEAST_DET = 0.05
 """Points of an element that shrink to less have no part in it: an iteration gone astray."""
@@ -165,8 +165,8 @@ def interior_sides(cells: IntArray) -> IntArray:
     return np.stack([first // 3, first % 3, second // 3, second % 3], axis=1)
 
 
-def second_gradients(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
-    """(m, q, k, 2, 2) second derivatives of the shape functions [1/mm^2], (m, q) weights [mm^2]."""
+def second_gradients(mesh: Mesh) -> FloatArray:
+    """(m, k, 2, 2) second derivatives of the shape functions, means over elements [1/mm^2]."""
     local = shape_gradients(mesh.element, _QUADRATURE)  # (q, k, 2)
     coefficients = reference_element(mesh.element).coefficients
     # Of 1, xi, eta, xi^2, xi eta, eta^2 only the last three have second derivatives.
@@ -178,8 +178,7 @@ def second_gradients(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
     slopes = np.einsum("qkj,eqji->eqki", local, inverse)
     bending = np.einsum("eki,klm->eilm", x, curved)
     bare = curved - np.einsum("eqki,eilm->eqklm", slopes, bending)
-    found = np.einsum("eqli,eqklm,eqmj->eqkij", inverse, bare, inverse)
-    return found, np.linalg.det(F) / 6.0
+    return np.einsum("eqli,eqklm,eqmj->eqkij", inverse, bare, inverse).mean(axis=1)
 
 
 def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -209,17 +208,21 @@ def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, Float
 
 
 def smoothness_matrix(mesh: Mesh) -> csr_array:
-    """(n, n) R of one component [1/mm^2], for nodal values (n,) on a T6 mesh; sorted indices."""
-    gradients, weights = second_gradients(mesh)
-    inside = np.einsum("eq,eqkij,eqlij->ekl", weights, gradients, gradients, optimize=True)
-    nodes, jumps, shares = side_jumps(mesh, interior_sides(mesh.cells))
-    across = _PENALTY * np.einsum("sg,sgki,sgli->skl", shares, jumps, jumps, optimize=True)
-    n = len(mesh.nodes)
-    total = csr_array((n, n))
-    for groups, blocks in ((mesh.cells, inside), (nodes, across)):
-        k = groups.shape[1]
-        at = np.repeat(groups, k, axis=1).ravel(), np.tile(groups, (1, k)).ravel()
-        total = total + csr_array((blocks.ravel(), at), shape=(n, n))
+    """(n, n) R of one component [1/mm^4], for nodal values (n,) on a T6 mesh; sorted indices."""
+    curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
+    nodes, jumps, shares = side_jumps(mesh, sides)
+    first, side, second, _ = sides.T
+    x = mesh.nodes[mesh.cells[first]]
+    ends = x[np.arange(len(x)), side], x[np.arange(len(x)), (side + 1) % 3]
+    h = np.linalg.norm(ends[1] - ends[0], axis=1)
+    bent = np.concatenate([curved[first], -curved[second]], axis=1)
+    blocks = np.einsum("skij,slij->skl", bent, bent, optimize=True) + _PENALTY * np.einsum(
+        "s,sg,sgki,sgli->skl", h**-2, shares, jumps, jumps, optimize=True
+    )
+    n, k = len(mesh.nodes), nodes.shape[1]
+    at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
+    total = csr_array((blocks.ravel(), at), shape=(n, n))
+    total.sum_duplicates()
     total.sort_indices()
     return total
 
@@ -268,7 +271,8 @@ class Body:
     def weight(self, M: csr_array, R: csr_array, cutoff: float) -> float:
         """The weight lambda of R for a cut-off wavelength [mm]."""
         data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, R))
-        return (cutoff / self._wavelength) ** 4 * data / smooth
+        power = 6 if self.law is None else 4
+        return (cutoff / self._wavelength) ** power * data / smooth
 
     def factor(self, M: csr_array, R: csr_array, weight: float) -> Factor:
         """Factorise M + lambda R."""
