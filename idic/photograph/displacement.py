@@ -93,13 +93,12 @@ def displacement_from(
     start: FloatArray,
     pair: ImagePair,
     mesh: Mesh,
-    cutoff_px: float | None = None,
+    options: FiniteElementOptions = _LAST,
     progress: Progress = silent,
 ) -> NodalResult:
     """Measure the displacement of a photograph on a mesh, from a start (n, 2) at its nodes [mm].
 
-    ``cutoff_px``: cut-off wavelength of the regularisation [px]; None to find it. For the others
-    see :func:`photographed_displacement`.
+    For the others see :func:`photographed_displacement`.
     """
     pair = _alike(pair, mesh, start)
     begin = partial(_known, start)
@@ -108,7 +107,6 @@ def displacement_from(
         first = measure_displacement(inner, begin, mesh, options=_FIRST, progress=progress)
         mask = deformed_mask(pair.grid, mesh, first.displacement, _OFF_PX[1])
         pair = replace(_alike(pair, mesh, first.displacement), deformed_mask=mask)
-    options = replace(_LAST, cutoff_px=cutoff_px)
     return measure_displacement(pair, begin, mesh, options=options, progress=progress)
 
 

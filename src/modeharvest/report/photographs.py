@@ -163,7 +163,10 @@ def _micro(millimetres: float | None, digits: int = 2) -> str:
 
 
 def _model_error_key(frame: Frame) -> KeyNumber:
-    local = frame["local"]
+    local, whole = frame["local"], frame["whole_field"]
+    if whole is not None:
+        remark = "rms of whole displacement − IDIC"
+        return KeyNumber("model error w", number(whole["w_rms_px"], 2), "px", remark)
     if local is not None and local["w_beyond_noise_px"] is not None:
         remark = f"rms of local DIC − IDIC beyond the local DIC’s {local['sd_px']:.2g} px"
         return KeyNumber("model error w", number(local["w_beyond_noise_px"], 2), "px", remark)

@@ -21,7 +21,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,8 +28,6 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import correlate
-from modeharvest.idic.finite_element.files import Given
-from modeharvest.idic.finite_element.measure import measure_displacement
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import SIDECAR, ImageSet, image_key, make_images
@@ -40,7 +37,6 @@ from modeharvest.runs.whole_field import WholeFields, name_of
 from modeharvest.util.errors import InputError, MissingDependencyError, dolfinx_missing
 from modeharvest.util.files import read_json, write_json
 from modeharvest.util.machine import on_first
-from modeharvest.util.progress import Progress
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
 from modeharvest.validation.summary import (
     MeasuredExperiment,
@@ -48,12 +44,6 @@ from modeharvest.validation.summary import (
     displacement_spectrum,
     experiment_summary,
     snapshot_summary,
-)
-from modeharvest.validation.truth import Comparison
-from modeharvest.validation.whole_field import (
-    WholeField,
-    WholeFieldSummary,
-    compare_whole,
 )
 
 _COMPLETE = "complete"
@@ -136,24 +126,10 @@ class Run(StagedRun[Case]):
         if not options.measure:
             return {}
         images, correlated = self._correlated()
-        how = options.of(self.case.experiment, images.grid.pixel_size)
-
-        law = None if how.law is None else how.law.material
-        results = {strain: Result.read(self._result_path(strain)) for strain in images.strains}
-
-        def one(strain: float, progress: Progress) -> NodalResult:
-            pair = images.pair(strain, camera=options.camera)
-            return measure_displacement(pair, results[strain], options=how, progress=progress)
 
         def work() -> list[Path]:
-            return [
-                path
-                for strain in images.strains
-                for path in self._whole_fields.measure(
-                    name_of(strain), f"strain {100 * strain:.2f} %", partial(one, strain),
-                    self.progress, Given(law, results[strain]),
-                )
-            ]  # fmt: skip
+            results, experiment = self._results(images), self.case.experiment
+            return self._whole_fields.of_images(images, results, options, experiment, self.progress)
 
         def read() -> dict[float, NodalResult]:
             return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
@@ -245,7 +221,7 @@ class Run(StagedRun[Case]):
                 [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
             )
             wholes = _Awaited(
-                [threads.submit(self._compare_whole, comparisons, k)
+                [threads.submit(self._whole_fields.compared, comparisons, k, measured.specimen)
                  for k in every if case.whole_field.measure]
             )  # fmt: skip
             found, pitch = [results[strain] for strain in strains], measured.specimen.pitch
@@ -259,14 +235,6 @@ class Run(StagedRun[Case]):
             summary = experiment_summary(measured, case.plain(), numbers).plain()
         write_page(experiment_report(summary, data), page, pictures=pictures)
         return summary
-
-    def _compare_whole(
-        self, comparisons: Sequence[Comparison], k: int
-    ) -> tuple[WholeField, WholeFieldSummary]:
-        known, fields = comparisons[k], self._whole_fields
-        whole = fields.refitted(name_of(known.strain), known.result, known.mask)
-        specimen = self.case.experiment.specimen
-        return whole, compare_whole(whole, known.displacement, known.best, known.mask, specimen)
 
     def _images(self) -> ImageSet:
         advice = "make it again with 'modeharvest image'"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from modeharvest.fem.experiment import Experiment
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.finite_element.files import (
     NO_MORE,
     Given,
@@ -20,14 +22,22 @@ from modeharvest.idic.finite_element.files import (
 from modeharvest.idic.finite_element.measure import (
     FiniteElementOptions,
     Law,
+    measure_displacement,
 )
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.result import Result
+from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import make_folder, read_json, write_json
 from modeharvest.util.progress import Progress
-from modeharvest.validation.whole_field import WholeField, refitted
+from modeharvest.validation.truth import Comparison
+from modeharvest.validation.whole_field import (
+    WholeField,
+    WholeFieldSummary,
+    compare_whole,
+    refitted,
+)
 
 _SECONDS = "timings.json"
 
@@ -132,6 +142,37 @@ class WholeFields:
         seconds = {**self._seconds(), name: time.perf_counter() - begin}
         write_json(self.folder / _SECONDS, seconds)
         return path, path.with_suffix(".vtu")
+
+    def of_images(
+        self,
+        images: ImageSet,
+        results: Mapping[float, Result],
+        options: VirtualWholeFieldOptions,
+        experiment: Experiment,
+        progress: Progress,
+    ) -> list[Path]:
+        """Measure every deformed image of a virtual experiment, from its correlation's result."""
+        files: list[Path] = []
+        how = options.of(experiment, images.grid.pixel_size)
+        law = None if how.law is None else how.law.material
+
+        def one(strain: float, progress: Progress) -> NodalResult:
+            pair = images.pair(strain, camera=options.camera)
+            return measure_displacement(pair, results[strain], options=how, progress=progress)
+
+        for strain in images.strains:
+            of, given = f"strain {100 * strain:.2f} %", Given(law, results[strain])
+            work = partial(one, strain)
+            files += self.measure(name_of(strain), of, work, progress, given)
+        return files
+
+    def compared(
+        self, comparisons: Sequence[Comparison], k: int, specimen: Specimen
+    ) -> tuple[WholeField, WholeFieldSummary]:
+        """One of a virtual experiment, refitted and set against the truth."""
+        known = comparisons[k]
+        whole = self.refitted(name_of(known.strain), known.result, known.mask)
+        return whole, compare_whole(whole, known.displacement, known.best, known.mask, specimen)
 
     def read(self, name: str) -> NodalResult:
         """The whole displacement of an image; InputError if its file is missing or damaged."""

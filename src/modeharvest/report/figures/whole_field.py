@@ -125,9 +125,10 @@ def whole_cards(found: Sequence[tuple[str, Numbers]]) -> list[Card]:
     if not found:
         return []
     labels, numbers = zip(*found, strict=True)
-    kinds = (WholeFieldNumbers, WholeFieldSummary)
-    heads = {name: f"{label} [{unit}]" if unit not in ("", "–") else label
-             for kind in kinds for label, unit, name in quantities(kind)}  # fmt: skip
+    heads: dict[str, str] = {}
+    for kind in (WholeFieldNumbers, WholeFieldSummary):
+        for label, unit, name in quantities(kind):
+            heads.setdefault(name, f"{label} [{unit}]" if unit not in ("", "–") else label)
     rows: list[tuple[Cell, ...]] = [
         (head, *(n.get(name) for n in numbers)) for name, head in heads.items()
     ]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.files import Given
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
@@ -54,6 +55,8 @@ from modeharvest.validation.whole_field import (
 
 _ASTRAY = (Outcome.LOCAL_MINIMUM, Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes of a correlation that is no start."""
+_EDGE_PX = 2
+"""A camera's pixels on an edge show some background, and taking out distortion mixes it further."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which that is warned of."""
 
@@ -124,7 +127,8 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
                 if is_usable:
                     at = correlated.ansatz.displacement_at(correlated.unknowns, mesh.nodes)
                     cutoff = self.case.whole_field.cutoff_px
-                    return self._warned(displacement_from(at, pair, mesh, cutoff, progress), name)
+                    options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
+                    return self._warned(displacement_from(at, pair, mesh, options, progress), name)
                 names, known = ("the reference", name), None if last is None else last.measured
                 found_anew = photographed_displacement(pair, mesh, known, names, progress)
                 return self._warned(found_anew, name)
