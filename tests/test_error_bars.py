@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from modeharvest.idic.correlate import correlate
 from modeharvest.idic.result import Result
-from modeharvest.idic.solver.pyramid import eroded
+from modeharvest.idic.setup import CorrelationOptions
+from modeharvest.idic.solver.pyramid import COARSE_TO_FINE, eroded
 from modeharvest.idic.uncertainty.covariance import MatchedImages, field_errors
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.util.errors import InputError
 
 FloatArray = NDArray[np.float64]
 NOISE = 0.01
+FINEST = CorrelationOptions(levels=COARSE_TO_FINE[-1:])
 USED = eroded(MASK, 2)  # as a correlation does by default
 X, Y = np.linspace(-1.0, 1.0, 7), np.linspace(-1.2, 1.2, 6)
 
@@ -132,7 +134,12 @@ def test_seeds_of_noise_scatter_as_the_curvature_predicts(model_error: float, sd
         noise = sd * rng.normal(size=(2, *f.shape))
         images = quiet[0] + noise[0], quiet[1] + noise[1]
         ends.append(
-            correlate(ImagePair(*images, GRID, MASK), result.ansatz, guess=result.unknowns).unknowns
+            correlate(
+                ImagePair(*images, GRID, MASK),
+                result.ansatz,
+                guess=result.unknowns,
+                options=FINEST,
+            ).unknowns
         )
     told, seen = (
         np.sqrt(np.mean(field_errors(result, X, Y, c).displacement ** 2))

@@ -289,7 +289,7 @@ def test_the_first_critical_point_does_not_depend_on_the_cell() -> None:
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])
 def test_a_critical_wave_between_the_points_of_the_grid_is_found(kind: str) -> None:
-    path = path_of(cell_of(kind, 6), equibiaxial())
+    path = path_of(cell_of(kind, 4), equibiaxial())
     on = first_critical(path)
     off = first_critical(path, CriticalSearch(divisions=3))  # no M among its points
     assert off.load == pytest.approx(on.load, rel=1e-6)  # stationary: of second order in k

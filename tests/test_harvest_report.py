@@ -46,6 +46,8 @@ from modeharvest.report.photographs import (
 from modeharvest.runs.photographs.results import Harvest
 from modeharvest.runs.photographs.summary import harvest_summary
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
 
 @pytest.fixture(scope="module")
 def harvest() -> Harvest:

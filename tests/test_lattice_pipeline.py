@@ -244,7 +244,7 @@ def test_a_study_goes_on_from_where_it_was(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     plan = StudyPlan(
-        ratios=(0.8, 0.8696), loadings=("equibiaxial",), overlays=(0.8696,), divisions=5
+        ratios=(0.8, 0.8696), loadings=("equibiaxial",), overlays=(0.8696,), divisions=4
     )
     seen: list[float] = []
 

@@ -28,6 +28,8 @@ from modeharvest.report.lattice import (
 from modeharvest.report.model import write_page
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField, summary_of
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
 SECTIONS = ("critical", "dispersion", "modes", "branches", "family", "study")
 
 

@@ -14,6 +14,8 @@ from modeharvest.runs.case import Case, shipped_solution
 from modeharvest.runs.experiment import Run
 from modeharvest.util.files import read_json
 
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
+
 CASE = """
 [experiment]
 strains = [0.128]

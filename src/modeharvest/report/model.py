@@ -367,14 +367,14 @@ def write_page(
     """
     if pictures is None:
         pictures = draw_figures(report.figures, progress)
-    page = _template().render(report=report, pictures=pictures)
+    page = page_template().render(report=report, pictures=pictures)
     with atomic(path) as temporary:
         temporary.write_text(page, "utf-8")
 
 
 @cache
-def _template() -> jinja2.Template:
-    """The page, compiled."""
+def page_template() -> jinja2.Template:
+    """Read and compile the page, once in a process."""
     import jinja2
 
     environment = jinja2.Environment(
