@@ -12,7 +12,12 @@ from scipy.sparse import csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
 from modeharvest.idic.finite_element.pixels import continued, images_on, normal_equations, pixels_of
-from modeharvest.idic.finite_element.system import Body, interior_sides, smoothness_matrix
+from modeharvest.idic.finite_element.system import (
+    Body,
+    interior_sides,
+    smoothness_matrix,
+    smoothness_samples,
+)
 from modeharvest.idic.solver.pyramid import FULL
 
 
@@ -71,6 +76,18 @@ def square(count: int) -> Mesh:
     lower = cells((0, 0), (2, 0), (0, 2), (1, 0), (1, 1), (0, 1))
     upper = cells((2, 2), (0, 2), (2, 0), (1, 2), (1, 1), (2, 1))
     return Mesh(nodes, np.vstack([lower, upper]), "T6")
+
+
+def test_samples_have_the_covariance_of_smoothness(mesh: Mesh) -> None:
+    R, count = smoothness_matrix(mesh), 2000
+    found = smoothness_samples(mesh, count).reshape(len(mesh.nodes), 2, count)
+    x, y = mesh.nodes.T
+    for field in (np.sin(5 * x), x * y, np.cos(9 * y)):
+        along = np.tensordot(field, found, 1)
+        covariance = along @ along.T / count
+        # Of so many samples: 1/sqrt(1000) = 3 % is one standard deviation.
+        expected = field @ R @ field * np.eye(2)
+        np.testing.assert_allclose(covariance, expected, atol=0.15 * expected[0, 0])
 
 
 def test_every_side_inside_has_two_cells(mesh: Mesh) -> None:

@@ -16,7 +16,10 @@ displacements are made, over its variance at the pixels: interpolated noise is s
 the pixels.
 
 The covariance by noise is s^2 A^-1 M A^-1. What smoothing takes away is estimated by what a cut-off
-wavelength 1.4 times as long changes, in the mean square around each node.
+wavelength 1.4 times as long changes, in the mean square around each node. Where there is no speckle
+nothing changes that, and the smoothest displacement shows no noise: there it counts what the
+regularisation lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45
+(1983), doi 10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around a node is noise.
 """
 
 from __future__ import annotations
@@ -53,6 +56,8 @@ class Linearised:
     """Sum of r^2, and how many pixels it is over."""
     blocks: FloatArray
     """(m, 3, 6, 6) parts of M, element by element."""
+    share: FloatArray
+    """(m,) of each element's slopes that is signal, not noise [-]."""
     R: csr_array
     penalty: FloatArray
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
@@ -129,20 +134,32 @@ class Deviations(NamedTuple):
     """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
 
 
-def deviations(body: Body, at: Linearised, cutoff: float, noise: float) -> Deviations:
+def deviations(
+    body: Body, at: Linearised, cutoff: float, noise: float, unknowns: float
+) -> Deviations:
     """Estimate what noise and smoothing make of u.
 
-    By noise, the rms of A^-1 e for random e of the covariance M times that of the noise; by
+    By noise, the rms of A^-1 e for random e of the covariance M times that of the noise, with what
+    the regularisation allows for where there is no speckle; by
     smoothing, the rms around each node of what a longer cut-off wavelength changes.
 
     cutoff : wavelength [mm].
     noise : its standard deviation at long wavelengths [grey levels].
+    unknowns : their effective number.
     """
     mesh = body.mesh
     longer = newton_step(body, at, _STEP * cutoff)
     change = (longer - newton_step(body, at, cutoff)).reshape(-1, 2)
-    factor = body.factor(at.M, at.R, body.weight(at.M, at.R, cutoff))
-    found = noise * factor.solve(body.samples(at.blocks, _SAMPLES)).reshape(-1, 2, _SAMPLES)
+    weight = body.weight(at.M, at.R, cutoff)
+    factor = body.factor(at.M, at.R, weight)
+    samples = body.samples(at.blocks, _SAMPLES), body.prior_samples(_SAMPLES)
+    by_noise, prior = (factor.solve(right).reshape(-1, 2, _SAMPLES) for right in samples)
+    blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
+    # The roughness that was found is that of so many unknowns, or the weight is too large.
+    grown = float((at.u - body.start.ravel()) @ at.penalty)
+    rough = weight * grown / max(noise**2 * unknowns, np.finfo(np.float64).tiny)
+    wide = np.sqrt(weight * blank * max(1.0, rough))
+    found = noise * (by_noise + wide[:, None, None] * prior)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes) / _SAMPLES
     slope = nodal_gradient(mesh, change)

@@ -53,6 +53,8 @@ _FIRST_PX = 20.0
 _FIRST_WITH_LAW_PX = 150.0
 _WORSE = 1.01
 """Ratio of the residual's noise with a law to that without, beyond which the law is wrong."""
+_BLANK = 0.01
+"""Part of the material without speckle, beyond which that is warned of."""
 _ROUNDS = 3
 _SETTLED = 0.25
 """Relative change of the cut-off wavelength that needs no other round."""
@@ -187,7 +189,7 @@ class _Measurement:
         self._level: Level | None = None
         self.images: LevelPair
         self.pixels: ElementPixels
-        self.share = 0.0
+        self.share, self.slope_noise = 0.0, 0.0
         self.tried: tuple[Risk, ...] = ()
         self.warnings = warnings
         self.speckle_px = speckle_size(pair.reference, pair.mask)
@@ -208,6 +210,8 @@ class _Measurement:
         require_cover(self.pixels, mask)
         if level == FULL:
             self._weigh_by_reference()
+        else:
+            self.share, self.slope_noise = 0.0, 0.0
         self._lap("images")
 
     def _weigh_by_reference(self) -> None:
@@ -223,16 +227,18 @@ class _Measurement:
             _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
         self.pixels, self.share, self.blur = self.pixels._replace(slope=slope), 1.0, blur
+        self.slope_noise = noise * slope_noise(self.order, blur) / px**2
 
     def linearised(self) -> Linearised:
         nodal = self.u.reshape(-1, 2)
         found = normal_equations(self.pixels, self.body.mesh, self.images, nodal, self.share)
         if found.pixels == 0:
             raise InputError("expected pixels of the material in both images, got none in common")
+        found, share = found.weighed(self.slope_noise)
         M, gradient = self.body.assembled(found)
         self._lap("pixels")
         return Linearised(
-            self.u, M, gradient, found.square_sum, found.pixels, found.blocks,
+            self.u, M, gradient, found.square_sum, found.pixels, found.blocks, share,
             *self.body.penalty(self.u),
         )  # fmt: skip
 
@@ -313,9 +319,16 @@ class _Measurement:
         excess = self._excess()
         here = risk(self.body, at, self.cutoff_px, px, excess)
         noise = here.noise * np.sqrt(excess)
-        sd = deviations(self.body, at, self.cutoff_px * px, noise)
+        sd = deviations(self.body, at, self.cutoff_px * px, noise, here.unknowns)
         self._lap("standard deviations")
         outside = int(self.pixels.start[-1]) - at.pixels
+        counts = np.diff(self.pixels.start)
+        blank = float(counts[at.share == 0.0].sum() / counts.sum())
+        if blank > _BLANK:
+            self.warnings += (
+                f"{100 * blank:.0f} % of the material shows no speckle: there the displacement is "
+                "the smoothest that fits around, and its standard deviation a guess.",
+            )
         return NodalResult(
             mesh=self.body.mesh,
             displacement=self.u.reshape(-1, 2),

@@ -96,6 +96,10 @@ def _continue(image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any]) ->
         out[i, j] = np.linalg.solve(A, b)[0]
 
 
+_LEAST_SHARE = 0.5
+"""Of signal in the slopes of an element; with less than that they may be nothing but noise."""
+
+
 class ElementPixels(NamedTuple):
     """The pixels that count, element by element."""
 
@@ -158,10 +162,24 @@ class NodalEquations:
     """(m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2]."""
     gradient: FloatArray
     """(m, 6, 2) sums of N_a h_i r [grey levels^2/mm]."""
+    counts: FloatArray
+    """(m,) pixels that each element's sums are over."""
     square_sum: float
     pixels: int
     outside: int
     """Sum of r^2 [grey levels^2], pixels it is over, and pixels mapped to where g isn't valid."""
+
+    def weighed(self, noise: float) -> tuple[NodalEquations, FloatArray]:
+        """The equations, each element weighed by its share of signal (m,) from 0 to 1.
+
+        ``noise``: variance of the slopes h that is noise [grey levels^2/mm^2]. Such slopes show no
+        displacement: of a sum of h h' only that share is what an element's residual changes by.
+        """
+        slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
+        share = 1.0 - 2.0 * noise * self.counts / np.maximum(slopes, np.finfo(np.float64).tiny)
+        share[(share < _LEAST_SHARE) | (slopes <= 0.0)] = 0.0
+        blocks = share[:, None, None, None] ** 2 * self.blocks
+        return replace(self, blocks=blocks, gradient=share[:, None, None] * self.gradient), share
 
 
 def normal_equations(
@@ -187,7 +205,7 @@ def normal_equations(
         level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
     total, count, outside = sums.sum(axis=0)
-    return NodalEquations(blocks, gradient, float(total), int(count), int(outside))
+    return NodalEquations(blocks, gradient, sums[:, 1], float(total), int(count), int(outside))
 
 
 @compiled(parallel=True, relaxed=True)

@@ -207,6 +207,20 @@ def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, Float
     return nodes, np.concatenate(parts, axis=2), weights
 
 
+def smoothness_samples(mesh: Mesh, count: int) -> FloatArray:
+    """(2 n, count) random vectors whose covariance is R of both components [1/mm]."""
+    gradients, weights = second_gradients(mesh)
+    nodes, jumps, shares = side_jumps(mesh, interior_sides(mesh.cells))
+    random, total = np.random.default_rng(1), np.zeros((len(mesh.nodes), 2 * count))
+    inside = np.sqrt(weights)[:, :, None, None, None] * gradients
+    across = np.sqrt(_PENALTY * shares)[:, :, None, None] * jumps
+    for groups, roots in ((mesh.cells, inside), (nodes, across)):
+        factors = np.moveaxis(roots, 2, 1).reshape(len(groups), groups.shape[1], -1)
+        z = random.standard_normal((len(groups), factors.shape[2], 2 * count))
+        add_at(total, groups, factors @ z)
+    return total.reshape(2 * len(mesh.nodes), count)
+
+
 def smoothness_matrix(mesh: Mesh) -> csr_array:
     """(n, n) R of one component [1/mm^4], for nodal values (n,) on a T6 mesh; sorted indices."""
     curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
@@ -283,6 +297,12 @@ class Body:
         else:
             self._factor.update(A)
         return self._factor
+
+    def prior_samples(self, count: int) -> FloatArray:
+        """(2 n, count) random vectors of the covariance R; 0 with a law."""
+        if self.law is not None:
+            return np.zeros((self.start.size, count))
+        return smoothness_samples(self.mesh, count)
 
     def samples(self, blocks: FloatArray, count: int) -> FloatArray:
         """(2 n, count) random vectors of the covariance M, given by its blocks."""
