@@ -39,6 +39,7 @@ _PROBES = 4
 _DEGREES = 1.4
 _STEP = 1.4
 """Between neighbouring cut-off wavelengths."""
+_TINY = float(np.finfo(np.float64).tiny)
 _LEAST_PX, _MOST_PX = 2.0, 400.0
 
 
@@ -157,7 +158,7 @@ def deviations(
     blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
     # The roughness that was found is that of so many unknowns, or the weight is too large.
     grown = float((at.u - body.start.ravel()) @ at.penalty)
-    rough = weight * grown / max(noise**2 * unknowns, np.finfo(np.float64).tiny)
+    rough = weight * grown / max(noise**2 * unknowns, _TINY)
     wide = np.sqrt(weight * blank * max(1.0, rough))
     found = noise * (by_noise + wide[:, None, None] * prior)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)

@@ -178,7 +178,8 @@ def second_gradients(mesh: Mesh) -> FloatArray:
     slopes = np.einsum("qkj,eqji->eqki", local, inverse)
     bending = np.einsum("eki,klm->eilm", x, curved)
     bare = curved - np.einsum("eqki,eilm->eqklm", slopes, bending)
-    return np.einsum("eqli,eqklm,eqmj->eqkij", inverse, bare, inverse).mean(axis=1)
+    found = np.einsum("eqli,eqklm,eqmj->eqkij", inverse, bare, inverse)
+    return np.asarray(found.mean(axis=1))
 
 
 def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -207,22 +208,11 @@ def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, Float
     return nodes, np.concatenate(parts, axis=2), weights
 
 
-def smoothness_samples(mesh: Mesh, count: int) -> FloatArray:
-    """(2 n, count) random vectors whose covariance is R of both components [1/mm]."""
-    gradients, weights = second_gradients(mesh)
-    nodes, jumps, shares = side_jumps(mesh, interior_sides(mesh.cells))
-    random, total = np.random.default_rng(1), np.zeros((len(mesh.nodes), 2 * count))
-    inside = np.sqrt(weights)[:, :, None, None, None] * gradients
-    across = np.sqrt(_PENALTY * shares)[:, :, None, None] * jumps
-    for groups, roots in ((mesh.cells, inside), (nodes, across)):
-        factors = np.moveaxis(roots, 2, 1).reshape(len(groups), groups.shape[1], -1)
-        z = random.standard_normal((len(groups), factors.shape[2], 2 * count))
-        add_at(total, groups, factors @ z)
-    return total.reshape(2 * len(mesh.nodes), count)
+def smoothness_roots(mesh: Mesh) -> tuple[IntArray, FloatArray]:
+    """(s, 2 k) nodes around each interior side, and (s, 2 k, c) roots [1/mm^2] of their part of R.
 
-
-def smoothness_matrix(mesh: Mesh) -> csr_array:
-    """(n, n) R of one component [1/mm^4], for nodal values (n,) on a T6 mesh; sorted indices."""
+    A part is its roots times their transpose.
+    """
     curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
     nodes, jumps, shares = side_jumps(mesh, sides)
     first, side, second, _ = sides.T
@@ -230,15 +220,30 @@ def smoothness_matrix(mesh: Mesh) -> csr_array:
     ends = x[np.arange(len(x)), side], x[np.arange(len(x)), (side + 1) % 3]
     h = np.linalg.norm(ends[1] - ends[0], axis=1)
     bent = np.concatenate([curved[first], -curved[second]], axis=1)
-    blocks = np.einsum("skij,slij->skl", bent, bent, optimize=True) + _PENALTY * np.einsum(
-        "s,sg,sgki,sgli->skl", h**-2, shares, jumps, jumps, optimize=True
-    )
+    across = np.sqrt(_PENALTY * shares / h[:, None] ** 2)[:, :, None, None] * jumps
+    second_part, first_part = bent.reshape(*nodes.shape, 4), np.moveaxis(across, 2, 1)
+    return nodes, np.concatenate([second_part, first_part.reshape(*nodes.shape, 4)], axis=2)
+
+
+def smoothness_matrix(mesh: Mesh) -> csr_array:
+    """(n, n) R of one component [1/mm^4], for nodal values (n,) on a T6 mesh; sorted indices."""
+    nodes, roots = smoothness_roots(mesh)
+    blocks = roots @ roots.swapaxes(1, 2)
     n, k = len(mesh.nodes), nodes.shape[1]
     at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
     total = csr_array((blocks.ravel(), at), shape=(n, n))
     total.sum_duplicates()
     total.sort_indices()
     return total
+
+
+def smoothness_samples(mesh: Mesh, count: int) -> FloatArray:
+    """(2 n, count) random vectors whose covariance is R of both components [1/mm^2]."""
+    nodes, roots = smoothness_roots(mesh)
+    z = np.random.default_rng(1).standard_normal((len(roots), roots.shape[2], 2 * count))
+    total = np.zeros((len(mesh.nodes), 2 * count))
+    add_at(total, nodes, roots @ z)
+    return total.reshape(2 * len(mesh.nodes), count)
 
 
 def add_at(total: FloatArray, nodes: IntArray, values: FloatArray) -> None:

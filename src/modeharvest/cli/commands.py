@@ -219,27 +219,17 @@ def harvest(
 def measure(
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Undeformed image.")],
     deformed: Annotated[
-        list[str],
-        typer.Argument(metavar="DEFORMED...", help="Deformed images in the order of the test."),
+        list[str], typer.Argument(metavar="DEFORMED...", help="Images, in the order of the test.")
     ],
     out: Annotated[Path, folder_option("--out", "Folder for everything the measurement leaves.")],
     mask: Annotated[
-        Path | None,
-        typer.Option(
-            help="Image that is black off the reference's material; without, the speckle is found.",
-            metavar="FILE",
-        ),
+        Path | None, typer.Option(help="Image, black off the material; by default it is found.")
     ] = None,
     pixel_size: Annotated[
         float | None, typer.Option(help="Edge of a pixel [mm]; without, lengths are in px.")
     ] = None,
     mesh: Annotated[
-        Path | None,
-        typer.Option(
-            help="Mesh of triangles that meshio reads, in the same unit, from the middle of the "
-            "image, x right, y up; without, one is made from the mask.",
-            metavar="FILE",
-        ),
+        Path | None, typer.Option(help="Triangles, from the middle of the image, x right, y up.")
     ] = None,
 ) -> None:
     """Measure the whole displacement of any speckled surface, up to the edges of its material.
