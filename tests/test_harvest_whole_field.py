@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from synthetic_photographs import Displacement, Photographed, lattice_points, of
 from test_cli import called, error_line
 
+from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
@@ -24,10 +25,17 @@ from modeharvest.idic.solver.gauss_newton import Outcome
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun, harvest
-from modeharvest.runs.photographs.whole_field import PhotographWholeFields
+from modeharvest.runs.photographs.whole_field import PhotographWholeFields, whole_checks
 from modeharvest.util.errors import InputError
+from modeharvest.validation.whole_field import (
+    WholeField,
+    compare_whole,
+    v_percent,
+    waves_percent,
+)
 
 pytest.importorskip("gmsh")
+pytestmark = pytest.mark.usefixtures("coarse_pictures")
 
 PITCH, PIXEL = 1.9, 0.035
 W_PX = 0.8
@@ -131,6 +139,38 @@ def test_the_summary_has_the_whole_displacement_and_both_modes(harvested: Path) 
     page = (harvested / "report.html").read_text("utf-8")
     for words in ("Microfluctuation field, measured", "Principal strain", "Modes by both ways"):
         assert words in page
+
+
+def test_against_the_truth(harvested: Path) -> None:
+    measured = read_result(harvested / "whole_field" / "frame_2.h5")
+    refit = Result.read(harvested / "whole_field" / "frame_2_refit.json")
+    true = np.where(SCENE.mask[..., None], truth(STATES["frame_2"])(SCENE.points), np.nan)
+    best = fit_displacement(true, SCENE.grid, refit.ansatz, refit.unknowns, SCENE.mask)
+    specimen = Specimen(holes_x=4, holes_y=4, diameter=1.4, pitch=PITCH)
+    errors = compare_whole(WholeField(measured, refit, 1.0), true, best, SCENE.mask, specimen)
+    error = true - measured.displacement_on()
+    assert errors.rms_px == pytest.approx(rms_px(error, np.isfinite(error[..., 0])))
+    assert errors.rms_edges_px is not None
+    assert errors.rms_px < errors.rms_edges_px < errors.max_px
+    rows = whole_checks("frame_2", refit, best, errors, SCENE.mask)
+    found = [row.obtained for row in rows]
+    assert found == [errors.rms_px, errors.rms_edges_px, v_percent(refit, best),
+                     waves_percent(refit, best)]  # fmt: skip
+    assert [row.ok for row in rows[2:]] == [found[2] <= 0.5, found[3] <= 0.05]
+
+
+def test_deviations_of_a_mode_from_the_best_fit() -> None:
+    a = ANSATZ.initial_guess(0.05, 3.0)
+    best = fit_displacement(
+        ANSATZ.displacement(a, SCENE.grid.x, SCENE.grid.y), SCENE.grid, ANSATZ, a, SCENE.mask
+    )
+    larger, turned = best.unknowns.copy(), best.unknowns.copy()
+    larger[ANSATZ.v_slice(0)] *= 1.01
+    turned[ANSATZ.phi_slice(0)][1] += 1e-3
+    assert v_percent(replace(best, unknowns=larger), best) == pytest.approx(1.0)
+    # One component of a wave vector (1, 1).
+    expected = 100.0 * 1e-3 / np.sqrt(2.0)
+    assert waves_percent(replace(best, unknowns=turned), best) == pytest.approx(expected, rel=1e-3)
 
 
 def test_again_repeats_nothing(photographs: Path, harvested: Path) -> None:
