@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from perforated import OBLIQUE, holed_cell
-from plate_with_hole import GRID, plate_pair
+from plate_with_hole import GRID, HALF_SIZE, plate_pair
 
 from modeharvest.fem.field import boundary_sides
 from modeharvest.fem.materials import JetMatrix, Ogden, TwoTermI1, stress_and_tangent
+from modeharvest.idic.finite_element.cutoff import Deviations, contradicted
 from modeharvest.idic.finite_element.measure import FiniteElementOptions, Law, measure_displacement
 from modeharvest.idic.finite_element.system import Imbalance
 
@@ -87,4 +88,55 @@ def test_a_law_that_does_not_fit_is_noticed() -> None:
         options=FiniteElementOptions(30.0, 15.0, law=options.law, cutoff_px=400.0),
     )  # fmt: skip
     assert any("law doesn't fit" in sentence for sentence in forced.warnings)
+    assert forced.contradicted is not None
+    assert forced.contradicted > 0.2
     assert forced.grid == GRID
+
+
+def test_a_law_that_fits_is_not_blamed() -> None:
+    """A homogeneous state is in equilibrium, with forces on all edges."""
+    pytest.importorskip("gmsh")
+    F = np.array([[0.97, 0.01], [0.02, 1.02]])
+    pair = plate_pair(lambda points: points @ (F - np.eye(2)).T, 0.02)
+    law = Law(Ogden(), lambda p: (abs(p) > HALF_SIZE - 0.02).any(axis=1) | (np.hypot(*p.T) < 0.4))
+    found, free = (
+        measure_displacement(
+            pair, np.zeros_like, options=FiniteElementOptions(30.0, 15.0, law=given)
+        )
+        for given in (law, None)
+    )
+    assert found.warnings == ()
+    assert found.contradicted is not None
+    assert found.contradicted < 0.02
+    assert free.contradicted is None
+    assert pair.truth is not None
+    mask = pair.masks[0]
+    error = (found.displacement_on() - pair.truth.displacement)[mask]
+    assert np.mean(abs(error) < 1.96 * found.standard_deviation_on()[mask]) > 0.9
+
+
+def test_what_is_in_both_solutions_does_not_contradict() -> None:
+    mesh = holed_cell(OBLIQUE, 4)
+    n, random = len(mesh.nodes), np.random.default_rng(0)
+    samples = random.standard_normal((n, 2, 16))
+    none = np.zeros((n, 2))
+    free = Deviations(samples, none + 0.1, np.zeros((n, 4, 4)))
+    lawful = Deviations(samples.copy(), none, np.zeros((n, 4, 4)))
+    nodes = np.arange(n)
+    assert contradicted(none + 0.29, free, lawful, nodes) == 0.0
+    assert contradicted(none + 0.31, free, lawful, nodes) == 1.0
+    # Independent noise hides as much.
+    other = lawful._replace(samples=random.standard_normal((n, 2, 16)))
+    assert contradicted(none + 0.31, free, other, nodes) == 0.0
+
+
+def test_bias_by_a_linear_change() -> None:
+    mesh = holed_cell(OBLIQUE, 4)
+    n = len(mesh.nodes)
+    bare = Deviations(np.zeros((n, 2, 4)), np.full((n, 2), 3.0), np.zeros((n, 4, 4)))
+    slope = np.array([[0.1, 0.2], [0.0, -0.3]])
+    found = bare.with_bias(mesh, 0.0 * mesh.nodes + [4.0, 0.0])
+    np.testing.assert_allclose(found.bias, np.broadcast_to([5.0, 3.0], (n, 2)), rtol=1e-12)
+    found = bare.with_bias(mesh, mesh.nodes @ slope.T)
+    expected = np.outer(slope.ravel(), slope.ravel())
+    np.testing.assert_allclose(found.gradient, np.broadcast_to(expected, (n, 4, 4)), atol=1e-9)

@@ -41,6 +41,8 @@ class WholeFieldSummary:
     interval_coverage: float = quantity("… truth within 95 % intervals", "–")
     """Share of the components of all pixels."""
     interval_coverage_edges: float | None = quantity("… the same within 10 px of an edge", "–")
+    contradicted: float | None = quantity("… nodes of free edges against the law", "–")
+    """Share where a material law changes u by more than 3 standard deviations; None without one."""
     mode: tuple[float, ...]
     """Parameters of a single mode in the ansatz refitted to the whole displacement."""
     library: str
@@ -194,6 +196,7 @@ def compare_whole(
         interval_coverage=float(inside[there].mean()),
         interval_coverage_edges=float(inside[places[EDGES]].mean()) if EDGES in rms else None,
         mode=_square_mode(refit, specimen.pitch),
+        contradicted=measured.contradicted,
         library=measured.library,
         warnings=measured.warnings,
         seconds=whole.seconds,

@@ -15,11 +15,15 @@ than smoothing too much: Y.-J. Kim, C. Gu, J. R. Stat. Soc. B 66 (2004), doi
 displacements are made, over its variance at the pixels: interpolated noise is smoother than that of
 the pixels.
 
-The covariance by noise is s^2 A^-1 M A^-1. What smoothing takes away is estimated by what a cut-off
-wavelength 1.4 times as long changes, in the mean square around each node. Where there is no speckle
-nothing changes that, and the smoothest displacement shows no noise: there it counts what the
-regularisation lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45
-(1983), doi 10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around a node is noise.
+The covariance by noise is s^2 A^-1 M A^-1. What smoothing takes away is estimated by what a weight
+four times as large changes, in the mean square around each node. Where there is no speckle nothing
+changes that, and the smoothest displacement shows no noise: there it counts what the regularisation
+lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45 (1983), doi
+10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around a node is noise. With a
+material law a larger weight says little, because errors of a law are the same at all long
+wavelengths. There the truth is taken to be anywhere between the solutions d apart with and without
+the law, which adds the variance d^2/12 of a uniform distribution (Guide to the Expression of
+Uncertainty in Measurement, JCGM 100, 4.3.7).
 """
 
 from __future__ import annotations
@@ -33,14 +37,15 @@ from scipy.sparse import csr_array
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import mean_around, nodal_gradient
 from modeharvest.idic.finite_element.system import Body
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES = 4
 _DEGREES = 1.4
 _STEP = 1.4
 """Between neighbouring cut-off wavelengths."""
 _TINY = float(np.finfo(np.float64).tiny)
-_LEAST_PX, _MOST_PX = 2.0, 400.0
+_LEAST_PX, _MOST_PX = 6.0, 400.0
+"""Shorter ones leave single nodes to what splines make of edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,8 @@ class Linearised:
     """(m, 3, 6, 6) parts of M, element by element."""
     share: FloatArray
     """(m,) of each element's slopes that is signal, not noise [-]."""
+    excess: FloatArray
+    """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
     R: csr_array
     penalty: FloatArray
     """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
@@ -109,30 +116,50 @@ def best_of(tried: tuple[Risk, ...]) -> float:
     """The cut-off wavelength at the vertex of the parabola through the best three [px]."""
     k = min(range(len(tried)), key=lambda i: tried[i].value)
     if not 0 < k < len(tried) - 1:
-        return tried[k].cutoff_px
+        return max(tried[k].cutoff_px, _LEAST_PX)
     low, here, high = (tried[i].value for i in (k - 1, k, k + 1))
     shift = 0.5 * (low - high) / (low - 2.0 * here + high)
-    return float(tried[k].cutoff_px * _STEP**shift)
+    return max(float(tried[k].cutoff_px * _STEP**shift), _LEAST_PX)
 
 
 _SAMPLES = 16
 """Of the distribution of noise: its standard deviations are known to 18 %."""
 
 
-def newton_step(body: Body, at: Linearised, cutoff: float) -> FloatArray:
-    """(2 n,) Gauss-Newton step for a cut-off wavelength [mm]."""
-    weight = body.weight(at.M, at.R, cutoff)
+_STRONGER = 4.0
+"""Weight of the regularisation that shows its bias, over the weight used [-]."""
+
+
+def newton_step(body: Body, at: Linearised, cutoff: float, times: float = 1.0) -> FloatArray:
+    """(2 n,) Gauss-Newton step for a cut-off wavelength [mm], or with its weight so many times."""
+    weight = times * body.weight(at.M, at.R, cutoff)
     return body.factor(at.M, at.R, weight).solve(at.gradient - weight * at.penalty)
 
 
 class Deviations(NamedTuple):
     """Standard deviations of u and of its gradient."""
 
-    by_noise: FloatArray
+    samples: FloatArray
+    """(n, 2, s) what random noise makes of u [mm]."""
     bias: FloatArray
-    """(n, 2) of u by noise and by smoothing [mm]."""
+    """(n, 2) of u [mm]."""
     gradient: FloatArray
     """(n, 4, 4) covariance by both of xx, xy, yx, yy of grad u [-]."""
+
+    @property
+    def by_noise(self) -> FloatArray:
+        """(n, 2) of u [mm]."""
+        return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
+
+    def with_bias(self, mesh: Mesh, change: FloatArray) -> Deviations:
+        """Count the mean square around each node of a possible change (n, 2) of u as well [mm]."""
+        slope = nodal_gradient(mesh, change)
+        spread = smoothed(mesh, np.einsum("nij,nkl->nijkl", slope, slope))
+        return Deviations(
+            self.samples,
+            np.sqrt(self.bias**2 + smoothed(mesh, change**2)),
+            self.gradient + spread.reshape(-1, 4, 4),
+        )
 
 
 def deviations(
@@ -140,20 +167,21 @@ def deviations(
 ) -> Deviations:
     """Estimate what noise and smoothing make of u.
 
-    By noise, the rms of A^-1 e for random e of the covariance M times that of the noise, with what
-    the regularisation allows for where there is no speckle; by
-    smoothing, the rms around each node of what a longer cut-off wavelength changes.
+    By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
+    elements with larger residuals, with what the regularisation allows for where there is no
+    speckle; by smoothing, what a larger weight changes.
 
     cutoff : wavelength [mm].
     noise : its standard deviation at long wavelengths [grey levels].
     unknowns : their effective number.
     """
     mesh = body.mesh
-    longer = newton_step(body, at, _STEP * cutoff)
-    change = (longer - newton_step(body, at, cutoff)).reshape(-1, 2)
+    stronger = newton_step(body, at, cutoff, _STRONGER)
     weight = body.weight(at.M, at.R, cutoff)
     factor = body.factor(at.M, at.R, weight)
-    samples = body.samples(at.blocks, _SAMPLES), body.prior_samples(_SAMPLES)
+    change = (stronger - factor.solve(at.gradient - weight * at.penalty)).reshape(-1, 2)
+    blocks = at.blocks * at.excess[:, None, None, None]
+    samples = body.samples(blocks, _SAMPLES), body.prior_samples(_SAMPLES)
     by_noise, prior = (factor.solve(right).reshape(-1, 2, _SAMPLES) for right in samples)
     blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
     # The roughness that was found is that of so many unknowns, or the weight is too large.
@@ -162,14 +190,25 @@ def deviations(
     wide = np.sqrt(weight * blank * max(1.0, rough))
     found = noise * (by_noise + wide[:, None, None] * prior)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)
-    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes) / _SAMPLES
-    slope = nodal_gradient(mesh, change)
-    bias = np.einsum("nij,nkl->nijkl", slope, slope)
-    return Deviations(
-        np.sqrt(np.mean(found**2, axis=2)),
-        np.sqrt(smoothed(mesh, change**2)),
-        (spread + smoothed(mesh, bias)).reshape(-1, 4, 4),
-    )
+    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / _SAMPLES
+    return Deviations(found, np.zeros_like(change), spread).with_bias(mesh, change)
+
+
+_SIGNIFICANT = 3.0
+"""Standard deviations."""
+
+
+def contradicted(
+    difference: FloatArray, free: Deviations, lawful: Deviations, nodes: IntArray
+) -> float:
+    """Share of components at nodes where solutions with and without a law differ significantly.
+
+    Significant are 3 standard deviations of the difference (n, 2) [mm], by the noise that both have
+    in common and by the smoothing of that without a law.
+    """
+    noise = np.mean((lawful.samples - free.samples) ** 2, axis=2)
+    limit = _SIGNIFICANT * np.sqrt(noise + free.bias**2)
+    return float(np.mean(np.abs(difference)[nodes] > limit[nodes]))
 
 
 def smoothed(mesh: Mesh, nodal: FloatArray) -> FloatArray:

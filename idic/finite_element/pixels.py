@@ -162,12 +162,22 @@ class NodalEquations:
     """(m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2]."""
     gradient: FloatArray
     """(m, 6, 2) sums of N_a h_i r [grey levels^2/mm]."""
+    squares: FloatArray
+    """(m,) sums of r^2 [grey levels^2]."""
     counts: FloatArray
-    """(m,) pixels that each element's sums are over."""
-    square_sum: float
-    pixels: int
+    """(m,) of how many pixels."""
     outside: int
-    """Sum of r^2 [grey levels^2], pixels it is over, and pixels mapped to where g isn't valid."""
+    """Pixels mapped to where g isn't valid."""
+
+    @property
+    def square_sum(self) -> float:
+        """Of r^2 over all elements [grey levels^2]."""
+        return float(self.squares.sum())
+
+    @property
+    def pixels(self) -> int:
+        """How many that is over."""
+        return int(self.counts.sum())
 
     def weighed(self, noise: float) -> tuple[NodalEquations, FloatArray]:
         """The equations, each element weighed by its share of signal (m,) from 0 to 1.
@@ -204,8 +214,7 @@ def normal_equations(
         pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
         level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
-    total, count, outside = sums.sum(axis=0)
-    return NodalEquations(blocks, gradient, sums[:, 1], float(total), int(count), int(outside))
+    return NodalEquations(blocks, gradient, sums[:, 0], sums[:, 1], int(sums[:, 2].sum()))
 
 
 @compiled(parallel=True, relaxed=True)

@@ -81,6 +81,9 @@ class NodalResult:
     """Every step; seconds by what they were spent on."""
     warnings: tuple[str, ...] = ()
     """Sentences."""
+    contradicted: float | None = None
+    """Share of the free edges' nodes where a law changes u significantly; None without a law [-].
+    """
 
     @property
     def unknowns(self) -> int:
