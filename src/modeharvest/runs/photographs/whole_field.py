@@ -27,7 +27,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
-from modeharvest.idic.photograph.displacement import displacement_from, photographed_displacement
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Outcome
@@ -125,13 +125,13 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
             def measured(progress: Progress) -> NodalResult:
                 pair, mesh = self._pair(name, before, found), self._mesh
                 if is_usable:
-                    at = correlated.ansatz.displacement_at(correlated.unknowns, mesh.nodes)
-                    cutoff = self.case.whole_field.cutoff_px
-                    options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
-                    return self._warned(displacement_from(at, pair, mesh, options, progress), name)
-                names, known = ("the reference", name), None if last is None else last.measured
-                found_anew = photographed_displacement(pair, mesh, known, names, progress)
-                return self._warned(found_anew, name)
+                    begin = correlated.ansatz.displacement_at(correlated.unknowns, mesh.nodes)
+                else:
+                    known = None if last is None else last.measured
+                    begin = block_motion(pair, mesh, known, ("the reference", name))
+                cutoff = self.case.whole_field.cutoff_px
+                options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
+                return self._warned(displacement_from(begin, pair, mesh, options, progress), name)
 
             try:
                 files = self._files.measure(
