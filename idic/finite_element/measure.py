@@ -29,7 +29,9 @@ from modeharvest.idic.finite_element.cutoff import (
 )
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.pixels import (
+    NOWHERE,
     ElementPixels,
+    beyond,
     continued,
     images_on,
     normal_equations,
@@ -193,7 +195,7 @@ class _Measurement:
         self._level: Level | None = None
         self.images: LevelPair
         self.pixels: ElementPixels
-        self.share, self.slope_noise = 0.0, 0.0
+        self.share, self.slope_noise, self.doubt = 0.0, 0.0, NOWHERE
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
         self.tried: tuple[Risk, ...] = ()
@@ -216,8 +218,9 @@ class _Measurement:
         require_cover(self.pixels, mask)
         if level == FULL:
             self._weigh_by_reference()
+            self.doubt = beyond(self.pair)
         else:
-            self.share, self.slope_noise = 0.0, 0.0
+            self.share, self.slope_noise, self.doubt = 0.0, 0.0, NOWHERE
         self._lap("images")
 
     def _weigh_by_reference(self) -> None:
@@ -237,7 +240,9 @@ class _Measurement:
 
     def linearised(self) -> Linearised:
         nodal = self.u.reshape(-1, 2)
-        found = normal_equations(self.pixels, self.body.mesh, self.images, nodal, self.share)
+        found = normal_equations(
+            self.pixels, self.body.mesh, self.images, nodal, self.share, self.doubt
+        )
         if found.pixels == 0:
             raise InputError("expected pixels of the material in both images, got none in common")
         found, share = found.weighed(self.slope_noise)

@@ -3,7 +3,9 @@
 Near an edge the spline through the deformed image reads pixels beyond it. What continues the
 material there is what errors at edges are made of: a masked blur, a polynomial of degree 0, leaves
 0.075 px within 10 px of the demo's edges, one of degree 2 leaves 0.028 px, without leaving out any
-pixel of the material.
+pixel of the material. Of fine speckle a polynomial knows little; so a residual weighs by how much
+of it continued pixels make, and by how wrong these are: by as much as if the outermost pixels of
+the material were continued from the others.
 
 For every pixel x of the reference that counts, with r = f(x) - g(x + u) and the gradient h that
 weighs it, an element sums N_a N_b h_i h_j and N_a h_i r over its pixels. The elements are dealt to
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.solver.noise import estimated_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, level_pair
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
@@ -57,6 +60,35 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     g = SplineImage.of(continued(pair.deformed, mask), order)
     border = found.valid if found.valid is None else ndimage.binary_dilation(found.valid)
     return replace(found, deformed=g, valid=border)
+
+
+class Beyond(NamedTuple):
+    """What is continued of the deformed image, and how wrong that may be."""
+
+    outside: NDArray[Any]
+    """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) for nowhere."""
+    variance: float
+    """Of a continued pixel's error, over that of the residual's noise [-]."""
+
+
+NOWHERE = Beyond(np.zeros((0, 0), np.float32), 0.0)
+_MOST_DOUBT = 1e6
+
+
+def beyond(pair: ImagePair) -> Beyond:
+    """Try on the outermost pixels of the material how wrong continued ones are."""
+    g, mask = pair.deformed, pair.deformed_mask
+    if mask is None or mask.all():
+        return NOWHERE
+    inside = ndimage.binary_erosion(mask, border_value=1)
+    rim = mask & ~inside
+    noise_f, noise_g = (estimated_noise(*image).sd ** 2
+                        for image in ((pair.reference, pair.masks[0]), (g, mask)))  # fmt: skip
+    error = float(np.mean((continued(g, inside)[rim] - g[rim]) ** 2)) if inside.any() else np.inf
+    # The tried pixel has noise itself, and so would have the one that is missing.
+    excess = max(0.0, error - 2.0 * noise_g)
+    ratio = excess / max(noise_f + noise_g, excess / _MOST_DOUBT, np.finfo(np.float64).tiny)
+    return Beyond((~mask).astype(np.float32), ratio)
 
 
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
@@ -165,7 +197,8 @@ class NodalEquations:
     squares: FloatArray
     """(m,) sums of r^2 [grey levels^2]."""
     counts: FloatArray
-    """(m,) of how many pixels."""
+    weights: FloatArray
+    """(m,) of how many pixels, and the sums of their weights."""
     outside: int
     """Pixels mapped to where g isn't valid."""
 
@@ -186,14 +219,19 @@ class NodalEquations:
         displacement: of a sum of h h' only that share is what an element's residual changes by.
         """
         slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
-        share = 1.0 - 2.0 * noise * self.counts / np.maximum(slopes, np.finfo(np.float64).tiny)
+        share = 1.0 - 2.0 * noise * self.weights / np.maximum(slopes, np.finfo(np.float64).tiny)
         share[(share < _LEAST_SHARE) | (slopes <= 0.0)] = 0.0
         blocks = share[:, None, None, None] ** 2 * self.blocks
         return replace(self, blocks=blocks, gradient=share[:, None, None] * self.gradient), share
 
 
 def normal_equations(
-    pixels: ElementPixels, mesh: Mesh, level: LevelPair, u: FloatArray, share: float
+    pixels: ElementPixels,
+    mesh: Mesh,
+    level: LevelPair,
+    u: FloatArray,
+    share: float,
+    doubt: Beyond = NOWHERE,
 ) -> NodalEquations:
     """Pass over all pixels.
 
@@ -205,22 +243,24 @@ def normal_equations(
     u : (n, 2) displacement of the nodes [mm].
     share : of the reference's gradient, pushed forward, in what weighs the residual; the rest is
         that of the deformed image at x + u [-].
+    doubt : of pixels of the deformed image that are continued.
     """
     m = len(mesh.cells)
-    blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 3))
+    blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 4))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
     g = level.deformed
     accumulate_elements(
         pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
-        level.grid.pixel_size, share, blocks, gradient, sums,
+        doubt.outside, doubt.variance, level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
-    return NodalEquations(blocks, gradient, sums[:, 0], sums[:, 1], int(sums[:, 2].sum()))
+    squares, counts, outside, weights = sums.T
+    return NodalEquations(blocks, gradient, squares, counts, weights, int(outside.sum()))
 
 
 @compiled(parallel=True, relaxed=True)
 def accumulate_elements(
-    pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, pixel_size: float,
-    share: float, blocks: Any, gradient: Any, sums: Any,
+    pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, outside: Any,
+    variance: float, pixel_size: float, share: float, blocks: Any, gradient: Any, sums: Any,
 ) -> None:  # fmt: skip
     """Fill each element's own sums of products over its pixels."""
     for e in prange(x.shape[0]):
@@ -233,6 +273,11 @@ def accumulate_elements(
             _sample(pixels, begin, n, N, u[e], coefficients, order, valid, pixel_size, own, sums[e])
             if share > 0.0:
                 _push_forward(pixels, begin, n, x[e], u[e], share, own)
+            if outside.size:
+                _weigh(n, outside, variance, own)
+            for m in range(n):
+                sums[e, 0] += own[2, m] * own[2, m]
+                sums[e, 3] += own[3, m]
             _add(n, N, own, h, blocks[e], gradient[e])
         for a in range(6):
             for b in range(a):
@@ -274,7 +319,6 @@ def _sample(
         residual[m] = pixels.grey[begin + m] - g[m] if counts else 0.0
         g_x[m] = g_x[m] * per_px if counts else 0.0
         g_y[m] = -g_y[m] * per_px if counts else 0.0
-        sums[0] += residual[m] * residual[m]
         sums[1] += weight[m]
         sums[2] += 1.0 - weight[m]
 
@@ -303,6 +347,23 @@ def _push_forward(pixels: Any, begin: int, n: int, x: Any, u: Any, share: float,
             f_s, f_t = f_x * X_s + f_y * Y_s, f_x * X_t + f_y * Y_t
             own[0, m] += share * ((f_s * y_t - f_t * y_s) / det - own[0, m])
             own[1, m] += share * ((f_t * x_s - f_s * x_t) / det - own[1, m])
+
+
+@compiled(relaxed=True)
+def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
+    """Weigh what continued pixels make of a block by the inverse of its variance."""
+    rows, cols = outside.shape
+    for m in range(n):
+        if own[3, m] > 0.0:
+            row, col = own[4, m], own[5, m]
+            i, j = min(max(int(row), 0), rows - 2), min(max(int(col), 0), cols - 2)
+            a, b = row - i, col - j
+            above = (1.0 - b) * outside[i, j] + b * outside[i, j + 1]
+            below = (1.0 - b) * outside[i + 1, j] + b * outside[i + 1, j + 1]
+            part = (1.0 - a) * above + a * below
+            own[3, m] = 1.0 / (1.0 + variance * part * part)
+            for k in range(3):
+                own[k, m] *= np.sqrt(own[3, m])
 
 
 @compiled(relaxed=True)
