@@ -11,7 +11,14 @@ from scipy.sparse import csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
-from modeharvest.idic.finite_element.pixels import continued, images_on, normal_equations, pixels_of
+from modeharvest.idic.finite_element.pixels import (
+    NOWHERE,
+    beyond,
+    continued,
+    images_on,
+    normal_equations,
+    pixels_of,
+)
 from modeharvest.idic.finite_element.system import (
     Body,
     interior_sides,
@@ -19,6 +26,7 @@ from modeharvest.idic.finite_element.system import (
     smoothness_samples,
 )
 from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.imaging.pair import ImagePair
 
 
 @pytest.fixture(scope="module")
@@ -180,3 +188,17 @@ def images_border(mask: np.ndarray) -> np.ndarray:
     beside[1:] |= mask[:-1]
     beside[:-1] |= mask[1:]
     return beside & ~mask
+
+
+def test_continued_pixels_weigh_by_how_wrong_they_are() -> None:
+    """Exact images leave them out; noise makes all pixels alike."""
+    ratios = []
+    for noise in (0.0, 0.002, 0.1):
+        pair = plate_pair(quadratic_field, noise)
+        assert pair.deformed_mask is not None
+        doubt = beyond(pair)
+        np.testing.assert_array_equal(doubt.outside == 0.0, pair.deformed_mask)
+        ratios.append(doubt.variance)
+    assert ratios[0] > 100.0 * ratios[1] > 100.0 * ratios[2]
+    assert ratios[2] < 1.0
+    assert beyond(ImagePair(pair.reference, pair.deformed, pair.grid)) is NOWHERE

@@ -81,13 +81,15 @@ def beyond(pair: ImagePair) -> Beyond:
     if mask is None or mask.all():
         return NOWHERE
     inside = ndimage.binary_erosion(mask, border_value=1)
-    rim = mask & ~inside
+    outermost = mask & ~inside
     noise_f, noise_g = (estimated_noise(*image).sd ** 2
                         for image in ((pair.reference, pair.masks[0]), (g, mask)))  # fmt: skip
-    error = float(np.mean((continued(g, inside)[rim] - g[rim]) ** 2)) if inside.any() else np.inf
-    # The tried pixel has noise itself, and so would have the one that is missing.
-    excess = max(0.0, error - 2.0 * noise_g)
-    ratio = excess / max(noise_f + noise_g, excess / _MOST_DOUBT, np.finfo(np.float64).tiny)
+    ratio = _MOST_DOUBT
+    if inside.any():
+        error = float(np.mean((continued(g, inside)[outermost] - g[rim]) ** 2))
+        # The tried pixel has noise itself, and so would have the one that is missing.
+        excess, noise = max(0.0, error - 2.0 * noise_g), float(noise_f + noise_g)
+        ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
     return Beyond((~mask).astype(np.float32), ratio)
 
 
