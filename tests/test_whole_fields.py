@@ -14,7 +14,13 @@ from plate_with_hole import GRID
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import JetMatrix, Ogden, TwoTermI1
-from modeharvest.idic.finite_element.fields import FIELDS, deviation_of, field_of, nodal_gradient
+from modeharvest.idic.finite_element.fields import (
+    FIELDS,
+    deviation_of,
+    field_of,
+    interpolation_error,
+    nodal_gradient,
+)
 from modeharvest.idic.finite_element.files import (
     Given,
     field_at,
@@ -184,3 +190,25 @@ def test_files_hold_every_field(mesh: Mesh, tmp_path: Path) -> None:
     assert [path.name for path in paths] == [
         "u_cauchy_xx_MPa.tif", "u_cauchy_yy_MPa.tif", "u_cauchy_xy_MPa.tif", "u_sd_J.tif"
     ]  # fmt: skip
+
+
+def test_interpolation_error_of_a_cubic() -> None:
+    """Of a wave on ever smaller elements it falls by h^3, and is about what is missing."""
+    found = []
+    for n in (8, 16):
+        mesh = holed_cell(OBLIQUE, n)
+        x, y = mesh.nodes.T
+        wave = np.stack([np.sin(1.5 * x + y), np.cos(x - 2.0 * y)], axis=1)
+        at = mesh.nodes[mesh.cells[:, :3]].mean(axis=1)
+        exact = np.stack([np.sin(1.5 * at[:, 0] + at[:, 1]), np.cos(at[:, 0] - 2.0 * at[:, 1])], 1)
+        inside = known(mesh, wave).at(at)
+        there = np.isfinite(inside[:, 0])
+        missing = np.sqrt(np.mean((inside - exact)[there] ** 2))
+        found.append(np.sqrt(np.mean(interpolation_error(mesh, wave) ** 2)))
+        assert 0.3 < found[-1] / missing < 6.0
+    assert 5.0 < found[0] / found[1] < 11.0
+
+
+def test_interpolation_error_of_a_quadratic(mesh: Mesh) -> None:
+    x, y = mesh.nodes.T
+    assert interpolation_error(mesh, np.stack([x**2, x * y], axis=1)).max() < 1e-12

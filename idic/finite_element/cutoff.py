@@ -21,9 +21,9 @@ changes that, and the smoothest displacement shows no noise: there it counts wha
 lets a displacement do, s^2 lambda A^-1 R A^-1 (G. Wahba, J. R. Stat. Soc. B 45 (1983), doi
 10.1111/j.2517-6161.1983.tb01239.x), by how much of the slopes around a node is noise. With a
 material law a larger weight says little, because errors of a law are the same at all long
-wavelengths. There the truth is taken to be anywhere between the solutions d apart with and without
-the law, which adds the variance d^2/12 of a uniform distribution (Guide to the Expression of
-Uncertainty in Measurement, JCGM 100, 4.3.7).
+wavelengths. There the truth is taken to be at most as far from the solution with the law as that
+without it is, d, and most probably with it, which adds the variance d^2/6 of a triangular
+distribution (Guide to the Expression of Uncertainty in Measurement, JCGM 100, 4.3.9).
 """
 
 from __future__ import annotations
@@ -35,7 +35,11 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
-from modeharvest.idic.finite_element.fields import mean_around, nodal_gradient
+from modeharvest.idic.finite_element.fields import (
+    interpolation_error,
+    mean_around,
+    nodal_gradient,
+)
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.util.arrays import FloatArray, IntArray
 
@@ -169,7 +173,7 @@ def deviations(
 
     By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
     elements with larger residuals, with what the regularisation allows for where there is no
-    speckle; by smoothing, what a larger weight changes.
+    speckle; by smoothing, what a larger weight changes, and the elements' own error.
 
     cutoff : wavelength [mm].
     noise : its standard deviation at long wavelengths [grey levels].
@@ -191,7 +195,8 @@ def deviations(
     found = noise * (by_noise + wide[:, None, None] * prior)
     slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)
     spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / _SAMPLES
-    return Deviations(found, np.zeros_like(change), spread).with_bias(mesh, change)
+    error = interpolation_error(mesh, at.u.reshape(-1, 2))
+    return Deviations(found, error, spread).with_bias(mesh, change)
 
 
 _SIGNIFICANT = 3.0

@@ -311,7 +311,7 @@ class _Measurement:
                 "free edges it changes the displacement by more than 3 standard deviations, where "
                 f"{100 * _WRONG:.1f} % are usual at most; measure without it, or correct the law.",
             )
-        return sd.with_bias(mesh, difference / np.sqrt(12.0))
+        return sd.with_bias(mesh, difference / np.sqrt(6.0))
 
     def _regularised(self, first_px: float, cutoff: float | None) -> None:
         """Go to a cut-off wavelength, given or to be found from a first one on."""
