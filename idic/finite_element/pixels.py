@@ -86,7 +86,7 @@ def beyond(pair: ImagePair) -> Beyond:
                         for image in ((pair.reference, pair.masks[0]), (g, mask)))  # fmt: skip
     ratio = _MOST_DOUBT
     if inside.any():
-        error = float(np.mean((continued(g, inside)[outermost] - g[rim]) ** 2))
+        error = float(np.mean((continued(g, inside)[outermost] - g[outermost]) ** 2))
         # The tried pixel has noise itself, and so would have the one that is missing.
         excess, noise = max(0.0, error - 2.0 * noise_g), float(noise_f + noise_g)
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
