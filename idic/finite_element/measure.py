@@ -350,6 +350,11 @@ class _Measurement:
         """Make the result, with its standard deviations."""
         at, here, sd = self._assessed()
         sd = self._against_law_free(sd)
+        if not (np.isfinite(self.u).all() and np.isfinite(sd.by_noise + sd.bias).all()):
+            raise InputError(
+                "expected images that determine a displacement, got no finite one: too much of "
+                "the mesh, or of the mask, shows no speckle that is in both images; check them"
+            )
         self._lap("standard deviations")
         outside = int(self.pixels.start[-1]) - at.pixels
         counts = np.diff(self.pixels.start)
