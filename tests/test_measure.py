@@ -197,6 +197,23 @@ def test_what_of_a_mask_is_not_measured_is_said(plate: Plate, tmp_path: Path) ->
     assert "of the mask without speckle" in (tmp_path / "out/report.html").read_text()
 
 
+def test_elements_beside_the_mask_are_left_out(plate: Plate, tmp_path: Path) -> None:
+    mask = plate.mask.copy()
+    mask[:, 130:] = False
+    write_image(tmp_path / "mask.tif", mask)
+    mesh = mesh_of_mask(plate.mask, GRID, 24.0)
+    points = np.pad(mesh.nodes, ((0, 0), (0, 1)))
+    meshio.Mesh(points, [("triangle6", mesh.cells)]).write(tmp_path / "mesh.vtu")
+    summary = measure(plate.folder / "ref.tif", [plate.folder / "a.tif"], tmp_path / "out",
+                      mask=tmp_path / "mask.tif", mesh=tmp_path / "mesh.vtu",
+                      pixel_size=GRID.pixel_size)  # fmt: skip
+    assert "elements lie beside the image or the mask" in summary["warnings"][0]
+    result = read_result(tmp_path / "out/results/a.h5")
+    assert 0.4 * len(mesh.cells) < len(result.mesh.cells) < 0.7 * len(mesh.cells)
+    error = (result.displacement_on() - plate.truth["a"])[mask] / GRID.pixel_size
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
 def test_what_does_not_match_is_said(plate: Plate, tmp_path: Path) -> None:
     image, other = (tifffile.imread(path) for path in (plate.files[0], plate.folder / "ref.tif"))
     image[120:150, 180:220] = other[60:90, 180:220]
