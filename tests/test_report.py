@@ -26,8 +26,6 @@ from modeharvest.report.figures.experiment import (
 )
 from modeharvest.report.model import Measured, draw_figures, fixed, number, print_report, write_page
 
-pytestmark = pytest.mark.usefixtures("coarse_pictures")
-
 
 def report(data: ExperimentData, folder: Path, summary: dict[str, Any]) -> str:
     path = folder / "report.html"
