@@ -184,9 +184,12 @@ def _continue(
     element, xi = located_at(mesh, grid, near, located.element, (rows, cols))
     for begin in range(0, rows.size, _CHUNK):
         part = np.s_[begin : begin + _CHUNK]
-        N = shape_functions(mesh.element, xi[part])
-        found = np.einsum("ka,kac->ck", N, nodal[mesh.cells[element[part]]])
-        values[:, rows[part], cols[part]] = found
+        N, own = shape_functions(mesh.element, xi[part]), nodal[mesh.cells[element[part]]]
+        # A polynomial through values that change much within an element runs away from them.
+        least, most = own.min(axis=1), own.max(axis=1)
+        reach = 0.5 * (most - least)
+        found = np.clip(np.einsum("ka,kac->kc", N, own), least - reach, most + reach)
+        values[:, rows[part], cols[part]] = found.T
 
 
 def located_at(

@@ -20,6 +20,8 @@ from modeharvest.util.typed import quantities
 from modeharvest.validation.truth import lengths
 from modeharvest.validation.whole_field import WholeField, WholeFieldNumbers, WholeFieldSummary
 
+_SHARE = 0.98
+"""Of the pixels whose values are within the colours: at edges a few are much larger."""
 Numbers = Mapping[str, Any]
 """A whole displacement's in ``summary.json``."""
 
@@ -78,7 +80,7 @@ class WholeMaps(Generic[S]):
         true, measured = self.truth(state), self._measured(state).displacement_on(state.view.grid)
         assert true is not None
         error = lengths(true.displacement - measured)
-        return fits.draw_length(state, state.view.map_frame().average(error))
+        return fits.draw_length(state, state.view.map_frame().average(error), share=_SHARE)
 
     def _principal_strain(self, state: S) -> Figure:
         """The logarithmic strain of larger size, tension positive."""
@@ -87,12 +89,12 @@ class WholeMaps(Generic[S]):
         is_first = np.abs(values[:, :1]) > np.abs(values[:, 1:])
         larger = np.where(is_first, values[:, :1], values[:, 1:])
         strain = measured.on_pixels(larger, _pixels(frame, state.view.grid))[..., 0]
-        return draw_field(frame, strain, ColourScale.signed(strain, "", 0.998), state.motion)
+        return draw_field(frame, strain, ColourScale.signed(strain, "", _SHARE), state.motion)
 
     def _deviation(self, state: S) -> Figure:
         frame, measured = state.view.map_frame(), self._measured(state)
         sd = measured.standard_deviation_on(_pixels(frame, state.view.grid))
-        return fits.draw_length(state, lengths(sd))
+        return fits.draw_length(state, lengths(sd), share=_SHARE)
 
 
 def _pixels(frame: MapFrame, grid: PixelGrid) -> PixelGrid:
