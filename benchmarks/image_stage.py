@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from modeharvest.fem.field import Mesh, Solution
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import interpolate, locate
-from modeharvest.imaging.render import ImagedState
 from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.case import shipped_solution
@@ -65,11 +64,12 @@ def term_by_term(speckle: Speckle, row: FloatArray, col: FloatArray) -> FloatArr
 
 
 def render(mesh: Mesh, u: FloatArray, grid: PixelGrid, speckle: Speckle) -> NDArray[np.float32]:
-    """The grey levels at all pixel centres, on a black background; nothing kept of the mapping."""
-    scene = ImagedState(mesh, u, grid, speckle, 0.0)
-    centre, once = np.zeros((1, 2)), np.ones(1)
-    grey = scene.average(centre, once, np.ones(grid.shape, np.bool_))
-    return grey.reshape(grid.shape).astype(np.float32)
+    """The grey levels at all pixel centres, on a black background, as of a deformed state."""
+    located = locate(mesh.nodes + u, mesh.cells, mesh.element, grid, nodal=mesh.nodes)
+    (x, y), mask = located.values, located.mask
+    image = np.zeros(grid.shape, np.float32)
+    image[mask] = speckle(*grid.to_px(x[mask], y[mask]))
+    return image
 
 
 def growth(mesh: Mesh, u: FloatArray) -> None:
