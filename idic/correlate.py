@@ -14,7 +14,12 @@ from modeharvest.idic.chebyshev import Brightness
 from modeharvest.idic.result import Result, determined_part
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.assembly import Assembly, residual
-from modeharvest.idic.solver.final_smoothing import FinalSmoothing, smoothed_pair, speckle_size
+from modeharvest.idic.solver.final_smoothing import (
+    FinalSmoothing,
+    smoothed_pair,
+    speckle_size,
+    spline_order,
+)
 from modeharvest.idic.solver.gauss_newton import (
     GaussNewtonOptions,
     Iteration,
@@ -45,8 +50,6 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.scaled_eigen import ScaledEigen
 
-_FINE_PX = 6.5
-"""Speckles narrower than this want a spline of order 11."""
 WITHOUT_RESULT = (Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes with nothing to assess."""
 
@@ -106,7 +109,7 @@ def correlate(
         pair = smoothed_pair(pair, smoothing.blur_px)
         ansatz = replace(ansatz, brightness=Brightness())  # which local normalisation takes away
     size_px = speckle_size(pair.reference, pair.mask)
-    order = options.order or (5 if size_px >= _FINE_PX else 11)
+    order = options.order or spline_order(size_px)
     course.lap("check")
     reached = course.through(levels, pair, ansatz, a[: ansatz.size], order)
     result, reweighted = _assessed(reached, pair, size_px, course)

@@ -12,9 +12,9 @@ from scipy.sparse import csr_array, diags_array
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.sparse_factor import LIBRARIES, factorise
 from modeharvest.idic.finite_element.pixels import (
-    NOWHERE,
-    beyond,
+    NONE_CONTINUED,
     continued,
+    continued_pixels,
     images_on,
     normal_equations,
     pixels_of,
@@ -196,9 +196,10 @@ def test_continued_pixels_weigh_by_how_wrong_they_are() -> None:
     for noise in (0.0, 0.002, 0.1):
         pair = plate_pair(quadratic_field, noise)
         assert pair.deformed_mask is not None
-        doubt = beyond(pair)
-        np.testing.assert_array_equal(doubt.outside == 0.0, pair.deformed_mask)
-        ratios.append(doubt.variance)
+        found = continued_pixels(pair, noise**2)
+        np.testing.assert_array_equal(found.outside == 0.0, pair.deformed_mask)
+        ratios.append(found.variance)
     assert ratios[0] > 100.0 * ratios[1] > 100.0 * ratios[2]
     assert ratios[2] < 1.0
-    assert beyond(ImagePair(pair.reference, pair.deformed, pair.grid)) is NOWHERE
+    whole = ImagePair(pair.reference, pair.deformed, pair.grid)
+    assert continued_pixels(whole, 0.0) is NONE_CONTINUED

@@ -29,10 +29,10 @@ from modeharvest.idic.finite_element.cutoff import (
 )
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.pixels import (
-    NOWHERE,
+    NONE_CONTINUED,
     ElementPixels,
-    beyond,
     continued,
+    continued_pixels,
     images_on,
     normal_equations,
     pixels_of,
@@ -41,7 +41,7 @@ from modeharvest.idic.finite_element.pixels import (
 from modeharvest.idic.finite_element.result import NodalResult, Step
 from modeharvest.idic.finite_element.system import Body, Imbalance
 from modeharvest.idic.result import Result
-from modeharvest.idic.solver.final_smoothing import speckle_size
+from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
 from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, smoothed
 from modeharvest.idic.solver.weighting import best_blur
@@ -195,13 +195,13 @@ class _Measurement:
         self._level: Level | None = None
         self.images: LevelPair
         self.pixels: ElementPixels
-        self.share, self.slope_noise, self.doubt = 0.0, 0.0, NOWHERE
+        self.share, self.slope_noise, self.continued = 0.0, 0.0, NONE_CONTINUED
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
         self.tried: tuple[Risk, ...] = ()
         self.warnings = warnings
         self.speckle_px = speckle_size(pair.reference, pair.mask)
-        self.order = options.order or (5 if self.speckle_px >= 6.5 else 11)
+        self.order = options.order or spline_order(self.speckle_px)
 
     def _lap(self, step: str) -> None:
         now = time.perf_counter()
@@ -218,9 +218,8 @@ class _Measurement:
         require_cover(self.pixels, mask)
         if level == FULL:
             self._weigh_by_reference()
-            self.doubt = beyond(self.pair)
         else:
-            self.share, self.slope_noise, self.doubt = 0.0, 0.0, NOWHERE
+            self.share, self.slope_noise, self.continued = 0.0, 0.0, NONE_CONTINUED
         self._lap("images")
 
     def _weigh_by_reference(self) -> None:
@@ -237,11 +236,12 @@ class _Measurement:
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
         self.pixels, self.share, self.blur = self.pixels._replace(slope=slope), 1.0, blur
         self.slope_noise = noise * slope_noise(self.order, blur) / px**2
+        self.continued = continued_pixels(self.pair, noise)
 
     def linearised(self) -> Linearised:
         nodal = self.u.reshape(-1, 2)
         found = normal_equations(
-            self.pixels, self.body.mesh, self.images, nodal, self.share, self.doubt
+            self.pixels, self.body.mesh, self.images, nodal, self.share, self.continued
         )
         if found.pixels == 0:
             raise InputError("expected pixels of the material in both images, got none in common")

@@ -1,11 +1,10 @@
 """Images and pixels of a mesh: continued beyond edges, sorted by element, normal equations.
 
 Near an edge the spline through the deformed image reads pixels beyond it. What continues the
-material there is what errors at edges are made of: a masked blur, a polynomial of degree 0, leaves
-0.075 px within 10 px of the demo's edges, one of degree 2 leaves 0.028 px, without leaving out any
-pixel of the material. Of fine speckle a polynomial knows little; so a residual weighs by how much
-of it continued pixels make, and by how wrong these are: by as much as if the outermost pixels of
-the material were continued from the others.
+material there is what errors at edges are made of: local quadratic polynomials. Of fine speckle
+they know little; so a residual weighs by the inverse of its variance, that of continued pixels
+included, which is the one that the outermost pixels of the material have when they are continued
+from the others.
 
 For every pixel x of the reference that counts, with r = f(x) - g(x + u) and the gradient h that
 weighs it, an element sums N_a N_b h_i h_j and N_a h_i r over its pixels. The elements are dealt to
@@ -62,8 +61,8 @@ def images_on(pair: ImagePair, level: Level, edge_px: int, order: int) -> LevelP
     return replace(found, deformed=g, valid=border)
 
 
-class Beyond(NamedTuple):
-    """What is continued of the deformed image, and how wrong that may be."""
+class ContinuedPixels(NamedTuple):
+    """Which pixels of the deformed image are continued, and their error's variance."""
 
     outside: NDArray[Any]
     """(rows, cols) float32, 1 where a pixel is continued and 0 on material; (0, 0) for nowhere."""
@@ -71,26 +70,28 @@ class Beyond(NamedTuple):
     """Of a continued pixel's error, over that of the residual's noise [-]."""
 
 
-NOWHERE = Beyond(np.zeros((0, 0), np.float32), 0.0)
-_MOST_DOUBT = 1e6
+NONE_CONTINUED = ContinuedPixels(np.zeros((0, 0), np.float32), 0.0)
+_LARGEST_VARIANCE = 1e6
+"""Of continued pixels where there is no noise [-]."""
 
 
-def beyond(pair: ImagePair) -> Beyond:
-    """Try on the outermost pixels of the material how wrong continued ones are."""
+def continued_pixels(pair: ImagePair, noise_f: float) -> ContinuedPixels:
+    """Estimate the continued pixels' variance from the outermost pixels of the material.
+
+    ``noise_f``: variance of the reference's noise [grey levels^2].
+    """
     g, mask = pair.deformed, pair.deformed_mask
     if mask is None or mask.all():
-        return NOWHERE
+        return NONE_CONTINUED
     inside = ndimage.binary_erosion(mask, border_value=1)
     outermost = mask & ~inside
-    noise_f, noise_g = (estimated_noise(*image).sd ** 2
-                        for image in ((pair.reference, pair.masks[0]), (g, mask)))  # fmt: skip
-    ratio = _MOST_DOUBT
+    noise_g, ratio = estimated_noise(g, mask).sd ** 2, _LARGEST_VARIANCE
     if inside.any():
         error = float(np.mean((continued(g, inside)[outermost] - g[outermost]) ** 2))
         # The tried pixel has noise itself, and so would have the one that is missing.
         excess, noise = max(0.0, error - 2.0 * noise_g), float(noise_f + noise_g)
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
-    return Beyond((~mask).astype(np.float32), ratio)
+    return ContinuedPixels((~mask).astype(np.float32), ratio)
 
 
 def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
@@ -233,7 +234,7 @@ def normal_equations(
     level: LevelPair,
     u: FloatArray,
     share: float,
-    doubt: Beyond = NOWHERE,
+    continued_in_g: ContinuedPixels = NONE_CONTINUED,
 ) -> NodalEquations:
     """Pass over all pixels.
 
@@ -245,7 +246,7 @@ def normal_equations(
     u : (n, 2) displacement of the nodes [mm].
     share : of the reference's gradient, pushed forward, in what weighs the residual; the rest is
         that of the deformed image at x + u [-].
-    doubt : of pixels of the deformed image that are continued.
+    continued_in_g : pixels of the deformed image that are continued, by which residuals weigh.
     """
     m = len(mesh.cells)
     blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 4))
@@ -253,7 +254,7 @@ def normal_equations(
     g = level.deformed
     accumulate_elements(
         pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
-        doubt.outside, doubt.variance, level.grid.pixel_size, share, blocks, gradient, sums,
+        *continued_in_g, level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
     squares, counts, outside, weights = sums.T
     return NodalEquations(blocks, gradient, squares, counts, weights, int(outside.sum()))

@@ -45,6 +45,11 @@ def speckle_size(image: NDArray[Any], mask: BoolArray | None = None) -> float:
     return float(2.0 * (below - 1 + fraction))
 
 
+def spline_order(speckle_size_px: float) -> int:
+    """The order that a speckle of this size [px] asks for: 5, or 11 if narrower than 6.5 px."""
+    return 5 if speckle_size_px >= 6.5 else 11
+
+
 def _autocorrelation(image: NDArray[Any], interior: BoolArray) -> FloatArray:
     """(_LONGEST,) along the rows, over pairs of pixels that are both inside."""
     lines = np.flatnonzero(interior.any(axis=1))
