@@ -21,9 +21,9 @@ from modeharvest.runs.lattice.case import (
     Loading,
     ModesPlan,
     SquareLattice,
-    StudyPlan,
 )
 from modeharvest.util.errors import InputError
+from modeharvest.validation.studies.lattice import StudyPlan
 
 SHIPPED = ("chiral-lattice", "hexagonal-lattice", "mode-study", "square-lattice")
 

@@ -29,10 +29,10 @@ from modeharvest.runs.lattice.case import (
     ModesPlan,
     SearchPlan,
     SquareLattice,
-    StudyPlan,
 )
 from modeharvest.runs.lattice.pipeline import LatticeAnalysis
 from modeharvest.util.files import read_json
+from modeharvest.validation.studies.lattice import StudyPlan
 
 pytestmark = [pytest.mark.dolfinx, pytest.mark.usefixtures("coarse_pictures")]
 

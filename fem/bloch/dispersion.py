@@ -18,7 +18,7 @@ from modeharvest.fem.lattice.options import CENTRE, Wave, wave_of
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic_hdf5, open_hdf5
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.eigen import BlochWaves
@@ -159,10 +159,8 @@ def dispersion(
     lattice = path.cell.cell.lattice
     points, stops = zone_path(corners, lattice, count)
     values = []
-    for k, load in enumerate(loads):
-        progress(k, len(loads), "dispersion")
+    for load in counted(loads, progress, "dispersion"):
         values.append(_along(BlochWaves(path.cell, _state(path, load)), points, bands))
-    progress(len(loads), len(loads), "dispersion")
     steps = np.diff(np.array(points), axis=0) @ np.linalg.inv(lattice).T
     distances = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
     labels = tuple(label for label, _ in corners)

@@ -33,7 +33,7 @@ from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.validation.resolution.buckled import AddedWave, ResolutionSpec
 from modeharvest.validation.resolution.star import KEPT
 
@@ -165,8 +165,7 @@ class TransferCurves:
             [buckled.wave_at(AddedWave(part, axis, float(period), phase, 1.0), points)
              for part, axis in kinds for period in periods for phase in _PHASES], axis=-1
         )  # fmt: skip
-        for n, degree in enumerate(degrees):
-            progress(n, len(degrees), "resolution: best fits")
+        for degree in counted(degrees, progress, "resolution: best fits"):
             ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
             fit = tangent_fit(ansatz, start, points, waves)
             for k, (part, axis) in enumerate(kinds):
@@ -174,7 +173,6 @@ class TransferCurves:
                 for found, among in ((own, getattr(fit, part)), (whole, fit.whole)):
                     shares = _over_phases(among[..., here], waves[..., here])
                     found[part, axis, degree] = shares
-        progress(len(degrees), len(degrees), "resolution: best fits")
         return cls(periods, own, whole)
 
     def at(self, part: str, axis: int, degree: int, period: float) -> float:

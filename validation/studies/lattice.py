@@ -28,10 +28,10 @@ from modeharvest.idic.modes import square_family
 from modeharvest.idic.spectra.lattice_spectrum import MeshQuadrature
 from modeharvest.idic.spectra.mode_family import best_amplitude, mode_family, overlap
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic
-from modeharvest.util.progress import Progress, silent
-from modeharvest.util.typed import quantities, quantity
+from modeharvest.util.errors import InputError, require_within
+from modeharvest.util.files import reading, write_csv
+from modeharvest.util.progress import Progress, counted, silent
+from modeharvest.util.typed import nearest, quantities, quantity
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
@@ -84,32 +84,24 @@ _HEADS = {name: f"{label} [{unit}]" if unit else label for label, unit, name in 
 _ROWS = TypeAdapter(tuple[ModeRow, ...])
 
 
-def write_rows(path: Path | str, rows: Iterable[ModeRow]) -> None:
+def write_rows(path: Path, rows: Iterable[ModeRow]) -> None:
     """Write the table, atomically; numbers with all their digits."""
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_HEADS.values())
-        writer.writerows([getattr(row, name) for name in _HEADS] for row in rows)
+    write_csv(path, _HEADS.values(), ([getattr(row, name) for name in _HEADS] for row in rows))
 
 
-def read_rows(path: Path | str) -> tuple[ModeRow, ...]:
+def read_rows(path: Path) -> tuple[ModeRow, ...]:
     """Read what :func:`write_rows` wrote; empty without a file, InputError if it is another."""
-    if not (path := Path(path)).exists():
+    if not path.exists():
         return ()
-    with path.open(newline="", encoding="utf-8") as file:
-        table = list(csv.reader(file))
-    if not table or table[0] != list(_HEADS.values()):
-        raise InputError(
-            f"mode study: expected a table with the heads of this version at {path}, got "
-            f"{table[0] if table else 'nothing'}; remove it to begin anew"
-        )
-    try:
-        return _ROWS.validate_python([dict(zip(_HEADS, row, strict=True)) for row in table[1:]])
-    except ValueError as error:
-        raise InputError(
-            f"mode study: expected {len(_HEADS)} values in each row of {path}, got: "
-            f"{str(error).splitlines()[0]}; remove it to begin anew"
-        ) from error
+    heads, remedy = list(_HEADS.values()), "remove it to begin anew"
+    with (
+        reading(path, "a table of the mode study", remedy),
+        path.open(newline="", encoding="utf-8") as file,
+    ):
+        first, *rows = csv.reader(file)
+        if first != heads:
+            raise InputError(f"expected the columns of this version, got {first}; {remedy}")
+        return _ROWS.validate_python([dict(zip(_HEADS, row, strict=True)) for row in rows])
 
 
 PATTERN = (math.pi, math.pi)
@@ -121,6 +113,7 @@ RATIOS = (0.25, 0.35, 0.45, 0.55, 0.6, 0.65, 0.7, 0.7895, 0.8696, 0.95)
 SHOWN = (0.95, 0.7895, 0.25)
 """Of d/l in the paper's Fig. "graded", from left to right."""
 _STEP, _CLOSE = 0.02, 0.002  # of the load [-]
+_NARROW = 0.005  # bracket of d/l where another mode comes first [-]
 LOADINGS: dict[str, MacroLoading] = {
     "uniaxial": uniaxial(), "uniaxial strain": uniaxial_strain(), "equibiaxial": equibiaxial()
 }  # fmt: skip
@@ -322,10 +315,9 @@ class ModeTable:
     ``path``: the file; None to keep the rows in memory.
     """
 
-    def __init__(self, path: Path | str | None = None) -> None:
+    def __init__(self, path: Path | None = None) -> None:
         self.path = path
-        rows = () if path is None else read_rows(path)
-        self.known: dict[object, ModeRow] = {row.key: row for row in rows}
+        self.known = {row.key: row for row in (() if path is None else read_rows(path))}
 
     def row(self, lattice: StudiedLattice, work: Work) -> ModeRow:
         """The row of a lattice, from the table or by ``work``."""
@@ -339,12 +331,7 @@ class ModeTable:
         self, lattices: Sequence[StudiedLattice], work: Work, progress: Progress = silent
     ) -> tuple[ModeRow, ...]:
         """The rows of some lattices, in their order."""
-        found = []
-        for n, lattice in enumerate(lattices):
-            progress(n, len(lattices), "mode study")
-            found.append(self.row(lattice, work))
-        progress(1, 1, "mode study")
-        return tuple(found)
+        return tuple(self.row(it, work) for it in counted(lattices, progress, "mode study"))
 
 
 def study_likeness(
@@ -367,66 +354,89 @@ def study_likeness(
 
 
 def first_mode_limit(
-    base: StudiedLattice,
-    loading: str,
-    rows: Sequence[ModeRow],
-    tolerance: float = 0.005,
-    table: ModeTable | None = None,
+    base: StudiedLattice, loading: str, rows: Sequence[ModeRow], table: ModeTable
 ) -> FirstModeLimit | None:
     """Bisect d/l to where the pattern stops being the first mode of a loading.
 
-    ``base``: all else about the lattice; ``rows``: known ones, to begin with; ``tolerance``: of
-    d/l [-], an InputError if it is not positive. None if among the rows there is none with the
-    pattern first and one below with something else.
+    ``base``: all else about the lattice; ``rows``: known ones, to begin with. None if among them
+    there is none with the pattern first and one below with something else.
     """
-    if not tolerance > 0:
-        raise InputError(f"mode study: expected a positive tolerance of d/l, got {tolerance}")
-    table = table or ModeTable()
     known = sorted((row for row in rows if row.loading == loading), key=lambda row: row.ratio)
     below = [row for row in known if not row.is_first]
     above = [row for row in known if row.is_first and (not below or row.ratio > below[-1].ratio)]
     if not below or not above or below[-1].kind == "path ends":
         return None
     low, high = below[-1], above[0]
-    while high.ratio - low.ratio > tolerance:
+    while high.ratio - low.ratio > _NARROW:
         ratio = round(0.5 * (low.ratio + high.ratio), 6)
         middle = table.row(replace(base, ratio=ratio, loading=LOADINGS[loading]), pattern_row)
         low, high = (low, middle) if middle.is_first else (middle, high)
     return FirstModeLimit(loading, low.ratio, high.ratio, low.kind)
 
 
-def ratio_lattices(
-    ratios: Iterable[float], loadings: Iterable[str], base: StudiedLattice = StudiedLattice()
-) -> list[StudiedLattice]:
-    """Every hole size under every loading, all else as the base has it."""
-    return [replace(base, ratio=r, loading=LOADINGS[name]) for name, r in product(loadings, ratios)]
+_LOADINGS = tuple(name.replace(" ", "-") for name in LOADINGS)
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """What a study asks about one lattice.
+
+    Every ratio under every loading, and where the pattern stops being what buckles first; other
+    unit cell sizes and materials at the lattice's own d/l and loading.
+    """
+
+    ratios: tuple[float, ...] = RATIOS
+    """d/l [-]."""
+    loadings: tuple[str, ...] = _LOADINGS
+    """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
+    pitches: tuple[float, ...] = ()
+    """Other l [mm]; the mesh is scaled, too."""
+    materials: tuple[str, ...] = ()
+    """Names among ``STUDIED_MATERIALS``."""
+    overlays: tuple[float, ...] = SHOWN
+    """d/l of the pictures of numerical over analytic mode [-]."""
+    divisions: int = 13
+    """Elements along l."""
+    largest: float = 0.28
+    """Load up to which to look for critical points [-]."""
+
+    def __post_init__(self) -> None:
+        for names, known in ((self.loadings, _LOADINGS), (self.materials, STUDIED_MATERIALS)):
+            for name in names:
+                if name not in known:
+                    raise InputError(f"unknown name {name!r}{nearest(name, list(known))}")
+        if not self.loadings or not self.ratios:
+            raise InputError("study: expected a ratio and a loading or more, got none")
+        require_within("study: expected divisions", self.divisions, 4, 200)
+        if not 0 < self.largest < 1:
+            raise InputError(f"study: expected 0 < largest < 1, got {self.largest}")
+        for pitch in self.pitches:
+            require_within("study: expected pitches [mm]", pitch, 0, above=True)
+        if not all(0 < ratio < 1 for ratio in (*self.ratios, *self.overlays)):
+            raise InputError(f"study: expected 0 < d/l < 1, got {self.ratios}, {self.overlays}")
 
 
 def run_lattice_study(
     base: StudiedLattice,
-    table: Path | str | None = None,
-    *,
-    ratios: Sequence[float] = RATIOS,
-    loadings: Sequence[str] = tuple(LOADINGS),
-    pitches: Sequence[float] = (),
-    materials: Sequence[str] = (),
-    shown: Sequence[float] = SHOWN,
+    plan: StudyPlan,
+    table: Path | None = None,
     progress: Progress = silent,
 ) -> LatticeModeStudy:
     """The whole study about one lattice: hole sizes, scales, materials, limits, overlays.
 
-    ``table``: CSV that keeps the rows, and that a study which was broken off goes on from;
-    ``ratios``, ``loadings``: d/l [-] and names of loadings, every combination; ``pitches``: other l
-    [mm], the mesh is scaled, too; ``materials``: names of other materials, among
-    ``STUDIED_MATERIALS``; ``shown``: d/l of the overlays [-], under the reference's loading.
+    ``base``: the lattice, with the plan's divisions and largest load; ``table``: CSV that keeps the
+    rows, and that a study which was broken off goes on from.
     """
     kept = ModeTable(table)
-    lattices = ratio_lattices(ratios, loadings, base)
+    base = replace(base, divisions=plan.divisions, largest=plan.largest)
+    loadings = [name.replace("-", " ") for name in plan.loadings]
+    lattices = [replace(base, ratio=r, loading=LOADINGS[name])
+                for name, r in product(loadings, plan.ratios)]  # fmt: skip
     rows = kept.rows(lattices, pattern_row, progress)
-    limits = [first_mode_limit(base, name, rows, table=kept) for name in loadings]
-    scaled = [replace(base, pitch=pitch) for pitch in pitches]
-    others = [replace(base, material=STUDIED_MATERIALS[name]) for name in materials]
-    overlaid = [replace(base, ratio=ratio) for ratio in shown]
+    limits = [first_mode_limit(base, name, rows, kept) for name in loadings]
+    scaled = [replace(base, pitch=pitch) for pitch in plan.pitches]
+    others = [replace(base, material=STUDIED_MATERIALS[name]) for name in plan.materials]
+    overlaid = [replace(base, ratio=ratio) for ratio in plan.overlays]
     scales, other = (study_likeness(base, some, kept, progress) for some in (scaled, others))
     overlays = tuple(pattern_mode(it, kept.row(it, pattern_row)) for it in overlaid)
     known = tuple(limit for limit in limits if limit is not None)

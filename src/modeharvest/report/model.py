@@ -6,7 +6,6 @@ run follows from that. Figures are functions, drawn one after the other while th
 
 from __future__ import annotations
 
-import csv
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from modeharvest.fem.materials import Ogden
-from modeharvest.util.files import atomic
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.files import atomic, write_csv
+from modeharvest.util.progress import Progress, counted, silent
 
 if TYPE_CHECKING:
     import jinja2
@@ -344,13 +343,11 @@ def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -
 
     ordered = sorted(figures, key=lambda figure: figure.late)
     pictures = {}
-    for n, figure in enumerate(ordered):
-        progress(n, len(ordered), "report")
+    for figure in counted(ordered, progress, "report"):
         with style():
             drawn = figure.draw()
         title = figure.label or figure.name
         pictures[figure.name] = to_svg(drawn, figure.name, title, exact=figure.exact)
-    progress(1, 1, "report")
     return pictures
 
 
@@ -393,13 +390,8 @@ def write_tables(tables: Sequence[ReportTable], folder: Path) -> None:
     """Write every table that has a file as CSV, with all digits, atomically."""
     for table in tables:
         if table.file:
-            rows = [["" if cell is None or cell != cell else cell for cell in row]
-                    for row in table.rows]  # fmt: skip
-            with (
-                atomic(folder / table.file) as part,
-                part.open("w", -1, "utf-8", newline="") as file,
-            ):
-                csv.writer(file, lineterminator="\n").writerows([table.columns, *rows])
+            rows = [[cell if cell == cell else None for cell in row] for row in table.rows]
+            write_csv(folder / table.file, table.columns, rows)
 
 
 def print_report(report: Report, out: Path) -> None:

@@ -63,7 +63,7 @@ from modeharvest.util.files import (
     write_json,
 )
 from modeharvest.util.machine import require_memory
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
@@ -228,11 +228,9 @@ class MeasureRun(StagedRun[MeasureCase]):
         for path in files:  # what is wrong with one is known before the first is measured
             read_frame(path, self.reference)
         found: dict[str, NodalResult] = {}
-        for k, path in enumerate(files):
-            self.progress(k, len(files), "measure images")
+        for path in counted(files, self.progress, "measure images"):
             key = digest([key, path.stem, sha256_of(path)])
             found[path.stem] = self._result(path, key, next(reversed(found.values()), None))
-        self.progress(1, 1, "measure images")
         return found
 
     def _result(self, path: Path, key: str, before: NodalResult | None) -> NodalResult:

@@ -45,7 +45,7 @@ from modeharvest.runs.photographs.whole_field import whole_checks
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, write_json
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.whole_field import compare_whole
@@ -215,12 +215,11 @@ def compare_with_truth(
     images, geometry, results = twin.images, harvesting.geometry, harvesting.results()
     wholes = harvesting.whole_fields.found if harvesting.whole_fields else {}
     frames, rows = {}, []
-    for k, (name, measured) in enumerate(results.items()):
-        progress(k, len(results), "compare with the truth")
+    for name in counted(tuple(results), progress, "compare with the truth"):
         true = images.truth(_strain_of(name, images.strains)).displacement
         # Not the images' own masks: those are as the lens shows them.
         inside = np.asarray(np.isfinite(true).all(axis=-1))
-        result = measured.result
+        result = results[name].result
         best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
         rows += _frame_rows(name, result, best, true, inside, geometry.region.cellular)
         errors = None

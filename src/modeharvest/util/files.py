@@ -9,6 +9,7 @@ then renamed: :func:`atomic`.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import io
 import json
@@ -18,7 +19,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -255,6 +256,12 @@ def write_json(path: Path | str, content: Any) -> None:
     """Write ``content`` as indented JSON, atomically."""
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
+
+
+def write_csv(path: Path | str, heads: Iterable[object], rows: Iterable[Iterable[object]]) -> None:
+    """Write a table, atomically; numbers with all their digits, nothing for None."""
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([heads, *rows])
 
 
 def read_json(path: Path | str) -> Any:

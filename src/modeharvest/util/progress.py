@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
 
 
 class Progress(Protocol):
@@ -23,3 +26,11 @@ def named(progress: Progress, name: str) -> Progress:
         progress(done, total, name)
 
     return listener
+
+
+def counted(items: Sequence[T], progress: Progress, what: str) -> Iterator[T]:
+    """The items one after the other, their progress reported as the step ``what``."""
+    for done, item in enumerate(items):
+        progress(done, len(items), what)
+        yield item
+    progress(1, 1, what)

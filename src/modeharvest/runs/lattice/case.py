@@ -36,14 +36,10 @@ from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import sha256_of
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import digest, stage_key
-from modeharvest.util.typed import nearest
 from modeharvest.validation.studies.lattice import (
-    LOADINGS,
-    RATIOS,
-    SHOWN,
-    STUDIED_MATERIALS,
     LatticeModeStudy,
     StudiedLattice,
+    StudyPlan,
     run_lattice_study,
 )
 
@@ -335,48 +331,6 @@ def _check_loads(where: str, loads: Sequence[float]) -> None:
         raise InputError(f"{where}: expected loads of 0 or more and below 1, got {tuple(loads)}")
 
 
-_LOADINGS = tuple(name.replace(" ", "-") for name in LOADINGS)
-
-
-@dataclass(frozen=True)
-class StudyPlan:
-    """A study of a square lattice's pattern: see ``validation.studies.lattice``.
-
-    Every ratio under every loading, and where the pattern stops being what buckles first; other
-    unit cell sizes and materials at the case's own d/l and loading.
-    """
-
-    ratios: tuple[float, ...] = RATIOS
-    """d/l [-]."""
-    loadings: tuple[str, ...] = _LOADINGS
-    """Among "uniaxial", "uniaxial-strain" and "equibiaxial"."""
-    pitches: tuple[float, ...] = ()
-    """Other l [mm]."""
-    materials: tuple[str, ...] = ()
-    """Names among ``STUDIED_MATERIALS``."""
-    overlays: tuple[float, ...] = SHOWN
-    """d/l of the pictures of numerical over analytic mode [-]."""
-    divisions: int = 13
-    """Elements along l."""
-    largest: float = 0.28
-    """Load up to which to look for critical points [-]."""
-
-    def __post_init__(self) -> None:
-        for names, known in ((self.loadings, _LOADINGS), (self.materials, STUDIED_MATERIALS)):
-            for name in names:
-                if name not in known:
-                    raise InputError(f"unknown name {name!r}{nearest(name, list(known))}")
-        if not self.loadings or not self.ratios:
-            raise InputError("study: expected a ratio and a loading or more, got none")
-        require_within("study: expected divisions", self.divisions, 4, 200)
-        if not 0 < self.largest < 1:
-            raise InputError(f"study: expected 0 < largest < 1, got {self.largest}")
-        for pitch in self.pitches:
-            require_within("study: expected pitches [mm]", pitch, 0, above=True)
-        if not all(0 < ratio < 1 for ratio in (*self.ratios, *self.overlays)):
-            raise InputError(f"study: expected 0 < d/l < 1, got {self.ratios}, {self.overlays}")
-
-
 class LatticeCase(CaseModel):
     """An infinite lattice under load, and what is asked about it."""
 
@@ -418,18 +372,8 @@ class LatticeCase(CaseModel):
         if plan is None or not isinstance(lattice, SquareLattice):
             return None
         ratio, loading = lattice.diameter / lattice.pitch, self.loading.macro()
-        return run_lattice_study(
-            StudiedLattice(
-                ratio, loading, self.material, lattice.pitch, plan.divisions, plan.largest
-            ),
-            table,
-            ratios=plan.ratios,
-            loadings=[name.replace("-", " ") for name in plan.loadings],
-            pitches=plan.pitches,
-            materials=plan.materials,
-            shown=plan.overlays,
-            progress=progress,
-        )
+        base = StudiedLattice(ratio, loading, self.material, lattice.pitch)
+        return run_lattice_study(base, plan, table, progress)
 
 
 def stage_keys(case: LatticeCase) -> dict[str, str]:

@@ -29,6 +29,7 @@ from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, Periodic
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_json
+from modeharvest.util.progress import counted
 from modeharvest.util.stages import StagedRun, exclusive, stage_key
 
 
@@ -98,11 +99,9 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         index = self.folder / "families.json"
 
         def work() -> list[Path]:
-            for k, pattern in enumerate(self._patterns):
-                self.progress(k, len(self._patterns), "mode families")
+            for pattern in counted(self._patterns, self.progress, "mode families"):
                 found = pattern.analysed(self.case.lattice.pitch)
                 write_family(self.folder / pattern.file, found.family, spectrum=found.spectrum)
-            self.progress(1, 1, "mode families")
             write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
             return [index, *(self.folder / pattern.file for pattern in self._patterns)]
 

@@ -5,7 +5,6 @@ Keys of the latter: docs/bloch.md.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
 from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.files import atomic, read_json
+from modeharvest.util.files import read_json, write_csv
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 
@@ -276,10 +275,9 @@ def write_dispersion_table(found: Dispersion, path: Path | str) -> None:
     at = dict(zip(found.stops, found.labels, strict=True))
     bands = [f"eigenvalue_{k + 1}_N_per_mm4" for k in range(found.bands)]
     head = ["load", "corner", "phase_1_rad", "phase_2_rad", "distance_rad_per_mm", *bands]
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(head)
-        for load, values in zip(found.loads, found.eigenvalues, strict=True):
-            for k, (wave, row) in enumerate(zip(found.waves, values, strict=True)):
-                numbers = [*wave, found.distances[k], *row]
-                table.writerow([f"{load:.9g}", at.get(k, ""), *(f"{x:.9g}" for x in numbers)])
+    rows = [
+        (f"{load:.9g}", at.get(k, ""), *(f"{x:.9g}" for x in (*wave, found.distances[k], *row)))
+        for load, values in zip(found.loads, found.eigenvalues, strict=True)
+        for k, (wave, row) in enumerate(zip(found.waves, values, strict=True))
+    ]
+    write_csv(path, head, rows)

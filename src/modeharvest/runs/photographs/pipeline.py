@@ -39,7 +39,7 @@ from modeharvest.runs.photographs.whole_field import PhotographWholeFields
 from modeharvest.runs.whole_field import change_of
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import made, to_plain
 from modeharvest.validation.onset import find_buckling
@@ -150,9 +150,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         case, prepared, region = self.case, self.prepared(), self.geometry.region
         results, source = self.results(), Path(self.source)
         frames, wholes = [], self.whole_fields
-        for k, (name, measured) in enumerate(results.items()):
-            self.progress(k, len(results), "error bars")
-            frame = harvested_frame(case, prepared, self.geometry, name, measured)
+        for name in counted(tuple(results), self.progress, "error bars"):
+            frame = harvested_frame(case, prepared, self.geometry, name, results[name])
             frames.append(frame if wholes is None else wholes.added(frame))
         moments = [amplitude_of(frame, region.cellular) for frame in frames]
         return Harvest(

@@ -46,7 +46,7 @@ from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, reading, write_json
-from modeharvest.util.progress import Progress, silent
+from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import made, picked, to_plain
 
 PREPARED_FILE = "prepared.json"
@@ -272,8 +272,7 @@ def prepare(
     deformed = named_files(base, images.deformed)
     masks = of_each_photograph(case, table.deformed_material, "specimen.deformed_material")
     names, skipped, notes = [], [], [*reference.notes, *text]
-    for k, path in enumerate(deformed):
-        progress(k, len(deformed), "prepare photographs")
+    for path in counted(deformed, progress, "prepare photographs"):
         try:
             frame = read_frame(path, reference)
             save(path.stem, frame, masks.get(path.stem))
