@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
+from scipy.signal import fftconvolve, savgol_coeffs
 
 from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.local.field import LocalField, write_field
@@ -32,16 +32,16 @@ from modeharvest.imaging.photographs.files import read_image
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.report.grades import star_report, write_star_grading
 from modeharvest.report.model import print_report
-from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
-from modeharvest.validation.resolution.star import (
+from modeharvest.validation.scoring.attenuation import Attenuation
+from modeharvest.validation.scoring.star import (
     Star,
     StarSet,
     StarSpec,
     image_name,
     make_star_set,
 )
-from modeharvest.validation.resolution.transfer import finest_period, subset_noise, subset_transfer
+from modeharvest.validation.scoring.star_grades import StarGrade, StarGrading, ranked_grades
+from modeharvest.validation.studies.transfer import finest_period
 
 FloatArray = NDArray[np.float64]
 
@@ -121,6 +121,21 @@ def grade_filters(shapes: list[str], widths: list[int]) -> None:
         finest = finest_period(lambda p, w=width, d=degree: subset_transfer(w, d, p), 4.0, 2000.0)
         print(f"| {shape}, {width} px | {finest:.2f} | {found.finest_px:.2f} | "
               f"{found.challenge_px:.2f} |")  # fmt: skip
+
+
+def subset_transfer(width: int, degree: int, period: FloatArray) -> FloatArray:
+    """(...) T of a subset for waves along one of its edges, read at its centre [-]."""
+    offsets = np.arange(width) - width // 2
+    phase = 2.0 * np.pi * offsets / np.asarray(period)[..., None]
+    return np.asarray(np.cos(phase) @ savgol_coeffs(width, degree))
+
+
+def subset_noise(width: int, degree: int) -> float:
+    """Noise floor of a subset's centre on even speckle, over sqrt(2) s / G [1/px]."""
+    t = np.linspace(-1.0, 1.0, width)
+    x, y = (a.ravel() for a in np.meshgrid(t, t))
+    basis = np.stack([x**i * y**j for i, j in orders(degree)], axis=-1)
+    return float(np.sqrt(np.linalg.inv(basis.T @ basis)[0, 0]))
 
 
 @cache

@@ -61,9 +61,8 @@ from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import reading
-from modeharvest.validation.resolution.star import Star, StarSet, StarSpec, make_star_set
-from modeharvest.validation.scoring.benchmark import BenchmarkTruth
-from modeharvest.validation.scoring.fields import Declared, read_measured
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth, Declared, read_measured
+from modeharvest.validation.scoring.star import Star, StarSet, StarSpec, make_star_set
 
 VARIANTS = 300
 LONGEST_S = 60.0

@@ -77,7 +77,7 @@ def test_every_panel_states_the_unit_of_its_colours(
 
 
 def test_the_panels_of_the_paper_are_all_there() -> None:
-    named = " ".join(panel.paper for panel in PANELS)
+    named = " ".join(panel.words["paper"] for panel in PANELS)
     assert all(f"({letter})" in named for letter in "abcdefghijklmnop")
 
 

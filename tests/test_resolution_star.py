@@ -22,9 +22,9 @@ from modeharvest.report.model import number
 from modeharvest.runs.benchmark import grade_star
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
-from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.grading import NoiseFloor, StarGrade, ranked_grades
-from modeharvest.validation.resolution.star import (
+from modeharvest.validation.scoring.attenuation import Attenuation
+from modeharvest.validation.scoring.benchmark import Declared
+from modeharvest.validation.scoring.star import (
     Star,
     StarSet,
     StarSpec,
@@ -32,13 +32,8 @@ from modeharvest.validation.resolution.star import (
     fine_speckle,
     make_star_set,
 )
-from modeharvest.validation.resolution.transfer import (
-    finest_period,
-    savitzky_golay,
-    subset_noise,
-    subset_transfer,
-)
-from modeharvest.validation.scoring.fields import Declared
+from modeharvest.validation.scoring.star_grades import NoiseFloor, StarGrade, ranked_grades
+from modeharvest.validation.studies.transfer import affine_subset_transfer, finest_period
 
 FloatArray = NDArray[np.float64]
 
@@ -67,28 +62,13 @@ def field(star: Star, v_down: FloatArray, half: int, step: int, name: str = "fil
 
 
 def test_an_affine_subset_of_17_px_loses_a_tenth_at_67_8_px() -> None:
-    """The number of the DIC Challenge 2.0; the closed form is Dirichlet's kernel."""
-    period = np.geomspace(4.0, 500.0, 40)
-    dirichlet = np.sin(17 * np.pi / period) / (17 * np.sin(np.pi / period))
-    assert subset_transfer(17, 1, period) == pytest.approx(dirichlet, abs=1e-14)
-    finest = finest_period(lambda p: subset_transfer(17, 1, p), 10.0, 1000.0)
+    """The number of the DIC Challenge 2.0; the closed form against a fit of a plane to the wave."""
+    period, offsets = np.geomspace(4.0, 500.0, 40), np.arange(-8.0, 9.0)
+    wave = np.cos(2.0 * np.pi * offsets / period[:, None])
+    fitted = wave @ np.linalg.pinv(np.vander(offsets, 2))[1]
+    assert affine_subset_transfer(17, period) == pytest.approx(fitted, abs=1e-14)
+    finest = finest_period(lambda p: affine_subset_transfer(17, p), 10.0, 1000.0)
     assert finest == pytest.approx(67.8, abs=0.05)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_subset_keeps_polynomials_of_its_degree(degree: int) -> None:
-    offsets, weights = savitzky_golay(11, degree)
-    moments = [float(weights @ offsets**k) for k in range(degree + 1)]
-    assert moments == pytest.approx([1.0] + [0.0] * degree, abs=1e-12)
-    assert savitzky_golay(11, 2 * (degree // 2) + 1)[1] == pytest.approx(weights)  # odd ones vanish
-
-
-def test_noise_of_subsets() -> None:
-    """Of the mean of w^2 px, and more with a quadratic, whose weights are Legendre's."""
-    assert subset_noise(17, 0) == pytest.approx(1 / 17)
-    assert subset_noise(17, 1) == pytest.approx(1 / 17)
-    # Many pixels: 1 + 5 P_2(0) (P_2(x) + P_2(y)), whose mean square is 1 + 2 * 5 / 4.
-    assert 401 * subset_noise(401, 2) == pytest.approx(np.sqrt(1.0 + 2 * 1.25), rel=1e-2)
 
 
 @pytest.mark.parametrize(("degree", "waves"), [(1, (0.4, 0.0)), (4, (1.6, 0.0)), (5, (1.2, 0.9))])
@@ -114,7 +94,7 @@ def test_a_rule_for_the_finest_period_of_polynomials(degree: int) -> None:
 
 def test_no_transfer_is_extrapolated() -> None:
     with pytest.raises(InputError, match="rises through"):
-        finest_period(lambda p: subset_transfer(17, 1, p), 5.0, 60.0)
+        finest_period(lambda p: affine_subset_transfer(17, p), 5.0, 60.0)
 
 
 # -- images -------------------------------------------------------------------------------
@@ -202,13 +182,13 @@ def test_a_star_set_can_be_made_again_and_tells_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("width", "step"), [(9, 3), (17, 4), (33, 8)])
 def test_grading_finds_the_period_of_a_known_filter(width: int, step: int) -> None:
     """Rows off the centre see waves up to 2 % shorter; 0.1 % is what they may change."""
-    weights = savitzky_golay(width, 1)[1]
+    weights = np.full(width, 1.0 / width)
     found = Attenuation.of(STAR, field(STAR, filtered(STAR, weights), width // 2, step))
-    expected = finest_period(lambda p: subset_transfer(width, 1, p), 5.0, 1000.0)
+    expected = finest_period(lambda p: affine_subset_transfer(width, p), 5.0, 1000.0)
     assert found.finest_px == pytest.approx(expected, rel=1e-3)
     assert found.safe_px == found.finest_px
     some = (found.period > 1.5 * width) & (found.period < 250.0)
-    expected_curve = subset_transfer(width, 1, found.period[some])
+    expected_curve = affine_subset_transfer(width, found.period[some])
     assert found.curve[0][some] == pytest.approx(expected_curve, abs=5e-3)
     # The Challenge's polynomial is a bit off where the curve is steep.
     assert found.challenge_px == pytest.approx(expected, rel=0.05)
@@ -218,7 +198,7 @@ def test_errors_of_resolution_and_noise_are_as_large_as_told() -> None:
     """Twenty realisations of white noise through a filter: chi squared of both, 99.9 %."""
     star = Star(rows=121, cols=1200, shortest_px=10.0, longest_px=100.0)
     width, noise = 9, 0.05
-    weights = savitzky_golay(width, 1)[1]
+    weights = np.full(width, 1.0 / width)
     expected = Attenuation.of(star, field(star, filtered(star, weights), width // 2, 3)).finest_px
     rng = np.random.default_rng(0)
     z, floors = [], []
@@ -240,7 +220,7 @@ def test_the_indicator_hardly_depends_on_the_size_of_the_subset(tmp_path: Path) 
     noise = 0.02 * rng.normal(size=(STAR.rows, STAR.cols))
     grades = []
     for width in (9, 17, 33):
-        weights = savitzky_golay(width, 1)[1]
+        weights = np.full(width, 1.0 / width)
         still = filtered(STAR, weights, noise) - filtered(STAR, weights)
         name = f"{width} px"
         moved = field(STAR, filtered(STAR, weights), width // 2, 5, name)
@@ -283,7 +263,7 @@ def test_two_codes_from_their_files_to_the_report(
     noise = 0.02 * rng.normal(size=(SMALL.rows, SMALL.cols))
     fields, stills = [], []
     for width in (5, 11):
-        weights = savitzky_golay(width, 1)[1]
+        weights = np.full(width, 1.0 / width)
         v = filtered(SMALL, weights)
         quiet = filtered(SMALL, weights, noise) - v
         v[60, 150:180] = np.nan
@@ -299,7 +279,7 @@ def test_two_codes_from_their_files_to_the_report(
     content = read_json(out / "resolution.json")
     codes = {code["name"]: code for code in content["codes"]}
     for name, width in (("fine", 5), ("coarse", 11)):
-        expected = finest_period(lambda p, w=width: subset_transfer(w, 1, p), 5.0, 500.0)
+        expected = finest_period(lambda p, w=width: affine_subset_transfer(w, p), 5.0, 500.0)
         assert codes[name]["finest_px"] == pytest.approx(expected, rel=0.02)
         assert codes[name]["noise_px"] == pytest.approx(0.02 / width, rel=0.1)
         assert codes[name]["returned_percent"] < 100.0
@@ -351,7 +331,7 @@ def test_without_a_crossing_nothing_is_extrapolated() -> None:
     exact = StarGrade(SMALL, field(SMALL, SMALL.down(row, col), 1, 3))
     assert np.isnan(exact.attenuation.finest_px)
     assert "less than 10 % of the amplitude is lost at all periods" in exact.notes[0]
-    weights = savitzky_golay(25, 1)[1]  # its finest period is 100 px, the star's longest 80 px
+    weights = np.full(25, 1.0 / 25)  # its finest period is 100 px, the star's longest 80 px
     coarse = StarGrade(SMALL, field(SMALL, filtered(SMALL, weights), 12, 3))
     assert np.isnan(coarse.attenuation.finest_px)
     assert "10 % or more of the amplitude is lost" in coarse.notes[0]

@@ -21,13 +21,19 @@ from modeharvest.imaging.speckle.pattern import SpeckleSpec
 from modeharvest.report.study_resolution import measured_waves, noise_floors, resolution_findings
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
-from modeharvest.validation.resolution.buckled import (
+from modeharvest.validation.studies.buckled import (
     LARGEST,
     AddedWave,
     BuckledMotion,
     ResolutionSpec,
 )
-from modeharvest.validation.resolution.transfer import (
+from modeharvest.validation.studies.resolution import (
+    ResolutionAnalysis,
+    ResolutionStudy,
+    one_case,
+)
+from modeharvest.validation.studies.study import ImagePairSpec as Experiment
+from modeharvest.validation.studies.transfer import (
     AXES,
     QUANTITIES,
     WAVED,
@@ -36,12 +42,6 @@ from modeharvest.validation.resolution.transfer import (
     tangent_fit,
     wave_share,
 )
-from modeharvest.validation.studies.resolution import (
-    ResolutionAnalysis,
-    ResolutionStudy,
-    one_case,
-)
-from modeharvest.validation.studies.study import ImagePairSpec as Experiment
 
 FloatArray = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def test_the_tangent_is_what_fit_displacement_does_to_small_waves(subject: Resol
     grid = PixelGrid.centred(131, 131, 0.1)
     at = np.stack(np.meshgrid(grid.x, grid.y), axis=-1)
     mask = buckled.material(at[..., 0], at[..., 1])
-    ansatz, start = subject.ansatz(degree, "buckled"), subject.start(degree, "buckled")
+    ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
     for part in WAVED:
         wave = buckled.wave_at(AddedWave(part, 0, 6.0, 0.3, 1e-4), at)
         fit = fit_displacement(buckled.displacement(at) + wave, grid, ansatz, start, mask)

@@ -19,8 +19,7 @@ from synthetic_benchmark import PIXEL, STRAIN
 
 from modeharvest.runs.benchmark import declarations
 from modeharvest.util.errors import InputError
-from modeharvest.validation.scoring.benchmark import BenchmarkTruth
-from modeharvest.validation.scoring.fields import Declared, read_measured
+from modeharvest.validation.scoring.benchmark import BenchmarkTruth, Declared, read_measured
 from modeharvest.validation.scoring.score import Score, regions, score
 
 FloatArray = NDArray[np.float64]

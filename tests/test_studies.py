@@ -33,9 +33,9 @@ from modeharvest.validation.studies.noise import NoiseStudy, one_realisation
 from modeharvest.validation.studies.noise_statistics import PairedErrors
 from modeharvest.validation.studies.robustness import (
     SAME_PX,
-    Proportion,
     RobustnessStudy,
     one_start,
+    success_interval,
 )
 from modeharvest.validation.studies.study import ImagePairSpec, StudySetting, VirtualImagePair
 from modeharvest.validation.studies.systematic import FACTORS, SystematicStudy, one_level
@@ -88,7 +88,7 @@ def starts_table(distances: list[float], outcomes: list[str] | None = None) -> p
 @pytest.mark.parametrize(("good", "n"), [(98, 100), (100, 100), (0, 7), (3, 5)])
 def test_intervals_are_wilson_s(good: int, n: int) -> None:
     """Against the score test that they invert: its p-value at their ends is 5 %."""
-    low, high = Proportion(good, n).interval
+    low, high = success_interval(good, n)
     share = good / n
     for end, is_open in ((low, share > 0.0), (high, share < 1.0)):
         if is_open:

@@ -1,1 +1,1 @@
-"""Scoring: displacement fields of any DIC code against the truth of a benchmark image set."""
+"""Scoring: fields of any DIC code against the truth of an image set, and on the star pattern."""

@@ -18,13 +18,14 @@ from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.campaign import grid
-from modeharvest.validation.resolution.buckled import (
+from modeharvest.validation.studies.buckled import (
     LARGEST,
     AddedWave,
     BuckledMotion,
     ResolutionSpec,
 )
-from modeharvest.validation.resolution.transfer import (
+from modeharvest.validation.studies.study import ImagePairSpec, Study, noisy
+from modeharvest.validation.studies.transfer import (
     AXES,
     WAVED,
     DegreeResolution,
@@ -34,7 +35,6 @@ from modeharvest.validation.resolution.transfer import (
     subset_indicator,
     wave_share,
 )
-from modeharvest.validation.studies.study import ImagePairSpec, Study, noisy
 from modeharvest.validation.workers import Case, Cases
 
 Row = dict[str, Any]

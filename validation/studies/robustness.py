@@ -29,23 +29,10 @@ EVERY = 4
 """Displacements are compared at every fourth pixel: they are smooth."""
 
 
-@dataclass(frozen=True)
-class Proportion:
-    """``good`` out of ``count``."""
-
-    good: int
-    count: int
-
-    @property
-    def value(self) -> float:
-        """Between 0 and 1."""
-        return self.good / self.count
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % confidence interval by Wilson's score, doi 10.1080/01621459.1927.10502953."""
-        low, high = binomtest(self.good, self.count).proportion_ci(0.95, method="wilson")
-        return float(low), float(high)
+def success_interval(good: int, count: int) -> tuple[float, float]:
+    """95 % confidence interval of a share by Wilson's score, doi 10.1080/01621459.1927.10502953."""
+    low, high = binomtest(good, count).proportion_ci(0.95, method="wilson")
+    return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -76,13 +63,13 @@ class GuessStatistics:
     def of(cls, guesses: pd.DataFrame, radius: float) -> GuessStatistics:
         """From the rows of those guesses, with a column ``same``."""
         same = guesses["same"]
-        success = Proportion(int(same.sum()), len(guesses))
+        good, count = int(same.sum()), len(guesses)
         epsilon = guesses["epsilon_percent"].dropna()
         outliers = epsilon > OUTLIER_PERCENT
         others = guesses[~same & (guesses["error"] == "")]
         distance = guesses["distance_px"]
         return cls(
-            success.count, radius, success.good, success.value, success.interval,
+            count, radius, good, good / count, success_interval(good, count),
             float(epsilon.mean()), float(epsilon.max()), float(epsilon[~outliers].mean()),
             int(outliers.sum()), float(distance.max()), float(distance[same].max()),
             float(guesses["start_distance_px"].max()),

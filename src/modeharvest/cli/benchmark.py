@@ -121,7 +121,7 @@ def star(
     after. Its displacement is a formula, in README.md and star.json beside them.
     """
     from modeharvest.util.stages import exclusive
-    from modeharvest.validation.resolution.star import Star, StarSpec, fine_speckle, make_star_set
+    from modeharvest.validation.scoring.star import Star, StarSpec, fine_speckle, make_star_set
 
     levels = tuple(noise) if noise else (0.01,)
     spec = StarSpec(Star(rows, cols), fine_speckle(seed), levels, bits, seed)

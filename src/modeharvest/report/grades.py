@@ -29,16 +29,7 @@ from modeharvest.report.model import (
 )
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.files import atomic, write_json
-from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.grading import (
-    GRADE_COLUMNS,
-    StarGrade,
-    StarGrading,
-    grade_numbers,
-    star_csv_lines,
-    star_summary,
-)
-from modeharvest.validation.resolution.star import KEPT
+from modeharvest.validation.scoring.attenuation import Attenuation
 from modeharvest.validation.scoring.score import (
     COMMON,
     EVERYWHERE,
@@ -50,6 +41,15 @@ from modeharvest.validation.scoring.score import (
     Score,
     csv_lines,
     grading_summary,
+)
+from modeharvest.validation.scoring.star import KEPT
+from modeharvest.validation.scoring.star_grades import (
+    GRADE_COLUMNS,
+    StarGrade,
+    StarGrading,
+    grade_numbers,
+    star_csv_lines,
+    star_summary,
 )
 
 _CELLS = 300
@@ -264,16 +264,14 @@ def _returned(part: RegionScore) -> str:
 
 def _score_curves(grading: Grading) -> list[Card]:
     scores = grading.scores
-    parts = {
-        "histogram": ("Histogram of errors", partial(draw_histogram, scores)),
-        "distribution": ("Share of points with a larger error",
-                         partial(draw_distribution, scores)),
-        "regions": ("By region", partial(draw_regions, scores)),
-    }  # fmt: skip
+    drawn = {
+        "histogram": partial(draw_histogram, scores),
+        "distribution": partial(draw_distribution, scores),
+        "regions": partial(draw_regions, scores),
+    }
     if any(grading.spectra.values()):
-        parts["spectrum"] = ("By wavelength", partial(draw_spectra, grading.spectra))
-    return [Card.single(name, title, drawn)
-            for name, (title, drawn) in parts.items()]  # fmt: skip
+        drawn["spectrum"] = partial(draw_spectra, grading.spectra)
+    return [Card.captioned(name, draw, f"score-{name}") for name, draw in drawn.items()]
 
 
 def _score_maps(drawn: ErrorMaps, scale: maps.ColourScale, n: int) -> Card:
@@ -427,11 +425,10 @@ def star_report(grading: StarGrading) -> Report:
 
 
 def _star_curves(grades: Sequence[StarGrade]) -> list[Card]:
-    parts = {"attenuation": ("Amplitude ratio of a wave", partial(draw_attenuation, grades))}
+    drawn = {"attenuation": partial(draw_attenuation, grades)}
     if any(np.isfinite(g.indicator_px2) and g.indicator_px2 > 0.0 for g in grades):
-        parts["trade-off"] = ("Noise against resolution", partial(draw_trade_off, grades))
-    return [Card.single(name, title, drawn)
-            for name, (title, drawn) in parts.items()]  # fmt: skip
+        drawn["trade-off"] = partial(draw_trade_off, grades)
+    return [Card.captioned(name, draw) for name, draw in drawn.items()]
 
 
 def _star_maps(grade: StarGrade, n: int) -> Card:

@@ -167,13 +167,6 @@ class Card:
     """Whether it takes the whole width of the page."""
 
     @classmethod
-    def single(
-        cls, name: str, title: str, draw: Callable[[], Figure], caption: str = "", **more: Any
-    ) -> Card:
-        """One figure over the whole width of its card."""
-        return cls(title, [ReportFigure(name, "", draw, wide=True)], caption=caption, **more)
-
-    @classmethod
     def captioned(
         cls,
         name: str,

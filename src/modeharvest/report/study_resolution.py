@@ -17,20 +17,20 @@ from matplotlib.figure import Figure
 from modeharvest.report.figures import style
 from modeharvest.report.figures.curves import curve, plain_ticks
 from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
-from modeharvest.validation.resolution.buckled import ResolutionSpec
-from modeharvest.validation.resolution.star import KEPT
-from modeharvest.validation.resolution.transfer import (
+from modeharvest.validation.scoring.star import KEPT
+from modeharvest.validation.studies.buckled import ResolutionSpec
+from modeharvest.validation.studies.resolution import (
+    MOTIONS,
+    ResolutionAnalysis,
+    ResolutionStudy,
+)
+from modeharvest.validation.studies.transfer import (
     AXES,
     QUANTITIES,
     WAVED,
     DegreeResolution,
     Passband,
     TransferCurves,
-)
-from modeharvest.validation.studies.resolution import (
-    MOTIONS,
-    ResolutionAnalysis,
-    ResolutionStudy,
 )
 
 _SIZE = (4.6, 3.3)  # [in]

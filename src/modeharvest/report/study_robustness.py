@@ -18,8 +18,8 @@ from modeharvest.validation.studies.robustness import (
     PUBLISHED,
     SAME_PX,
     GuessStatistics,
-    Proportion,
     RobustnessStudy,
+    success_interval,
 )
 
 
@@ -27,15 +27,15 @@ def by_radius(moved: pd.DataFrame) -> pd.DataFrame:
     """Success against the radius of the perturbations."""
     rows = []
     for radius, part in moved.groupby("radius"):
-        same = Proportion(int(part["same"].sum()), len(part))
-        low, high = same.interval
+        good, count = int(part["same"].sum()), len(part)
+        low, high = success_interval(good, count)
         others = part[~part["same"]]
         detected = int((others["outcome"] != "converged").sum())
         rows.append({
             "off by up to [%]": 100.0 * radius,
-            "initial guesses": same.count,
-            "same minimum": same.good,
-            "success [%]": 100.0 * same.good / same.count,
+            "initial guesses": count,
+            "same minimum": good,
+            "success [%]": 100.0 * good / count,
             "95 % from": 100.0 * low,
             "to [%]": 100.0 * high,
             "other minima detected": f"{detected} of {len(others)}",

@@ -23,19 +23,20 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import copy_whole, require_writable
 from modeharvest.util.progress import Progress, silent
 from modeharvest.util.stages import exclusive
-from modeharvest.validation.resolution.grading import StarGrade, StarGrading, ranked_grades
-from modeharvest.validation.resolution.star import StarSet
 from modeharvest.validation.scoring import score as scoring
 from modeharvest.validation.scoring.benchmark import (
     SOLUTION,
     BenchmarkTruth,
+    Declared,
     publish,
+    read_measured,
     require_apart,
     require_no_lens,
 )
 from modeharvest.validation.scoring.conventions import check_conventions
-from modeharvest.validation.scoring.fields import Declared, read_measured
 from modeharvest.validation.scoring.score import Grading
+from modeharvest.validation.scoring.star import StarSet
+from modeharvest.validation.scoring.star_grades import StarGrade, StarGrading, ranked_grades
 
 REACH_CELLS = 0.25
 """How far a point can stand for others: an eighth of the pattern's wave, two cells long [-]."""

@@ -6,13 +6,12 @@ ansatz are listed here; the others where their kind of run is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from modeharvest.idic.result import Result
@@ -98,7 +97,8 @@ class FittedState:
 def convergence_card(state: FittedState, caption: str = "") -> Card:
     """The steps of a state's correlation."""
     drawn = partial(draw_convergence, state.result)
-    return Card.single(f"convergence-{state.name}", state.label, drawn, caption)
+    figure = ReportFigure(f"convergence-{state.name}", "", drawn, wide=True)
+    return Card(state.label, [figure], caption=caption)
 
 
 def largest_density(spectra: Iterable[tuple[Spectrum, WavePattern]]) -> float:
@@ -125,11 +125,8 @@ class Panel(Generic[S]):
     """Draws it of a state."""
     shows: Callable[[S], bool] = always
     """Whether there is something to draw."""
-    title: str = ""
-    symbol: str = ""
-    paper: str = ""
-    """The panel in the paper; empty for none."""
-    caption: str = ""
+    words: Mapping[str, Any] = field(default_factory=dict)
+    """Its title, symbol, panel in the paper, and caption."""
     exact: bool = False
     """Whether the picture's pixels are kept exactly."""
     late: bool = False
@@ -151,8 +148,12 @@ class Panel(Generic[S]):
     ) -> Panel[S]:
         """With the words named ``text``, or as the key; ``figure``: in the paper, "" for none."""
         words = caption(text or key, figure=figure, **values)
-        words |= {} if figure else {"paper": Markup()}
-        return cls(section, key, draw, shows, exact=exact, late=late, **words)
+        words["paper"] = f"paper: Fig. {words['paper']}" if figure and "paper" in words else ""
+        return cls(section, key, draw, shows, words, exact, late)
+
+    def without_caption(self) -> Panel[S]:
+        """Where there is nothing to compare with."""
+        return replace(self, words={**self.words, "caption": ""})
 
     def card(self, states: Sequence[S], numbers: Callable[[str, S], str]) -> Card:
         """Its pictures of these states; ``numbers`` makes the lines below them."""
@@ -161,9 +162,7 @@ class Panel(Generic[S]):
                          numbers(self.key, state), exact=self.exact, late=self.late)
             for state in states if self.shows(state)
         ]  # fmt: skip
-        paper = f"paper: Fig. {self.paper}" if self.paper else ""
-        return Card(self.title, figures, caption=self.caption, name=self.key, symbol=self.symbol,
-                    paper=paper)  # fmt: skip
+        return Card(figures=figures, name=self.key, **self.words)
 
 
 def panel_sections(
@@ -239,14 +238,14 @@ def spectrum_panels(
                  late=True, states=states)
         for component, key in enumerate(("Sxx", "Syy"))
     )  # fmt: skip
-    return [xx, yy if figure else replace(yy, caption="")]
+    return [xx, yy if figure else yy.without_caption()]
 
 
 def ansatz_panels(section: str, figure: str, modes: int) -> list[Panel[FittedState]]:
     """v0, and of each mode amplitude, shape and fluctuation."""
     x, y = (Panel.of(section, key, partial(_v0, component=component), figure=figure)
             for component, key in enumerate(("v0x", "v0y")))  # fmt: skip
-    panels: list[Panel[FittedState]] = [x, y if figure else replace(y, caption="")]
+    panels: list[Panel[FittedState]] = [x, y if figure else y.without_caption()]
     for i in range(modes):
         own: dict[str, Any] = {"shows": has_mode(i), "figure": figure if i == 0 else "", "n": i + 1}
         panels += [

@@ -22,8 +22,8 @@ from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.typed import quantities, quantity, to_plain
-from modeharvest.validation.resolution.attenuation import Attenuation
-from modeharvest.validation.resolution.star import KEPT, Star, StarSet
+from modeharvest.validation.scoring.attenuation import Attenuation
+from modeharvest.validation.scoring.star import KEPT, Star, StarSet
 
 RESOLUTION_FORMAT = "modeharvest-resolution-1"
 

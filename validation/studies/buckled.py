@@ -81,21 +81,16 @@ class ResolutionSpec:
         a, b = self.buckled.specimen.cellular_half_size
         return some, (np.abs(some[:, 0]) <= a) & (np.abs(some[:, 1]) <= b)
 
-    def ansatz(self, degree: int, motion: str) -> Ansatz:
-        """The paper's at a degree; without a pattern its mode is fixed."""
-        return self.buckled.ansatz(degree, degree, fixed_mode=motion == "still")
-
-    def start(self, degree: int, motion: str) -> FloatArray:
-        """The base motion, or none."""
-        if motion == "still":
-            return np.zeros(self.ansatz(degree, motion).size)
-        return self.buckled.start(degree, degree)
-
     def correlate(self, pair: ImagePair, degree: int, motion: str) -> Result:
-        """Measure a pair from what is nearly its motion, on the full images."""
-        how, guess = self.buckled.how, self.start(degree, motion)
+        """Measure a pair from what is nearly its motion, on the full images.
+
+        ``motion``: "buckled", or "still", without a pattern and with a fixed mode.
+        """
+        how, is_still = self.buckled.how, motion == "still"
+        ansatz = self.buckled.ansatz(degree, degree, fixed_mode=is_still)
+        guess = np.zeros(ansatz.size) if is_still else self.buckled.start(degree, degree)
         options = CorrelationOptions((Level(1, 0.0),), how.edge_px, how.order)
-        return correlate(pair, self.ansatz(degree, motion), guess=guess, options=options)
+        return correlate(pair, ansatz, guess=guess, options=options)
 
 
 @lru_cache(maxsize=1)

@@ -23,19 +23,17 @@ from typing import Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from modeharvest.idic.ansatz import Ansatz
-from modeharvest.idic.chebyshev import orders
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import Speckle
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, counted, silent
-from modeharvest.validation.resolution.buckled import AddedWave, ResolutionSpec
-from modeharvest.validation.resolution.star import KEPT
+from modeharvest.validation.scoring.star import KEPT
+from modeharvest.validation.studies.buckled import AddedWave, ResolutionSpec
 
 _SCAN = 4001
 WAVED = ("v0", "v1")
@@ -54,40 +52,14 @@ Kind = tuple[str, int, int]
 """Part, axis and degree."""
 
 
-def subset_transfer(width: int, degree: int, period: ArrayLike) -> FloatArray:
-    """(...) T of a square subset for waves along one of its edges, read at its centre [-].
+def affine_subset_transfer(width: int, period: FloatArray) -> FloatArray:
+    """(...) T of a square affine subset for waves along one of its edges, read at its centre [-].
 
-    ``width``: edge of the subset, odd [px]; ``degree``: of the shape functions, 0 rigid, 1 affine
-    (the same at the centre), 2 quadratic; ``period``: (...) of the wave [px]. For an affine subset
-    it is sin(pi w/p) / (w sin(pi/p)).
+    Dirichlet's kernel sin(pi w/p) / (w sin(pi/p)), as of a mean over the subset. ``width``: its
+    edge w, odd [px]; ``period``: (...) of the wave [px].
     """
-    offsets, weights = savitzky_golay(width, degree)
-    phase = 2.0 * np.pi * offsets / np.asarray(period, dtype=np.float64)[..., None]
-    return np.asarray(np.cos(phase) @ weights)
-
-
-def subset_noise(width: int, degree: int) -> float:
-    """Noise floor of a square subset's centre on even speckle, over sqrt(2) s / G [1/px].
-
-    s is the noise in each image, G the rms gradient of the speckle along the displacement [1/px]:
-    the root of the summed squares of the fit's weights, 1/width for affine shape functions.
-    """
-    offsets, _ = savitzky_golay(width, degree)
-    x, y = (a.ravel() / offsets[-1] for a in np.meshgrid(offsets, offsets))
-    basis = np.stack([x**i * y**j for i, j in orders(degree)], axis=-1)
-    return float(np.sqrt(np.linalg.inv(basis.T @ basis)[0, 0]))
-
-
-def savitzky_golay(width: int, degree: int) -> tuple[FloatArray, FloatArray]:
-    """(width,) offsets [px] and weights [-] of the fitted polynomial's value at the centre."""
-    if width < 3 or width % 2 == 0 or not 0 <= degree < width:
-        raise InputError(
-            f"expected an odd subset of at least 3 px and a degree from 0 to {width - 1}, got "
-            f"{width} px and {degree}"
-        )
-    offsets = np.asarray(np.arange(width) - 0.5 * (width - 1), dtype=np.float64)
-    basis = np.polynomial.legendre.legvander(offsets / offsets[-1], degree)
-    return offsets, np.asarray(np.linalg.pinv(basis).T @ basis[width // 2])
+    phase = np.pi / period
+    return np.asarray(np.sin(width * phase) / (width * np.sin(phase)))
 
 
 def finest_period(transfer: Callable[[FloatArray], FloatArray], low: float, high: float) -> float:
@@ -166,7 +138,7 @@ class TransferCurves:
              for part, axis in kinds for period in periods for phase in _PHASES], axis=-1
         )  # fmt: skip
         for degree in counted(degrees, progress, "resolution: best fits"):
-            ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
+            ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
             fit = tangent_fit(ansatz, start, points, waves)
             for k, (part, axis) in enumerate(kinds):
                 here = slice(k * 2 * _PERIODS, (k + 1) * 2 * _PERIODS)
@@ -222,8 +194,8 @@ class Passband:
     @classmethod
     def of(cls, spec: ResolutionSpec, degree: int) -> Passband:
         """At one degree of v0 and v1."""
-        points = spec.points
-        ansatz, start = spec.ansatz(degree, "buckled"), spec.start(degree, "buckled")
+        points, buckled = spec.points, spec.buckled
+        ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
         stretch = np.concatenate([np.linspace(0.05, 0.8, 26), np.linspace(0.82, 1.3, 33)])
         waves = np.stack([_stretched(spec, s, points) for s in stretch], axis=-1)
         itself, error = np.full((2, stretch.size), np.nan)
@@ -262,9 +234,9 @@ def _refitted(spec: ResolutionSpec, degree: int, stretch: float) -> tuple[float,
     pattern = buckled.pattern * _stretched(spec, stretch, at)
     u = pattern.copy()
     u[..., 0] -= buckled.strain * at[..., 0]
-    ansatz = spec.ansatz(degree, "buckled")
+    ansatz, start = buckled.ansatz(degree, degree), buckled.start(degree, degree)
     try:
-        found = fit_displacement(u, grid, ansatz, spec.start(degree, "buckled"), mask)
+        found = fit_displacement(u, grid, ansatz, start, mask)
     except InputError:
         return float("nan"), float("nan")
     fluctuation = found.fluctuation(0)[mask][..., None]
@@ -316,11 +288,15 @@ def degrees_of(
 
 
 def subset_indicator(spec: ResolutionSpec) -> float:
-    """n l10 of an affine subset on the same speckle under the same noise, by theory [px^2]."""
+    """n l10 of an affine subset on the same speckle under the same noise, by theory [px^2].
+
+    Noise is averaged over the subset: n = sqrt(2) s / (w G), with the rms gradient G of the speckle
+    along the displacement [1/px].
+    """
     grid = spec.buckled.grid
     speckle = Speckle(spec.buckled.speckle, grid.shape)
     row, col = np.meshgrid(np.arange(0.0, grid.rows, 7), np.arange(0.0, grid.cols, 7))
     slope = float(np.sqrt(np.mean(speckle.gradient(row, col) ** 2)))
-    floor = np.sqrt(2.0) * spec.noise / slope * subset_noise(_SUBSET_PX, 1)
-    finest = finest_period(lambda p: subset_transfer(_SUBSET_PX, 1, p), 10.0, 1000.0)
+    floor = np.sqrt(2.0) * spec.noise / slope / _SUBSET_PX
+    finest = finest_period(lambda p: affine_subset_transfer(_SUBSET_PX, p), 10.0, 1000.0)
     return float(floor * finest)

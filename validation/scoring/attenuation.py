@@ -19,7 +19,7 @@ from scipy import ndimage
 from modeharvest.idic.local.field import LocalField
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
-from modeharvest.validation.resolution.star import KEPT, Star
+from modeharvest.validation.scoring.star import KEPT, Star
 
 _WIDTH = 0.35
 """Half width of the local regression, in the logarithm of the period."""

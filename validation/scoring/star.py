@@ -148,7 +148,7 @@ def exact_images(star: Star, speckle: SpeckleSpec) -> tuple[FloatArray, FloatArr
 
 FORMAT = "modeharvest-star-1"
 SIDECAR, README = "star.json", "README.md"
-_README = resources.files(__package__).joinpath("readme.txt").read_text("utf-8")
+_README = resources.files(__package__).joinpath("star_readme.txt").read_text("utf-8")
 _ROLES = {
     "reference": "before the motion",
     "still": "the same again, with other noise",

@@ -1,1 +1,0 @@
-"""Spatial resolution: how fine a displacement a measurement resolves, and at what noise."""
