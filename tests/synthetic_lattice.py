@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from modeharvest.fem.bloch.dispersion import ZONES, Dispersion, ZoneMap
 from modeharvest.fem.bloch.modes import Branch, BranchState, ModeSet
 from modeharvest.fem.field import Mesh
+from modeharvest.idic.spectra.mode_family import wave_sum
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
 from modeharvest.validation.studies.lattice import (
     EQ_MODE,
@@ -21,7 +22,6 @@ from modeharvest.validation.studies.lattice import (
     LatticeModeStudy,
     ModeRow,
     PatternMode,
-    wave_sum,
 )
 
 FloatArray = NDArray[np.float64]

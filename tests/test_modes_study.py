@@ -18,13 +18,14 @@ from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import square_family
+from modeharvest.idic.spectra.mode_family import wave_sum
 from modeharvest.report.study_modes import modes_findings, report_modes
 from modeharvest.runs.case import shipped_solution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
 from modeharvest.validation.studies import modes as modes_specimen
-from modeharvest.validation.studies.lattice import EQ_MODE, ModeRow, PatternMode, wave_sum
+from modeharvest.validation.studies.lattice import EQ_MODE, ModeRow, PatternMode
 from modeharvest.validation.studies.modes import (
     MeasuredModesStudy,
     ModesAnalysis,

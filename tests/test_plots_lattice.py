@@ -20,6 +20,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from modeharvest.idic.spectra.mode_family import wave_sum
 from modeharvest.report.figures.boundaries import LatticePatch
 from modeharvest.report.figures.lattice import (
     draw_amplitudes,
@@ -37,7 +38,7 @@ from modeharvest.report.figures.lattice import (
 )
 from modeharvest.report.figures.style import INK
 from modeharvest.runs.lattice.results import combination_name
-from modeharvest.validation.studies.lattice import EQ_MODE, wave_sum
+from modeharvest.validation.studies.lattice import EQ_MODE
 
 L = made_up.PITCH
 HEXAGONAL = L * np.array([[1.0, 0.0], [0.5, 0.75**0.5]])

@@ -44,7 +44,6 @@ class Campaign:
     """What to run it with, all with the same keys. What it reads from ``folder`` belongs in them by
     a digest, so that a result is known to be of other inputs."""
     folder: Path
-    """Where the results go."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cases", tuple(dict(case) for case in self.cases))

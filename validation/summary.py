@@ -218,7 +218,6 @@ class MeasuredExperiment:
 
     experiment: Experiment
     options: SquareLatticeOptions
-    """Of the correlation."""
     solution: Solution
     images: ImageSet
     results: Mapping[float, Result]

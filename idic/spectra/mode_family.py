@@ -73,10 +73,15 @@ def overlap(
     return float(np.sqrt(best_amplitude(rule, rule.without_mean(rule.values(u)), phi)[1]))
 
 
+def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArray:
+    """(n, 2) sum of waves (w, 5) at positions (n, 2) [mm], without scale and support [-]."""
+    phases = np.pi / pitch * (positions @ waves[:, 2:4].T + waves[:, 4])
+    return np.asarray(np.sin(phases) @ waves[:, :2])
+
+
 def wave_values(rule: MeshQuadrature, waves: FloatArray, pitch: float) -> FloatArray:
-    """(q, 2) sum of waves (w, 5) at the points of a quadrature [-], without mean."""
-    phases = np.pi / pitch * (rule.positions @ waves[:, 2:4].T + waves[:, 4])
-    return rule.without_mean(np.sin(phases) @ waves[:, :2])
+    """(q, 2) the same at the points of a quadrature, without mean."""
+    return rule.without_mean(wave_sum(waves, rule.positions, pitch))
 
 
 def best_amplitude(rule: MeshQuadrature, u: FloatArray, phi: FloatArray) -> tuple[float, float]:

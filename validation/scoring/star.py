@@ -36,12 +36,12 @@ from modeharvest.imaging.speckle.pattern import Speckle, SpeckleSpec
 from modeharvest.util import __version__
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import atomic, read_json, read_record, reading, sha256_of, write_json
+from modeharvest.util.files import atomic, read_record, reading, sha256_of, write_json
 from modeharvest.util.machine import require_memory
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import stage_key
+from modeharvest.util.stages import Stages, stage_key
 from modeharvest.util.typed import made
-from modeharvest.validation.scoring.benchmark import RETURNED, are_whole, set_id
+from modeharvest.validation.scoring.benchmark import RETURNED, set_id
 
 KEPT = 0.9
 """Share of the amplitude that comes back at the finest period: an attenuation of 10 % [-]."""
@@ -209,8 +209,8 @@ class StarSet:
 def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silent) -> StarSet:
     """Write a star set; a whole one of the same spec is left as it is."""
     folder = Path(folder)
-    if not _is_whole(folder, spec):
-        (folder / SIDECAR).unlink(missing_ok=True)
+
+    def work() -> list[Path]:
         progress(0, 3, "star: images")
         f, g, residual_px = exact_images(spec.star, spec.speckle)
         progress(1, 3, "star: images")
@@ -223,8 +223,11 @@ def make_star_set(spec: StarSpec, folder: Path | str, progress: Progress = silen
         info = _info(spec, files, residual_px)
         with atomic(folder / README) as part:
             part.write_text(star_readme(info), "utf-8")
-        write_json(folder / SIDECAR, info)  # last: it says that all is there
+        write_json(folder / SIDECAR, info)
         progress(3, 3, "star: images")
+        return [folder / name for name in (*files, README, SIDECAR)]
+
+    Stages(folder).do("star", stage_key(asdict(spec)), work)
     return StarSet.read(folder)
 
 
@@ -275,7 +278,6 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
     return {
         "format": FORMAT,
         "id": set_id(files),
-        "key": stage_key(asdict(spec)),
         "licence": "CC-BY-4.0",
         "made_with": f"modeharvest {__version__}",
         "law": law,
@@ -283,16 +285,3 @@ def _info(spec: StarSpec, files: Mapping[str, Any], residual_px: float) -> dict[
         "returned": RETURNED,
         "files": dict(files),
     }
-
-
-def _is_whole(folder: Path, spec: StarSpec) -> bool:
-    """Whether the folder holds this set, nothing missing or changed."""
-    try:
-        info = read_json(folder / SIDECAR)
-        return bool(
-            info["key"] == stage_key(asdict(spec))
-            and (folder / README).read_text("utf-8") == star_readme(info)
-            and are_whole(folder, {n: f["sha256"] for n, f in info["files"].items()})
-        )
-    except (InputError, OSError, ValueError, KeyError, TypeError):
-        return False

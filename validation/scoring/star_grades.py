@@ -132,7 +132,6 @@ class NoiseFloor:
     mean_px: tuple[float, float]
     """(u, v) along x and y up [px]."""
     points: int
-    """Of the field."""
     returned: float
     """Share of the points with a displacement [-]."""
 

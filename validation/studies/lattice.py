@@ -26,7 +26,7 @@ from modeharvest.fem.lattice.options import MacroLoading, equibiaxial, uniaxial,
 from modeharvest.fem.materials import Material, Ogden, TwoTermI1
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.spectra.lattice_spectrum import MeshQuadrature
-from modeharvest.idic.spectra.mode_family import best_amplitude, mode_family, overlap
+from modeharvest.idic.spectra.mode_family import best_amplitude, mode_family, overlap, wave_sum
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import reading, write_csv
@@ -257,12 +257,6 @@ def _path(lattice: StudiedLattice) -> CellPath:
     mesh = Mesh(lattice.pitch * one.mesh.nodes, one.mesh.cells, one.mesh.element)
     unit = UnitCell(mesh, lattice.pitch * one.lattice)
     return CellPath(PeriodicCell(unit, lattice.material), lattice.loading)
-
-
-def wave_sum(waves: FloatArray, positions: FloatArray, pitch: float) -> FloatArray:
-    """(n, 2) sum of waves (w, 5) at positions (n, 2) [mm], without scale and support [-]."""
-    phases = math.pi / pitch * (positions @ waves[:, 2:4].T + waves[:, 4])
-    return np.asarray(np.sin(phases) @ waves[:, :2])
 
 
 def kind_of(found: LatticeCritical, largest: float) -> str:

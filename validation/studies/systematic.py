@@ -21,6 +21,7 @@ from modeharvest.validation.studies.study import (
     StudySetting,
     VirtualImagePair,
 )
+from modeharvest.validation.truth import ErrorParts
 from modeharvest.validation.workers import Case, Cases
 
 T = TypeVar("T")
@@ -162,15 +163,11 @@ ERRORS = ("measurement_error_px", "model_error_px", "w_px", "v1_percent")
 
 
 @dataclass(frozen=True)
-class LevelResult:
+class LevelResult(ErrorParts):
     """What is found at one level of a factor."""
 
-    w_px: float
-    model_error_px: float
-    measurement_error_px: float
     v1_percent: float
-    """The errors: :class:`~modeharvest.validation.truth.ErrorParts` and
-    :meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
+    """:meth:`~modeharvest.validation.truth.Comparison.v1_percent`."""
     outcome: str
     iterations: int
     residual: float

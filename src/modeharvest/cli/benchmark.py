@@ -120,12 +120,11 @@ def star(
     Exact ones, and for each level of noise three as a camera's: before, the same without motion,
     after. Its displacement is a formula, in README.md and star.json beside them.
     """
-    from modeharvest.util.stages import exclusive
     from modeharvest.validation.scoring.star import Star, StarSpec, fine_speckle, make_star_set
 
     levels = tuple(noise) if noise else (0.01,)
     spec = StarSpec(Star(rows, cols), fine_speckle(seed), levels, bits, seed)
-    with bars() as progress, exclusive(out):
+    with bars() as progress:
         made = make_star_set(spec, out, progress)
     residual = made.info["law"]["residual_of_inversion_px"]
     print(f"star {made.id}: {len(made.info['files'])} images of {rows} x {cols} px in {out}")

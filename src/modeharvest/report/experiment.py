@@ -78,7 +78,11 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
             + [text for text in (_expected(summary), *_energies(summary)) if text]
         ),
         keys=key_numbers(summary),
-        brief=brief_table(summary),
+        brief=ReportTable(
+            "Results",
+            ("nominal strain", *(percent(s["nominal_strain"]) for s in snapshots)),
+            _rows(snapshots, _BRIEF),
+        ),
         sections=[
             Section("expected", "Obtained and expected values", _expected_cards(summary)),
             *([] if data is None else _figures(data, summary)),
@@ -209,13 +213,6 @@ def number_cards(summary: Summary) -> list[Card]:
     columns = ("rms: per component, all material", *labels)
     table = ReportTable("Results", columns, rows, name="results")
     return [*Card.tabular(table, wide=True), *_mode_cards(summary)]
-
-
-def brief_table(summary: Summary) -> ReportTable:
-    """What the terminal shows of all snapshots."""
-    snapshots = summary["snapshots"]
-    columns = ("nominal strain", *(percent(s["nominal_strain"]) for s in snapshots))
-    return ReportTable("Results", columns, _rows(snapshots, _BRIEF))
 
 
 def _rows(snapshots: Sequence[Snapshot], labels: Mapping[str, str]) -> list[list[Cell]]:

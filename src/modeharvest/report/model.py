@@ -87,9 +87,7 @@ class KeyNumber:
 
     name: str
     value: str | float | None
-    """As a reader wants it, or None."""
     unit: str = ""
-    """May be empty."""
     remark: str = ""
     """What to compare it with."""
 
@@ -130,13 +128,13 @@ class ReportTable:
     folded: bool = False
     """Whether the reader has to unfold it."""
     on_terminal: bool = False
-    """Whether it is printed, too."""
 
     @classmethod
     def of(cls, title: str, table: pd.DataFrame, **more: Any) -> ReportTable:
         """A data frame as it is, with a CSV file."""
         rows = table.astype(object).values.tolist()
-        columns, name = [str(column) for column in table], slug(title)
+        columns = [str(column) for column in table]
+        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
         return cls(title, columns, rows, f"table-{name}", f"{name}.csv", **more)
 
     @property
@@ -157,7 +155,6 @@ class Card:
     text: Sequence[str] | Mapping[str, Sequence[str]] = ()
     """Statements, as a list; by headings, side by side, where it is a mapping."""
     caption: str = ""
-    """What is shown, below."""
     name: str = ""
     """Its anchor; none if empty."""
     symbol: str = ""
@@ -205,7 +202,6 @@ class Report:
     """All that a reader sees of a run."""
 
     kind: str
-    """Of which kind of run it is."""
     title: str
     lead: str = ""
     """A paragraph on what the page is about."""
@@ -228,9 +224,7 @@ class Report:
     files: Mapping[str, str] = field(default_factory=dict)
     """What lies beside the page, and what each file holds."""
     costs: Mapping[str, str] = field(default_factory=dict)
-    """Of the run."""
     versions: Mapping[str, str] = field(default_factory=dict)
-    """Of libraries."""
     hero: ReportFigure | None = None
     hero_caption: str = ""
     """A figure at the top, and its caption."""
@@ -400,7 +394,9 @@ def print_report(report: Report, out: Path) -> None:
     brief = [report.brief] if report.brief else []
     for table in (*brief, *(table for table in report.tables if table.on_terminal)):
         printed = Table(title=escape(table.title), title_justify="left")
-        heads, *rows = _upright([list(table.columns), *map(list, table.rows)])
+        lines: list[Sequence[Cell]] = [table.columns, *table.rows]
+        is_wide = len(lines) < len(lines[0])  # few long rows: turned, so that they fit
+        heads, *rows = zip(*lines, strict=True) if is_wide else lines
         for n, head in enumerate(heads):
             printed.add_column(escape(number(head)), justify="right" if n else "left")
         for row in rows:
@@ -409,13 +405,6 @@ def print_report(report: Report, out: Path) -> None:
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/yellow] {escape(warning)}", soft_wrap=True)
     console.print(f"report: {out / 'report.html'}", markup=False, soft_wrap=True)
-
-
-def _upright(lines: list[list[Cell]]) -> list[list[Cell]]:
-    """A table of few long rows turned, so that it fits the terminal."""
-    return (
-        [list(line) for line in zip(*lines, strict=True)] if len(lines) < len(lines[0]) else lines
-    )
 
 
 def number(value: Any, digits: int | None = None) -> str:
@@ -472,11 +461,6 @@ def material_text(table: Mapping[str, Any]) -> str:
 
 def _plain_number(value: Any) -> str:
     return ", ".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value:g}"
-
-
-def slug(title: str) -> str:
-    """A title as the name of a file."""
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def together(text: str) -> str:

@@ -210,11 +210,18 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
     """Every quantity that is drawn of one of these photographs."""
     modes = max((len(state.frame.modes) for state in states), default=0)
     parts = states[0].frame.parts if states else ()
+
+    def has_spectrum(state: PhotographState) -> bool:
+        return state.frame.spectrum is not None
+
+    def is_known(state: PhotographState) -> bool:
+        return figures.truth_of(state) is not None
+
     last = "residual-and-model-error"
     panels: list[fits.Panel[PhotographState]] = [
         fits.Panel.of("photographs", "image", figures.draw_deformed, text="photograph"),
         fits.Panel.of("photographs", "closeup", figures.draw_closeup, cells=figures.CLOSE),
-        *fits.spectrum_panels("photographs", "spect_real", "photographs", _has_spectrum),
+        *fits.spectrum_panels("photographs", "spect_real", "photographs", has_spectrum),
         *(fits.Panel.of("photographs", f"S{axis}{axis}-part{k + 1}",
                    partial(figures.draw_part_spectrum, part=k, component=c), text=f"part-{axis}",
                    part=part.name)
@@ -231,7 +238,7 @@ def photograph_panels(states: Sequence[PhotographState]) -> list[fits.Panel[Phot
         panels += [*_error_panels(f"v{i + 1}", "v", i), *_error_panels(f"fluc{i + 1}", "fluc", i)]
     for part, text in {"true_w": "true-w", "best": "best", "loss": "loss"}.items():
         drawn = partial(figures.draw_error_against_truth, part=part)
-        panels.append(fits.Panel.of("errors", part, drawn, figures.has_truth, text))
+        panels.append(fits.Panel.of("errors", part, drawn, is_known, text))
     return [panel for panel in panels if any(map(panel.shows, states))]
 
 
@@ -252,10 +259,6 @@ def _error_panels(field: str, text: str, i: int | None = None) -> list[fits.Pane
                  n=(i or 0) + 1)
         for cause, shown in causes.items()
     ]  # fmt: skip
-
-
-def _has_spectrum(state: PhotographState) -> bool:
-    return state.frame.spectrum is not None
 
 
 def _with_readings(

@@ -51,11 +51,6 @@ def buckling_table(ran: pd.DataFrame) -> pd.DataFrame:
     return _renamed(ran.assign(**percent), _BUCKLING)
 
 
-def likeness_table(measured: pd.DataFrame) -> pd.DataFrame:
-    """A row for each specimen: overlaps of its mode, and errors of its displacement."""
-    return _renamed(measured, _LIKENESS)
-
-
 def _renamed(rows: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
     names = {"varied": "varied", "level": "level", **columns}
     return rows.reindex(columns=list(names)).rename(columns=names)
@@ -238,7 +233,7 @@ def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
         tables=[
             ReportTable.of("Buckling", buckling_table(ran)),
             ReportTable.of("Parameters", parameters_summary(measured)),
-            ReportTable.of("Overlaps and errors", likeness_table(measured)),
+            ReportTable.of("Overlaps and errors", _renamed(measured, _LIKENESS)),
         ],
         attachments=[ReportTable.of("Every parameter", parameters_table(measured))],
     )

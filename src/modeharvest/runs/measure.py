@@ -65,6 +65,7 @@ from modeharvest.util.files import (
 from modeharvest.util.machine import require_memory
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
+from modeharvest.util.typed import picked
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 _CODE = ("fem", "imaging", "idic", "runs")
@@ -314,16 +315,11 @@ class MeasureRun(StagedRun[MeasureCase]):
             "max_px": float(np.linalg.norm(inside, axis=-1).max()),
             "median_sd_px": float(np.median(result.standard_deviation)) / px,
             "coverage": len(inside) / int(mask.sum()),
-            "cutoff_px": result.cutoff_px,
-            "unknowns": result.unknowns,
-            "effective_unknowns": result.effective_unknowns,
-            "pixels": result.pixels,
+            **picked(result, "cutoff_px unknowns effective_unknowns pixels"),
             "outside_px": result.outside,
-            "residual_rms": result.residual_rms,
-            "residual_noise": result.residual_noise,
+            **picked(result, "residual_rms residual_noise library"),
             "gain": gain,
             "offset": offset,
-            "library": result.library,
             "seconds": self.stages.timings.get(f"image {name}"),
             "image_noise": noise,
             "warnings": warnings,

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,7 @@ from modeharvest.util.typed import to_plain
 from modeharvest.validation.whole_field import compare_whole
 
 _SIDECAR = "twin.json"
+_EXPERIMENT = resources.files(__package__).joinpath("twin_experiment.txt").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -150,29 +152,10 @@ def _experiment_text(case: Case, images: ImageSet) -> str:
     """The TOML file that a user would write."""
     deformed = ", ".join(f'"{name}.tif"' for name, _ in _exposures(images) if name != "reference")
     about = ", ".join(f"({col:g}, {row:g})" for col, row in _target(case).shifts_px)
-    return f"""\
-title = "{case.title}"
-
-[images]
-reference = "reference.tif"
-deformed = [{deformed}]
-repeats = ["reference_2.tif"]      # the same state once more: for the camera's noise
-
-[scale]
-pixel_size = {case.imaging.pixel_size:g}                  # [mm/px]
-
-[specimen]
-cell_size = {case.experiment.specimen.pitch:g}                    # [mm], from hole to hole
-
-[distortion]
-# The stage was moved by about
-# {about} px
-# (along columns, along rows), not exactly enough to be of use.
-calibration = ["calibration_*.tif"]
-
-[correlation]
-gain_degree = 0                    # the light was not the same in all photographs
-"""
+    return _EXPERIMENT.format(
+        title=case.title, deformed=deformed, about=about, pixel_size=case.imaging.pixel_size,
+        cell_size=case.experiment.specimen.pitch,
+    )  # fmt: skip
 
 
 _WAVES, _AMPLITUDE, _LENS_PX = 0.01, 0.03, 0.05

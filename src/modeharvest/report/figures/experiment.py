@@ -31,7 +31,6 @@ class ExperimentData:
     strains: Sequence[float]
     """Nominal strain of each snapshot [-]."""
     results: Sequence[Result]
-    """What was found in each."""
     comparisons: Sequence[Comparison]
     """Of each with the truth; may still be computed."""
     spectra: Sequence[tuple[Spectrum, WavePattern]]

@@ -73,7 +73,6 @@ class FittedState:
     """Ending of its pictures' anchors, and what is written above them."""
     view: SpecimenView
     result: Result
-    """Of its correlation."""
     densities: Callable[[], tuple[Spectrum, WavePattern, float]]
     """Gives the spectral densities of the displacement, what is read off them, and where their
     colours end [mm⁶], the same for all states."""
@@ -122,7 +121,6 @@ class Panel(Generic[S]):
     key: str
     """Where on the page it is, and its anchor there."""
     draw: Callable[[S], Figure]
-    """Draws it of a state."""
     shows: Callable[[S], bool] = always
     """Whether there is something to draw."""
     words: Mapping[str, Any] = field(default_factory=dict)

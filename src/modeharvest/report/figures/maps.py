@@ -35,7 +35,6 @@ class MapFrame:
     """What all maps of a specimen share, so that they can be laid over each other."""
 
     boundary: MeshBoundary
-    """Of the specimen."""
     grid: PixelGrid
     factor: int
     """The images' pixels, so many of them joined in each direction to the cells that are drawn."""

@@ -273,11 +273,6 @@ def truth_of(state: PhotographState) -> FrameTruth | None:
     return None if truth is None else truth.frames.get(state.frame.name)
 
 
-def has_truth(state: PhotographState) -> bool:
-    """Whether that is known."""
-    return truth_of(state) is not None
-
-
 WHOLE_MAPS: WholeMaps[PhotographState] = WholeMaps(lambda state: state.frame.whole, truth_of)
 
 WIDE, NARROW = 5.2, 3.5  # of a picture on half a page, and on a third of it [in]

@@ -35,7 +35,6 @@ BLUE, RED, GREEN, GOLD = "#3987e5", "#e0603f", "#2a9d74", "#d99a1f"
 COLOURS = (BLUE, RED, GREEN, GOLD)
 """Of curves side by side, in this order."""
 EDGE = "#70757d"
-"""For boundaries."""
 DPI = 260
 """Of the pixel parts; a picture of 2.35 in is 611 px wide."""
 

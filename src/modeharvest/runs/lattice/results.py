@@ -50,7 +50,6 @@ class CriticalPoint:
     """Where a lattice first becomes unstable: what ``LatticeCritical`` says, in plain values."""
 
     loading: str
-    """Its name."""
     load: float
     """The critical one [-]; the largest at which the lattice was found stable where nothing is
     critical."""

@@ -79,7 +79,6 @@ class Images:
     """The photographs."""
 
     reference: str = ""
-    """File of the undeformed state."""
     deformed: tuple[str, ...] = ()
     """Files of the deformed states in the order of the test; a name may have wildcards, whose
     matches come in the order of their names."""

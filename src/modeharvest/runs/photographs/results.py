@@ -83,7 +83,6 @@ class HarvestedFrame:
     start_text: tuple[str, ...] = ()
     """Where the correlation started from."""
     warnings: tuple[str, ...] = ()
-    """What a user should know."""
 
     @property
     def modes(self) -> range:
@@ -101,7 +100,6 @@ class TruthCheck:
     ok: bool
     """Whether the first is as good as the second asks for."""
     unit: str = ""
-    """Empty for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +121,6 @@ class HarvestTruth:
     frames: Mapping[str, FrameTruth]
     """By their names, some may be missing."""
     distortion: Distortion | None = None
-    """Of the optics."""
     rows: tuple[TruthCheck, ...] = ()
     """What was found against what is true."""
 
@@ -134,9 +131,7 @@ class Harvest:
 
     title: str
     experiment: Mapping[str, Any]
-    """The experiment, as plain values."""
     grid: PixelGrid
-    """The pixels of the ideal images."""
     reference: FloatImage
     mask: BoolArray
     """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels], and
@@ -158,7 +153,6 @@ class Harvest:
     timeline: Sequence[ImageAmplitude] = ()
     """In the order of the test."""
     buckling: Buckling | None = None
-    """When the pattern appeared."""
     calibration: Calibration | None = None
     lens: Distortion | None = None
     """Both of the optics; the lens alone if it was given."""
