@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from affine_aside import affine_aside
+from lens_pair import recover_camera
 from numpy.typing import NDArray
 
-from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
-from modeharvest.imaging.distortion.calibration.pair import recover_camera
-from modeharvest.imaging.distortion.calibration.result import Calibration
+from modeharvest.imaging.distortion.calibrate import Calibration, CalibrationOptions, calibrate
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.distortion.lens import (
     CameraDistortion,

@@ -21,7 +21,7 @@ from modeharvest.idic.correlate import correlate
 from modeharvest.idic.setup import CorrelationOptions
 from modeharvest.idic.solver.pyramid import Level
 from modeharvest.idic.uncertainty.covariance import field_errors
-from modeharvest.imaging.distortion.calibration.result import sampled_correlations
+from modeharvest.imaging.distortion.fit import sampled_correlations
 from modeharvest.imaging.distortion.lens import CameraDistortion, undistorted
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair

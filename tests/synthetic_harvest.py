@@ -21,8 +21,8 @@ from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import spectral_density
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
-from modeharvest.imaging.distortion.calibration.model import PolynomialModel
-from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.fit import PolynomialModel
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.results import (

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from undistortion_noise import undistorted_noise
 
-from modeharvest.imaging.distortion.calibration.calibrate import CalibrationOptions, calibrate
-from modeharvest.imaging.distortion.calibration.result import Calibration, sampled_noise
+from modeharvest.imaging.distortion.calibrate import Calibration, CalibrationOptions, calibrate
+from modeharvest.imaging.distortion.fit import sampled_noise
 from modeharvest.imaging.distortion.lens import PolynomialDistortion, undistorted
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.photographs.prepare import calibration_text

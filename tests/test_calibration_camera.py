@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from calibration_set import photographs, random_lens
+from lens_pair import CameraModel, recover_camera
 from numpy.typing import NDArray
 
-from modeharvest.imaging.distortion.calibration.model import CameraModel, PolynomialModel
-from modeharvest.imaging.distortion.calibration.pair import recover_camera
-from modeharvest.imaging.distortion.calibration.result import LensEstimate
+from modeharvest.imaging.distortion.calibrate import LensEstimate
+from modeharvest.imaging.distortion.fit import PolynomialModel
 from modeharvest.imaging.distortion.lens import CameraDistortion, Distortion, PolynomialDistortion
 from modeharvest.util.errors import InputError
 

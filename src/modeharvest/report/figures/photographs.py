@@ -23,7 +23,7 @@ from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.idic.uncertainty.covariance import FieldErrors
-from modeharvest.imaging.distortion.calibration.result import Calibration
+from modeharvest.imaging.distortion.calibrate import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage

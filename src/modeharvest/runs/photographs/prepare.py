@@ -18,10 +18,9 @@ from modeharvest.idic.local.field import LocalField, read_field, without_distort
 from modeharvest.idic.local.subsets import SubsetOptions, pyvale_python, subset_field
 from modeharvest.idic.photograph.material import MaterialOptions, find_material, material_options
 from modeharvest.idic.solver.noise import GIVEN, CameraNoise, estimated_noise, measured_noise
-from modeharvest.imaging.distortion.calibration.calibrate import calibrate
-from modeharvest.imaging.distortion.calibration.model import PolynomialModel
-from modeharvest.imaging.distortion.calibration.result import Calibration, DegreeTrial
+from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial, calibrate
 from modeharvest.imaging.distortion.files import read_distortion, write_distortion
+from modeharvest.imaging.distortion.fit import PolynomialModel
 from modeharvest.imaging.distortion.lens import (
     Distortion,
     PolynomialDistortion,

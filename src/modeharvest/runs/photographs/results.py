@@ -23,7 +23,7 @@ from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
 from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, field_errors
 from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
-from modeharvest.imaging.distortion.calibration.result import Calibration
+from modeharvest.imaging.distortion.calibrate import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase

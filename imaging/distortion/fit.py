@@ -4,7 +4,8 @@ Photograph i shows the ideal position x of the target's pattern at phi_S(T_i(x))
 motion. The pattern P(x) is not known; the minimum over P of sum_i (c_i I_i(phi_S(T_i x)) + o_i -
 P(x))^2 is at the mean of those photographs that show x, so what is minimised is the scatter about
 it. No photograph is privileged, noise in different photographs stays independent, and the
-covariance of the unknowns is sigma^2 M^-1.
+covariance of the unknowns is sigma^2 M^-1. sigma, the noise of a photograph, follows from the
+residual by what becomes of white noise where a blurred image is sampled between its pixels.
 """
 
 from __future__ import annotations
@@ -16,13 +17,62 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from modeharvest.imaging.distortion.calibration.model import DistortionModel
-from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
 from modeharvest.imaging.photographs.files import require_contrast
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.scaled_eigen import ScaledEigen
+
+
+@dataclass(frozen=True)
+class PolynomialModel:
+    """Polynomials of a total degree, all of their terms or those above the affine ones."""
+
+    shape: tuple[int, int]
+    """(rows, cols) of the image [px]."""
+    degree: int
+    """Total degree, at least 1."""
+    fixed: int = 3
+    """How many terms of each component are zero: 3, the affine ones, where shifts are not known; 1,
+    the constant, where they are; 0 if all are observable."""
+
+    def __post_init__(self) -> None:
+        if self.fixed not in (0, 1, 3) or self.terms < 1:
+            raise InputError(
+                "expected a degree above that of the fixed terms (0, 1 or 3 of them), got degree "
+                f"{self.degree} and {self.fixed} fixed terms"
+            )
+
+    @property
+    def terms(self) -> int:
+        """Count the unknown coefficients of one component."""
+        return PolynomialDistortion.size_of(self.degree) - self.fixed
+
+    @property
+    def start(self) -> FloatArray:
+        """(k,) coefficients to begin with: zeros, no distortion."""
+        return np.zeros(2 * self.terms)
+
+    def distortion(self, c: FloatArray) -> PolynomialDistortion:
+        """The distortion of these coefficients: first all along rows, then all along columns."""
+        full = np.zeros((2, self.terms + self.fixed))
+        full[:, self.fixed :] = c.reshape(2, self.terms)
+        return PolynomialDistortion(self.shape, full)
+
+    def sensitivities(self, c: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
+        """(2, k, n) derivatives of S(row, col) [px] with respect to the coefficients."""
+        basis = self.distortion(c).basis(row, col)[:, self.fixed :].T
+        zero = np.zeros_like(basis)
+        return np.array([np.concatenate([basis, zero]), np.concatenate([zero, basis])])
+
+    def of_degree(self, c: FloatArray, degree: int) -> tuple[PolynomialModel, FloatArray]:
+        """The model of another degree; coefficients in it, cut or continued by zeros."""
+        other = replace(self, degree=degree)
+        full, kept = np.zeros((2, other.terms)), min(self.terms, other.terms)
+        full[:, :kept] = c.reshape(2, self.terms)[:, :kept]
+        return other, full.ravel()
+
 
 POSE_UNKNOWNS = 5
 """Of a photograph: shift along rows and columns, rotation, contrast, brightness."""
@@ -105,6 +155,42 @@ def normalised_illumination(
     return poses
 
 
+_FINE = 16
+"""Samples per px of the response to a single noisy pixel."""
+
+
+def sampled_noise(blur_px: float, order: int, stride_px: float) -> tuple[float, float]:
+    """Variance of a sample, and of the mean of many samples, of white noise of variance 1.
+
+    The former is the mean over all positions between pixels; the latter that times how much
+    neighbouring samples have in common: the variance that a field sees that varies slowly from
+    sample to sample. It is 1 for a stride of 1 px: no information is lost there.
+
+    blur_px, order : standard deviation of the blur before the spline [px]; its order, 3 or 5.
+    stride_px : distance between samples along rows and columns [px].
+    """
+    lags, correlations = sampled_correlations(blur_px, order, stride_px)
+    return float(correlations[lags == 0.0].sum()) ** 2, float(correlations.sum()) ** 2
+
+
+def sampled_correlations(
+    blur_px: float, order: int, stride_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lags [px] along an axis, and covariances at them of white noise blurred and sampled."""
+    reach = int(np.ceil(16 + 6 * blur_px))
+    impulse = np.zeros((24, 2 * reach + 1))
+    impulse[:, reach] = 1.0  # a line, so that the other axis has no say
+    if blur_px > 0.0:
+        impulse = ndimage.gaussian_filter1d(impulse, blur_px, axis=1)
+    along = np.arange(2 * reach * _FINE) / _FINE
+    response, _, _ = SplineImage.of(impulse, order, np.float64).sample(12.0, along)
+    count = int(reach / stride_px)
+    lags = stride_px * np.arange(-count, count + 1, dtype=np.float64)
+    shifted = np.interp(along + lags[:, None], along, response, left=0.0, right=0.0)
+    correlations: NDArray[np.float64] = shifted @ response / _FINE
+    return lags, correlations
+
+
 _CHUNK = 4096
 """Points that are looked at a time."""
 
@@ -146,7 +232,7 @@ class Fit:
 
 
 def fit_views(
-    model: DistortionModel,
+    model: PolynomialModel,
     c: FloatArray,
     views: Sequence[View],
     points: tuple[FloatArray, FloatArray],
@@ -173,7 +259,7 @@ def fit_views(
         own[free] = step[len(c) :]
         c = c + step[: len(c)]
         poses = [pose.stepped(change) for pose, change in zip(poses, own, strict=True)]
-        length = max(np.abs(step[: len(c)] / model.scale).max(), np.abs(own * px).max())
+        length = max(np.abs(step[: len(c)]).max(), np.abs(own * px).max())
         if length < tolerance_px:
             break
     return Fit(
@@ -191,7 +277,7 @@ def fit_views(
 
 
 def _assemble(
-    model: DistortionModel,
+    model: PolynomialModel,
     c: FloatArray,
     views: Sequence[View],
     poses: Sequence[Pose],
@@ -234,7 +320,7 @@ def _assemble(
 
 
 def _sample(
-    model: DistortionModel,
+    model: PolynomialModel,
     c: FloatArray,
     distortion: Distortion,
     view: View,

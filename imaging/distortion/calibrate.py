@@ -2,13 +2,14 @@
 
 A distortion S makes a rigid shift t look like t + S(x + t) - S(x): the apparent motion varies over
 the image, and S follows from how. All photographs are fitted at once, grey level by grey level
-(:mod:`modeharvest.imaging.distortion.calibration.fit`); the shifts are found along with S. Source
-of the idea: Maraghechi et al. 2019, the paper's reference for S; the fit is this project's own.
+(:mod:`modeharvest.imaging.distortion.fit`); the shifts are found along with S. Source of the idea:
+Maraghechi et al. 2019, the paper's reference for S; the fit is this project's own.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,23 +18,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 from skimage.registration import phase_cross_correlation
 
-from modeharvest.imaging.distortion.calibration.fit import (
+from modeharvest.imaging.distortion.fit import (
     POSE_UNKNOWNS,
     Fit,
+    PolynomialModel,
     Pose,
     View,
     blurred_spline,
     checked_images,
     fit_views,
     normalised_illumination,
+    sampled_noise,
     with_poses,
 )
-from modeharvest.imaging.distortion.calibration.model import PolynomialModel
-from modeharvest.imaging.distortion.calibration.result import (
-    Calibration,
-    calibration_of,
-    sampled_noise,
-)
+from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
 from modeharvest.util.progress import Progress, silent
@@ -73,6 +71,86 @@ class CalibrationOptions:
                 "expected two or more blurs of 0 px or more and at least 1000 points, got "
                 f"{self.blurs_px} and {self.points}"
             )
+
+
+@dataclass(frozen=True, eq=False)
+class LensEstimate:
+    """A lens as a fit found it."""
+
+    distortion: Distortion
+    """What the model made of it."""
+    coefficients: FloatArray
+    covariance: FloatArray
+    """(k,) and (k, k) of the model's unknowns."""
+    model: PolynomialModel
+    """Which these are."""
+    noise_sd: float
+    """Noise of an image, estimated from the residual [grey levels]."""
+    matches: FloatArray
+    """(m,) correlation of each image with the mean of the others, without distortion [-]."""
+    bic: float = math.nan
+    """Bayesian information criterion, the lower the better, of one set; NaN if not kept."""
+
+    @classmethod
+    def of(cls, model: PolynomialModel, fit: Fit, noise: tuple[float, float]) -> LensEstimate:
+        """The lens of a fit, ``noise`` being what :func:`sampled_noise` gives."""
+        one, many = noise
+        k = len(fit.coefficients)
+        return cls(
+            distortion=model.distortion(fit.coefficients),
+            coefficients=fit.coefficients,
+            covariance=fit.inverse[:k, :k] * (fit.variance * many / one),
+            model=model,
+            noise_sd=float(np.sqrt(fit.variance / one)),
+            matches=fit.matches,
+            bic=fit.bic,
+        )
+
+    def sd(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Standard deviation of S [px] at ideal positions [px], by the images' noise alone."""
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        columns = self.model.sensitivities(self.coefficients, row.ravel(), col.ravel())
+        products = np.einsum("ckn,kl->cln", columns, self.covariance, optimize=True)
+        variance = np.maximum((products * columns).sum(axis=1), 0.0)
+        along_row, along_col = np.sqrt(variance).reshape(2, *row.shape)
+        return along_row, along_col
+
+
+@dataclass(frozen=True)
+class DegreeTrial:
+    """What a degree of S gave."""
+
+    degree: int
+    """Total degree."""
+    unknowns: int
+    """Number of all unknowns."""
+    residual_rms: float
+    """Scatter of the photographs about their mean [grey levels]."""
+    bic: float
+    """Bayesian information criterion less its lowest value: N log(residual^2) + unknowns log N for
+    N values; the degree with 0 is taken [-]."""
+    change_px: float
+    """Rms per component over the image by which S differs from the degree before [px]."""
+    sd_px: float
+    """Rms per component over the image of S's standard deviation [px]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(LensEstimate):
+    """The lens of a set of photographs, without the part of S that can't be observed."""
+
+    distortion: PolynomialDistortion
+    model: PolynomialModel
+    """S; the model's ``fixed`` terms could not be observed and are zero."""
+    shifts: FloatArray
+    shifts_sd: FloatArray
+    """(m, 2) motion of the target since the first photograph, along rows and columns [px], and its
+    standard deviation; 0 where given."""
+    angles: FloatArray
+    angles_sd: FloatArray
+    """(m,) likewise its rotation, from the columns' to the rows' axis [rad]."""
+    trials: tuple[DegreeTrial, ...]
+    """One for each degree."""
 
 
 def calibrate(
@@ -246,3 +324,45 @@ def _require_shifts(poses: Sequence[Pose]) -> None:
             f"{longest:.1f} px at most and {across / max(along, 1e-9):.3f} as much across: "
             "a calibration set without enough shifts; photograph the target shifted both ways"
         )
+
+
+def calibration_of(
+    trials: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
+) -> Calibration:
+    """Choose the degree with the lowest BIC; ``noise`` is what :func:`sampled_noise` gives."""
+    model, fit = min(trials, key=lambda trial: trial[1].bic)
+    one, many = noise
+    own, covariance = np.zeros(fit.free.shape), fit.inverse * (fit.variance * many / one)
+    own[fit.free] = np.sqrt(np.diag(covariance)[len(fit.coefficients) :])
+    return Calibration(
+        **vars(LensEstimate.of(model, fit, noise)),
+        shifts=np.array([pose.shift for pose in fit.poses]),
+        shifts_sd=own[:, :2],
+        angles=np.array([pose.angle for pose in fit.poses]),
+        angles_sd=own[:, 2],
+        trials=_tried(trials, noise),
+    )
+
+
+def _tried(
+    fitted: Sequence[tuple[PolynomialModel, Fit]], noise: tuple[float, float]
+) -> tuple[DegreeTrial, ...]:
+    row, col = (np.linspace(0.0, n - 1.0, 25) for n in fitted[0][0].shape)
+    at = row[:, None], col[None, :]
+    lowest = min(fit.bic for _, fit in fitted)
+    trials: list[DegreeTrial] = []
+    before: FloatArray = np.zeros((2, 25, 25))
+    for model, fit in fitted:
+        lens = LensEstimate.of(model, fit, noise)
+        now = np.stack(lens.distortion.shift(*at))
+        trial = DegreeTrial(
+            degree=model.degree,
+            unknowns=len(fit.inverse),
+            residual_rms=float(np.sqrt(fit.variance)),
+            bic=fit.bic - lowest,
+            change_px=float(np.sqrt(np.mean((now - before) ** 2))),
+            sd_px=float(np.sqrt(np.mean(np.square(lens.sd(*at))))),
+        )
+        trials.append(trial)
+        before = now
+    return tuple(trials)

@@ -1,1 +1,0 @@
-"""A lens's distortion from photographs of a shifted target, or from a pair of images."""
