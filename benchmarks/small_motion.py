@@ -10,10 +10,13 @@ The truth is in the ansatz, so that nothing is left over but noise. The Cramer-R
 the pattern's exact gradient. What a few realisations say of scatter is mostly chance; so errors
 are set against those that the efficient linear estimator makes under the very same noise, which
 are at the bound on average: I^-1 (sum J n_f over the pixels of f - sum J n_g/det F over those of
-g), I = sum J J'. "Least squares" is the naive version: the deformed image's own
-gradient, and a quintic spline whatever the speckle.
+g), I = sum J J'. Every motion has noise of its own: an estimator whose variance is a share e above
+the bound differs from the efficient one by a part of that variance that is uncorrelated with it,
+so that chi squared over the efficient one's scatters by 2 sqrt(e/n) in n independent errors. That
+standard error, estimated from the scatter of the pairs, stands behind each ratio. "Least squares"
+is the naive version: the deformed image's own gradient, and a quintic spline whatever the speckle.
 
-Run: scripts/env python benchmarks/small_motion.py [--pairs 3] [--step 0.125] [--only TEXT]
+Run: scripts/env python benchmarks/small_motion.py [--pairs 4] [--step 0.125] [--only TEXT]
      [--json FILE]
 """
 
@@ -90,8 +93,15 @@ ROWS = (
     *(Row(s, s) for s in (0.002, 0.005, 0.01, 0.02, 0.04)),
     *(Row(s, 0.0) for s in (0.002, 0.01, 0.04)),
     *(Row(0.0, s) for s in (0.002, 0.01, 0.04)),
-    *(Row(s, s, width) for width in (3.0, 4.0, 6.0, 8.0) for s in (0.002, 0.01, 0.04)),
     *(Row(0.01, 0.01, PAPER_PX, degree) for degree in (2, 3, 5)),
+    *(
+        Row(f * s, g * s, width)
+        for width in (3.0, 4.0, 6.0)
+        for f, g in ((1, 1), (1, 0), (0, 1))
+        for s in (0.002, 0.01, 0.04)
+    ),
+    *(Row(s, s, 6.0, degree) for degree in (3, 5) for s in (0.01, 0.04)),
+    *(Row(s, s, 8.0) for s in (0.002, 0.01, 0.04)),
     *(Row(s, s, options=LEAST_SQUARES) for s in (0.002, 0.01, 0.04)),
     Row(0.0, 0.01, options=LEAST_SQUARES),
     *(Row(0.01, 0.01, width, options=LEAST_SQUARES) for width in (3.0, 6.0)),
@@ -103,14 +113,57 @@ ROWS = (
 )
 
 
-def motions(step: float) -> Iterator[tuple[float, float, float]]:
-    """Shifts along x and y [px], and strain along x [-]."""
+MASK: NDArray[np.bool_] = np.zeros(GRID.shape, dtype=np.bool_)
+MASK[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+USED = np.nonzero(eroded(MASK, CorrelationOptions().edge_px))
+"""Rows and columns of the pixels that a correlation compares."""
+AT = GRID.x[USED[1], None], GRID.y[USED[0], None]  # two-dimensional: points, not axes
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A translation, and a stretch along x.
+
+    Parameters
+    ----------
+    dx_px, dy_px
+        Along x and y [px].
+    strain
+        [-].
+    """
+
+    dx_px: float
+    dy_px: float
+    strain: float
+
+    @property
+    def came_from(self) -> tuple[FloatArray, FloatArray]:
+        """(rows, cols) x and y before the motion of what the pixels of g show [mm]."""
+        across, up = np.meshgrid(GRID.x, GRID.y)
+        return (across - self.dx_px * PIXEL) / (1.0 + self.strain), up - self.dy_px * PIXEL
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """(rows, cols) True on the pixels of g that show what the pixels of f compared do."""
+        inside = np.ones(GRID.shape, dtype=np.bool_)
+        for at, own in zip(GRID.to_px(*self.came_from), USED, strict=True):
+            inside &= (own.min() - 0.5 <= at) & (at < own.max() + 0.5)
+        return inside
+
+    def displacement(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(..., 2) [mm]."""
+        return np.stack([self.dx_px * PIXEL + self.strain * x, np.full_like(y, self.dy_px * PIXEL)],
+                        axis=-1)  # fmt: skip
+
+
+def motions(step: float) -> Iterator[Motion]:
+    """Translations along x, along y and both ways, and stretches."""
     for k in range(round(1.0 / step) + 1):
-        yield step * k, 0.0, 0.0
-        yield 0.0, step * k, 0.0
-        yield step * k, step * k, 0.0
+        yield Motion(step * k, 0.0, 0.0)
+        yield Motion(0.0, step * k, 0.0)
+        yield Motion(step * k, step * k, 0.0)
     for strain in (0.001, 0.002, 0.005, 0.01):
-        yield 0.0, 0.0, strain
+        yield Motion(0.0, 0.0, strain)
 
 
 @lru_cache(maxsize=64)
@@ -119,6 +172,21 @@ def speckle(width_px: float, seed: int) -> Speckle:
     scale = width_px / PAPER_PX
     spec = SpeckleSpec(standard_deviation=0.05 / scale, blur_px=3.0 * scale, seed=seed)
     return Speckle(spec, GRID.shape)
+
+
+@lru_cache(maxsize=64)
+def slopes(width_px: float, seed: int) -> FloatArray:
+    """(2, pixels) exact slopes of f along rows and columns where it is compared [1/px]."""
+    return np.asarray(speckle(width_px, seed).gradient(*USED))
+
+
+@lru_cache(maxsize=256)
+def moved(width_px: float, seed: int, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    """Exact g, and (2, pixels) slopes before the motion where it shows what is compared [1/px]."""
+    pattern, came_from = speckle(width_px, seed), GRID.to_px(*motion.came_from)
+    return pattern.exact(*came_from), np.asarray(
+        pattern.gradient(*(at[motion.shown] for at in came_from))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +220,12 @@ class Measured:
 
     @property
     def mean_squares(self) -> FloatArray:
-        """Of the displacement's error, and of the efficient estimator's [px^2]."""
-        return np.array([
-            np.einsum("...i,ij,...j->...", errors, self.to_px, errors).mean()
-            for errors in (self.errors, self.efficient)
-        ])  # fmt: skip
+        """(2, pairs) of the displacement's error, and of the efficient estimator's [px^2]."""
+
+        def square(errors: FloatArray) -> FloatArray:
+            return np.einsum("...i,ij,...j->...", errors, self.to_px, errors)
+
+        return np.array([square(self.errors).mean(axis=1), square(self.efficient)])
 
     @property
     def bias_square(self) -> float:
@@ -168,66 +237,51 @@ class Measured:
 
     @property
     def chi_squares(self) -> FloatArray:
-        """Mean squares of the unknowns' standardised errors.
+        """(3, pairs) mean squares of the unknowns' standardised errors.
 
         Of the errors by the bound and by the predicted covariances, and of the efficient
         estimator's by the bound.
         """
-        n = self.errors.shape[-1]
-        pairs = (
-            (self.errors, self.bounds[:, None]),
-            (self.errors, self.predicted),
-            (self.efficient, self.bounds),
-        )
+
+        def square(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+            standardised = np.linalg.solve(covariances, errors[..., None])[..., 0]
+            return np.asarray((errors * standardised).mean(axis=-1))
+
         return np.array([
-            (e * np.linalg.solve(c, e[..., None])[..., 0]).sum(axis=-1).mean() / n
-            for e, c in pairs
+            square(self.errors, self.bounds[:, None]).mean(axis=1),
+            square(self.errors, self.predicted).mean(axis=1),
+            square(self.efficient, self.bounds),
         ])  # fmt: skip
 
 
-def measure(row: Row, motion: tuple[float, float, float], pairs: int) -> Measured:
-    """Correlate all realisations under one motion."""
+def measure(row: Row, motion: Motion, pairs: int, number: int = 0) -> Measured:
+    """Correlate all realisations under one motion, whose number makes its noise its own."""
     ansatz = Ansatz(Box.centred(GRID.cols * PIXEL, GRID.rows * PIXEL), v0_degree=row.degree)
-    mask = np.zeros(GRID.shape, dtype=np.bool_)
-    mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
-    options = CorrelationOptions((FULL,), **row.options)
-    used = np.nonzero(eroded(mask, options.edge_px))
-    x, y = GRID.x[used[1], None], GRID.y[used[0], None]  # two-dimensional: points, not axes
-    S = ansatz.sensitivities(np.zeros(ansatz.size), x, y)[:, 0]
-    dx, dy, strain = motion
-    u = np.column_stack([dx * PIXEL + strain * x, np.full_like(x, dy * PIXEL)])
-    truth = np.linalg.lstsq(S[::EVERY].reshape(-1, ansatz.size), u[::EVERY].ravel(), rcond=None)[0]
-    across, up = np.meshgrid(GRID.x, GRID.y)
-    from_x, from_y = (across - dx * PIXEL) / (1.0 + strain), up - dy * PIXEL
-    came_from = GRID.to_px(from_x, from_y)
-    # Pixels of g that show what the pixels of f compared do.
-    inside = np.ones(GRID.shape, dtype=np.bool_)
-    for at, own in zip(came_from, used, strict=True):
-        inside &= (own.min() - 0.5 <= at) & (at < own.max() + 0.5)
-    there = [at[inside] for at in came_from]
-    S_g = ansatz.sensitivities(np.zeros(ansatz.size), from_x[inside, None], from_y[inside, None])
+    options, stretch = CorrelationOptions((FULL,), **row.options), 1.0 + motion.strain
+    shown, rest = motion.shown, np.zeros(ansatz.size)
+    S = ansatz.sensitivities(rest, *AT)[:, 0]
+    S_g = ansatz.sensitivities(rest, *(at[shown, None] for at in motion.came_from))[:, 0]
+    u = motion.displacement(*AT)[::EVERY].ravel()
+    truth = np.linalg.lstsq(S[::EVERY].reshape(-1, ansatz.size), u, rcond=None)[0]
     errors, bounds, predicted, efficient = [], [], [], []
     for seed in range(pairs):
-        pattern = speckle(row.width_px, seed)
-        f, g = pattern.image(), pattern.exact(*came_from)
-        noise = np.random.default_rng([seed, 1]).normal(size=(2, *GRID.shape))
+        f = speckle(row.width_px, seed).image()
+        g, slopes_g = moved(row.width_px, seed, motion)
+        noise = np.random.default_rng([seed, 1, number]).normal(size=(2, *GRID.shape))
         J, J_g = (
-            (d_col[:, None] * of[:, 0] / (1.0 + strain) - d_row[:, None] * of[:, 1]) / PIXEL
-            for (d_row, d_col), of in (
-                (pattern.gradient(*used), S), (pattern.gradient(*there), S_g[:, 0])
-            )
-        )  # fmt: skip
+            (d_col[:, None] * of[:, 0] / stretch - d_row[:, None] * of[:, 1]) / PIXEL
+            for (d_row, d_col), of in ((slopes(row.width_px, seed), S), (slopes_g, S_g))
+        )
         inverse = np.linalg.inv(J.T @ J)
-        bounds.append((row.in_f**2 + row.in_g**2 / (1.0 + strain)) * inverse)
-        push = row.in_f * noise[0][used] @ J
-        push -= row.in_g / (1.0 + strain) * noise[1][inside] @ J_g
+        bounds.append((row.in_f**2 + row.in_g**2 / stretch) * inverse)
+        push = row.in_f * noise[0][USED] @ J - row.in_g / stretch * noise[1][shown] @ J_g
         efficient.append(inverse @ push)
         found = [
             correlate(
                 ImagePair(
-                    f + sign * row.in_f * noise[0], g + sign * row.in_g * noise[1], GRID, mask
+                    f + sign * row.in_f * noise[0], g + sign * row.in_g * noise[1], GRID, MASK
                 ),
-                ansatz, guess=np.zeros(ansatz.size), options=options,
+                ansatz, guess=rest, options=options,
             )
             for sign in (1, -1)
         ]  # fmt: skip
@@ -237,6 +291,29 @@ def measure(row: Row, motion: tuple[float, float, float], pairs: int) -> Measure
     to_px = np.einsum("pcn,pcm->nm", S[::EVERY], S[::EVERY]) / (2 * len(S[::EVERY])) / PIXEL**2
     made = (np.array(values) for values in (errors, bounds, predicted, efficient))
     return Measured(*made, to_px)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A ratio of two sums, and its standard error by the scatter of their terms."""
+
+    value: float
+    error: float
+
+    @classmethod
+    def of(cls, above: FloatArray, below: FloatArray) -> Ratio:
+        """Of independent pairs of terms (k,)."""
+        value = above.sum() / below.sum()
+        scatter = np.square(above - value * below).sum()
+        return cls(float(value), float(np.sqrt(scatter) / below.sum()))
+
+    @property
+    def root(self) -> Ratio:
+        """Its square root."""
+        return Ratio(float(np.sqrt(self.value)), float(0.5 * self.error / np.sqrt(self.value)))
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f} ± {self.error:.3f}"
 
 
 @dataclass(frozen=True)
@@ -258,28 +335,28 @@ class Summary:
 
     bound_px: float
     bias: float
-    ratio: float
-    chi_square: float
-    chi_square_predicted: float
+    ratio: Ratio
+    chi_square: Ratio
+    chi_square_predicted: Ratio
 
 
 def summarise(row: Row, pairs: int, step: float) -> Summary:
     """Measure a row."""
-    made = [measure(row, motion, pairs) for motion in motions(step)]
-    error, efficient = np.sum([one.mean_squares for one in made], axis=0)
-    by_bound, by_own, expected = np.sum([one.chi_squares for one in made], axis=0)
+    made = [measure(row, motion, pairs, number) for number, motion in enumerate(motions(step))]
+    error, efficient = np.hstack([one.mean_squares for one in made])
+    by_bound, by_own, expected = np.hstack([one.chi_squares for one in made])
     return Summary(
         bound_px=float(np.sqrt(np.mean([one.bound for one in made]))),
         bias=float(np.sqrt(max(max(0.0, one.bias_square) / one.bound for one in made))),
-        ratio=float(np.sqrt(error / efficient)),
-        chi_square=float(by_bound / expected),
-        chi_square_predicted=float(by_own / expected),
+        ratio=Ratio.of(error, efficient).root,
+        chi_square=Ratio.of(by_bound, expected),
+        chi_square_predicted=Ratio.of(by_own, expected),
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--pairs", type=int, default=3, help="realisations n, each with its -n")
+    parser.add_argument("--pairs", type=int, default=4, help="realisations n, each with its -n")
     parser.add_argument("--step", type=float, default=0.125, help="of the translations [px]")
     parser.add_argument("--only", default="", help="rows whose names contain this text")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")
@@ -291,9 +368,8 @@ def main() -> None:
         if options.only in row.name:
             one = summarise(row, options.pairs, options.step)
             found[row.name] = asdict(one)
-            print(f"| {row.name} | {one.bound_px:.2e} | {one.bias:.3f} | {one.ratio:.3f} | "
-                  f"{one.chi_square:.3f} | {one.chi_square_predicted:.3f} |",
-                  flush=True)  # fmt: skip
+            print(f"| {row.name} | {one.bound_px:.2e} | {one.bias:.3f} | {one.ratio} | "
+                  f"{one.chi_square} | {one.chi_square_predicted} |", flush=True)  # fmt: skip
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
 
