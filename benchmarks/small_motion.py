@@ -16,7 +16,7 @@ so that chi squared over the efficient one's scatters by 2 sqrt(e/n) in n indepe
 standard error, estimated from the scatter of the pairs, stands behind each ratio. "Least squares"
 is the naive version: the deformed image's own gradient, and a quintic spline whatever the speckle.
 
-Run: scripts/env python benchmarks/small_motion.py [--pairs 4] [--step 0.125] [--only TEXT]
+Run: scripts/env python benchmarks/small_motion.py [--pairs 8] [--step 0.125] [--only TEXT]
      [--json FILE]
 """
 
@@ -356,7 +356,7 @@ def summarise(row: Row, pairs: int, step: float) -> Summary:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--pairs", type=int, default=4, help="realisations n, each with its -n")
+    parser.add_argument("--pairs", type=int, default=8, help="realisations n, each with its -n")
     parser.add_argument("--step", type=float, default=0.125, help="of the translations [px]")
     parser.add_argument("--only", default="", help="rows whose names contain this text")
     parser.add_argument("--json", type=Path, help="where to leave all numbers")

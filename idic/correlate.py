@@ -28,7 +28,7 @@ from modeharvest.idic.solver.gauss_newton import (
     minimise,
 )
 from modeharvest.idic.solver.level_search import LevelSearch, step_length
-from modeharvest.idic.solver.noise import NoiseTransfer
+from modeharvest.idic.solver.noise import NoiseTransfer, spline_autocorrelation
 from modeharvest.idic.solver.pyramid import FULL, Level, level_pair
 from modeharvest.idic.solver.residual_test import (
     MOST_DECORRELATED,
@@ -394,11 +394,14 @@ def _result(
     if lost > MOST_DECORRELATED and found.outcome not in WITHOUT_RESULT:
         found = replace(found, outcome=Outcome.LOCAL_MINIMUM)
     order = pair.deformed.order
+    where = (ansatz, found.unknowns, pair.grid, used.mask, order)
     return replace(
         make_result(ansatz, pair.grid, found, how),
-        noise_transfer=NoiseTransfer.of(ansatz, found.unknowns, pair.grid, used.mask, order),
+        noise_transfer=NoiseTransfer.of(*where),
         order=order,
-        residual_correlation=autocorrelation(left, lags_px),
+        residual_correlation=autocorrelation(
+            left, lags_px, spline_autocorrelation(*where, lags_px)
+        ),
         residual_lags_px=lags_px,
         decorrelated_fraction=lost,
         weighting=weighting or Weighting(speckle_size_px=size_px),

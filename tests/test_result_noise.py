@@ -16,7 +16,12 @@ from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import correlate, fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.setup import CorrelationOptions
-from modeharvest.idic.solver.noise import ImageNoise, NoiseTransfer, slope_noise
+from modeharvest.idic.solver.noise import (
+    ImageNoise,
+    NoiseTransfer,
+    slope_noise,
+    spline_autocorrelation,
+)
 from modeharvest.idic.solver.pyramid import Level, blurred
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
@@ -66,6 +71,11 @@ def test_what_a_spline_makes_of_noise_between_pixels(
     assert found.value == pytest.approx(value.var(), rel=0.02)
     assert found.slope == pytest.approx(0.5 * (d_row.var() + d_col.var()), rel=0.02)
     assert found.density == pytest.approx(1.0)
+    lags = (1, 2, 3, 4, 30)
+    made = spline_autocorrelation(ansatz, a, grid, np.ones(grid.shape, np.bool_), order, lags)
+    for along, noise in zip(made, (value, value.T), strict=True):
+        measured = [np.mean(noise[lag:] * noise[:-lag]) / value.var() for lag in lags]
+        assert along == pytest.approx(measured, abs=4 / 475)
 
 
 def test_the_slope_of_blurred_noise() -> None:

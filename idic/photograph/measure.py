@@ -29,7 +29,13 @@ from modeharvest.idic.result import Result
 from modeharvest.idic.setup import PhotographOptions
 from modeharvest.idic.solver.final_smoothing import speckle_size
 from modeharvest.idic.solver.gauss_newton import Outcome
-from modeharvest.idic.solver.noise import GIVEN, CameraNoise, ImageNoise, estimated_noise
+from modeharvest.idic.solver.noise import (
+    GIVEN,
+    CameraNoise,
+    ImageNoise,
+    estimated_noise,
+    spline_autocorrelation,
+)
 from modeharvest.idic.solver.pyramid import eroded
 from modeharvest.idic.solver.residual_test import ResidualTest, autocorrelation, lags_for
 from modeharvest.imaging.pair import ImagePair
@@ -69,8 +75,11 @@ def residual_test(result: Result, pair: ImagePair, noise: ImageNoise, edge_px: i
     residual = np.where(used, pair.reference - np.float32(gain) * back - np.float32(offset), np.nan)
     rms = float(np.sqrt(np.nanmean(np.square(residual, dtype=np.float64))))
     lags = lags_for(speckle_size(pair.reference, used))
+    by_spline = spline_autocorrelation(
+        result.ansatz, result.unknowns, pair.grid, used, result.order, lags
+    )
     return ResidualTest.of(
-        rms, autocorrelation(residual, lags), int(used.sum()), result.ansatz.size,
+        rms, autocorrelation(residual, lags, by_spline), int(used.sum()), result.ansatz.size,
         result.residual_noise(noise), lags,
     )  # fmt: skip
 

@@ -172,6 +172,34 @@ def subsampled(mask: BoolArray) -> tuple[NDArray[np.intp], NDArray[np.intp], Boo
     return rows, cols, mask[np.ix_(rows, cols)]
 
 
+def spline_autocorrelation(
+    ansatz: Ansatz,
+    a: FloatArray,
+    grid: PixelGrid,
+    mask: BoolArray,
+    order: int,
+    lags_px: Sequence[int],
+) -> FloatArray:
+    """(2, lags) autocorrelation of white noise in g, sampled at x + u, down columns, along rows.
+
+    The mean over the compared pixels, True in ``mask`` (rows, cols); pixels some lag [px] apart
+    are taken to lie alike between those of g.
+    """
+    rows, cols, some = subsampled(mask)
+    if not some.any():
+        return np.zeros((2, len(lags_px)))
+    phase = (ansatz.displacement(a, grid.x[cols], grid.y[rows])[some] / grid.pixel_size) % 1.0
+    at, table = np.arange(_PHASES + 1) / _PHASES, _autocovariances(order)
+
+    def at_lag(component: int, lag: int) -> FloatArray:
+        own = table[lag] if lag < len(table) else np.zeros(_PHASES + 1)
+        return np.interp(phase[:, component], at, own)
+
+    across, down = at_lag(0, 0), at_lag(1, 0)
+    found = [[np.mean(across * at_lag(1, lag)), np.mean(down * at_lag(0, lag))] for lag in lags_px]
+    return np.asarray(np.transpose(found) / np.mean(across * down))
+
+
 def slope_noise(order: int, blur_px: float, low_pass: int = 0) -> float:
     """Variance at a pixel of the slope of white noise of variance 1, filtered first [1/px^2].
 
@@ -199,14 +227,30 @@ def _variances(order: int, phase: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.interp(phase, at, value), np.interp(phase, at, slope)
 
 
+_REACH = 24
+"""How far from a pixel the spline through it is looked at [px]."""
+
+
 @cache
 def _table(order: int) -> tuple[FloatArray, FloatArray]:
     """Both at the phases 0 ... 1: sums of squares of the spline through a single 1."""
-    reach = 24
-    impulse = np.zeros((2 * reach + 1, 2 * reach + 1))
-    impulse[reach, reach] = 1.0
+    value, slope = _impulse(order)
+    return (value**2).sum(axis=1), (slope**2).sum(axis=1)
+
+
+@cache
+def _autocovariances(order: int) -> FloatArray:
+    """(lags, phases) of interpolated noise of variance 1, along an axis, a few pixels apart."""
+    value, _ = _impulse(order)
+    n = value.shape[1]
+    return np.array([(value[:, : n - lag] * value[:, lag:]).sum(axis=1) for lag in range(_REACH)])
+
+
+def _impulse(order: int) -> tuple[FloatArray, FloatArray]:
+    """(phases 0 ... 1, positions a pixel apart) the spline through a single 1, and its slope."""
+    impulse = np.zeros((2 * _REACH + 1, 2 * _REACH + 1))
+    impulse[_REACH, _REACH] = 1.0
     spline = SplineImage.of(impulse, order, np.float64)
     phase = np.arange(_PHASES + 1)[:, None] / _PHASES
-    col = phase + np.arange(4, 2 * reach - 4)
-    value, _, slope = spline.sample(float(reach), col)
-    return (value**2).sum(axis=1), (slope**2).sum(axis=1)
+    value, _, slope = spline.sample(float(_REACH), phase + np.arange(4, 2 * _REACH - 4))
+    return value, slope

@@ -1,8 +1,9 @@
 """Residual test: is a residual white noise, and which fraction of the image is decorrelated.
 
-Noise has no correlation from one pixel to another a few pixels off; a model error shows the
-speckle's own gradient, which is correlated over a speckle. So the residual's autocorrelation
-separates the two without knowing the noise; where that is known, chi squared does, too.
+Noise has no correlation from one pixel to another a few pixels off, but what the spline makes of
+that of g between its pixels, which is known; a model error shows the speckle's own gradient, which
+is correlated over a speckle. So the residual's autocorrelation separates the two without knowing
+the noise; where that is known, chi squared does, too.
 
 NaN is where no pixel counts. Each row, or row of blocks, is summed on its own, so the result does
 not depend on the number of threads.
@@ -18,6 +19,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.compiled import compiled
 from modeharvest.util.errors import InputError
 
@@ -85,7 +87,7 @@ def block_moments(f: Any, residual: Any, size: int, sums: Any) -> None:
 
 
 _SPARED_PX = 3
-"""The deformed image's spline correlates its noise over fewer pixels than that by more than 2 %."""
+"""Closer than that the deformed image's spline correlates its noise most."""
 LAGS_PX = (4, 6, 8, 10, 12)
 """What :func:`lags_for` gives for the paper's speckle, 12 px wide."""
 BLOCK_PX, CORRELATED = 32, 0.3
@@ -182,10 +184,14 @@ def lags_for(speckle_size_px: float) -> tuple[int, ...]:
     return tuple(sorted({round(lag) for lag in np.linspace(first, last, 5)}))
 
 
-def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) -> float:
+def autocorrelation(
+    residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX, by_spline: FloatArray | None = None
+) -> float:
     """Rms autocorrelation of a residual at some lags along rows and columns [-].
 
-    The residual is f - g(x + u) (rows, cols), NaN where no pixel counts.
+    The residual is f - g(x + u) (rows, cols), NaN where no pixel counts. ``by_spline``, (2, lags)
+    by :func:`~modeharvest.idic.solver.noise.spline_autocorrelation`, is what that of g's noise
+    alone would be; of it that share is taken out, from 0 to 1, which leaves the least.
     """
     lags = np.array([0, *lags_px])
     sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
@@ -197,6 +203,9 @@ def autocorrelation(residual: NDArray[Any], lags_px: tuple[int, ...] = LAGS_PX) 
     if variance == 0.0 or not counted.any():
         return 0.0
     found = products[:, 1:][counted] / pairs[:, 1:][counted] / variance
+    if by_spline is not None and by_spline[counted].any():
+        made = by_spline[counted]
+        found -= np.clip(found @ made / (made @ made), 0.0, 1.0) * made
     return float(np.sqrt(np.mean(found**2)))
 
 
