@@ -20,7 +20,6 @@ from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir
-from numba import prange
 from numba import types as numba_types
 from numba.core import cgutils as numba_cgutils
 from numba.extending import intrinsic
@@ -28,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, PPoly
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.compiled import compiled, readable
+from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
 
 ORDERS = (3, 5, 11)
@@ -76,8 +75,8 @@ def spline_coefficients(image: NDArray[Any], order: int, pad: int) -> NDArray[An
     interior = padded[pad : pad + rows, pad : pad + cols]
     z = poles(order)
     gain = float(np.prod((1.0 - z) * (1.0 - 1.0 / z)))
-    _filter_columns(readable(image), z, _mirrored(z, rows), gain, interior)
-    _filter_rows(z, _mirrored(z, cols), gain, interior)
+    in_parallel(_filter_columns, readable(image), z, _mirrored(z, rows), gain, interior)
+    in_parallel(_filter_rows, z, _mirrored(z, cols), gain, interior)
     _pad_mirrored(padded, pad)
     return padded
 
@@ -123,10 +122,12 @@ def _filter(lines: Any, n: int, poles: Any, first: Any, gain: float) -> None:
             lines[i, m] *= gain
 
 
-@compiled(parallel=True, relaxed=True)
-def _filter_columns(image: Any, poles: Any, first: Any, gain: float, out: Any) -> None:
+@compiled(relaxed=True)
+def _filter_columns(
+    image: Any, poles: Any, first: Any, gain: float, out: Any, thread: int, threads: int
+) -> None:
     rows, cols = image.shape
-    for block in prange((cols + _LINES - 1) // _LINES):
+    for block in range(thread, (cols + _LINES - 1) // _LINES, threads):
         lines = np.zeros((rows, _LINES))
         left, width = block * _LINES, min(_LINES, cols - block * _LINES)
         for i in range(rows):
@@ -138,10 +139,12 @@ def _filter_columns(image: Any, poles: Any, first: Any, gain: float, out: Any) -
                 out[i, left + m] = lines[i, m]
 
 
-@compiled(parallel=True, relaxed=True)
-def _filter_rows(poles: Any, first: Any, gain: float, image: Any) -> None:
+@compiled(relaxed=True)
+def _filter_rows(
+    poles: Any, first: Any, gain: float, image: Any, thread: int, threads: int
+) -> None:
     rows, cols = image.shape
-    for block in prange((rows + _LINES - 1) // _LINES):
+    for block in range(thread, (rows + _LINES - 1) // _LINES, threads):
         lines = np.zeros((cols, _LINES))
         top, height = block * _LINES, min(_LINES, rows - block * _LINES)
         for m in range(height):

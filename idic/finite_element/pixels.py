@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -29,7 +28,7 @@ from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, sample_points
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
-from modeharvest.util.compiled import compiled, readable
+from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
 
 _BLOCK = 64
@@ -106,13 +105,16 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
     filled = np.ascontiguousarray(image[tuple(nearest)])
     rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
-    _continue(readable(image), readable(mask), rows, cols, filled)
+    of_material = readable(image), readable(mask)
+    in_parallel(_continue, *of_material, readable(rows), readable(cols), filled)
     return filled
 
 
-@compiled(parallel=True, relaxed=True)
-def _continue(image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any]) -> None:
-    for p in prange(rows.size):
+@compiled(relaxed=True)
+def _continue(
+    image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any], thread: int, threads: int
+) -> None:
+    for p in range(thread, rows.size, threads):
         i, j = rows[p], cols[p]
         A, b, phi = np.zeros((6, 6)), np.zeros(6), np.ones(6)
         for k in range(max(0, i - _WINDOW_PX), min(image.shape[0], i + _WINDOW_PX + 1)):
@@ -128,7 +130,14 @@ def _continue(image: Any, mask: Any, rows: Any, cols: Any, out: NDArray[Any]) ->
                         A[a, c] += w * phi[a] * phi[c]
         for a in range(1, 6):
             A[a, a] += _RIDGE * A[0, 0]
-        out[i, j] = np.linalg.solve(A, b)[0]
+        # A is positive definite: without its last unknowns, eliminated in turn, the first remains.
+        for c in range(5, 0, -1):
+            for a in range(c):
+                share = A[a, c] / A[c, c]
+                b[a] -= share * b[c]
+                for d in range(c):
+                    A[a, d] -= share * A[c, d]
+        out[i, j] = b[0] / A[0, 0]
 
 
 _LEAST_SHARE = 0.5
@@ -252,21 +261,22 @@ def normal_equations(
     blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 4))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
     g = level.deformed
-    accumulate_elements(
-        pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order, valid,
-        *continued_in_g, level.grid.pixel_size, share, blocks, gradient, sums,
+    in_parallel(
+        accumulate_elements, pixels, mesh.nodes[mesh.cells], u[mesh.cells], g.coefficients, g.order,
+        valid, *continued_in_g, level.grid.pixel_size, share, blocks, gradient, sums,
     )  # fmt: skip
     squares, counts, outside, weights = sums.T
     return NodalEquations(blocks, gradient, squares, counts, weights, int(outside.sum()))
 
 
-@compiled(parallel=True, relaxed=True)
+@compiled(relaxed=True)
 def accumulate_elements(
     pixels: Any, x: Any, u: Any, coefficients: Any, order: int, valid: Any, outside: Any,
     variance: float, pixel_size: float, share: float, blocks: Any, gradient: Any, sums: Any,
+    thread: int, threads: int,
 ) -> None:  # fmt: skip
     """Fill each element's own sums of products over its pixels."""
-    for e in prange(x.shape[0]):
+    for e in range(thread, x.shape[0], threads):
         own = np.empty((7, _BLOCK))
         N = np.empty((6, _BLOCK))
         h = np.empty((2, _BLOCK))

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage, border_reach
 from modeharvest.util.arrays import BoolArray, FloatImage
-from modeharvest.util.compiled import compiled, readable
+from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
 
 _ENDS = 4.0
@@ -37,7 +36,7 @@ def binned(
     weight = np.ones(image.shape, dtype=np.bool_) if weight is None else weight
     shape = image.shape[0] // factor, image.shape[1] // factor
     mean, share = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    _bin(readable(image), readable(weight), factor, mean, share)
+    in_parallel(_bin, readable(image), readable(weight), factor, mean, share)
     return mean, share
 
 
@@ -49,15 +48,17 @@ def blurred(image: FloatImage, sigma: float) -> FloatImage:
     weights = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
     weights /= weights[0] + 2.0 * weights[1:].sum()
     out = np.empty_like(image)
-    _blur(readable(image), weights.astype(np.float32), out)
+    in_parallel(_blur, readable(image), weights.astype(np.float32), out)
     return out
 
 
-@compiled(parallel=True, relaxed=True)
-def _bin(image: Any, weight: Any, factor: int, mean: Any, share: Any) -> None:
+@compiled(relaxed=True)
+def _bin(
+    image: Any, weight: Any, factor: int, mean: Any, share: Any, thread: int, threads: int
+) -> None:
     rows, cols = mean.shape
     size = np.float32(1.0 / (factor * factor))
-    for i in prange(rows):
+    for i in range(thread, rows, threads):
         along, count = np.zeros(cols * factor, np.float32), np.zeros(cols * factor, np.float32)
         for row in range(i * factor, (i + 1) * factor):
             for j in range(cols * factor):
@@ -72,11 +73,11 @@ def _bin(image: Any, weight: Any, factor: int, mean: Any, share: Any) -> None:
             mean[i, j], share[i, j] = total * size, number * size
 
 
-@compiled(parallel=True, relaxed=True)
-def _blur(image: Any, weights: Any, out: Any) -> None:
+@compiled(relaxed=True)
+def _blur(image: Any, weights: Any, out: Any, thread: int, threads: int) -> None:
     rows, cols = image.shape
     reach = weights.size - 1
-    for i in prange(rows):
+    for i in range(thread, rows, threads):
         line = np.empty(cols + 2 * reach, np.float32)
         middle, own = line[reach : reach + cols], image[i]
         for j in range(cols):

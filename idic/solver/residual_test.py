@@ -11,28 +11,28 @@ not depend on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel, readable
 from modeharvest.util.errors import InputError
 
 
-@compiled(parallel=True, relaxed=True)
-def lagged_products(residual: Any, lags: Any, products: Any, counts: Any) -> None:
+@compiled(relaxed=True)
+def lagged_products(
+    residual: Any, lags: Any, products: Any, counts: Any, thread: int, threads: int
+) -> None:
     """Sum residual (rows, cols) times residual ``lags`` (k,) further on [px], row by row.
 
     Fills ``products`` and ``counts`` (rows, 2, k): sums and numbers of pairs, down the columns and
     along the rows.
     """
     rows, cols = residual.shape
-    for i in prange(rows):
+    for i in range(thread, rows, threads):
         own = residual[i]
         first, last = 0, cols
         while first < last and np.isnan(own[first]):
@@ -59,14 +59,14 @@ def _products(one: Any, other: Any, n: int, products: Any, counts: Any, k: int) 
     products[k], counts[k] = total, count
 
 
-@compiled(parallel=True, relaxed=True)
-def block_moments(f: Any, residual: Any, size: int, sums: Any) -> None:
+@compiled(relaxed=True)
+def block_moments(f: Any, residual: Any, size: int, sums: Any, thread: int, threads: int) -> None:
     """Sum 1, f, g, f g, f f and g g with g = f - residual over blocks of ``size`` pixels.
 
     Fills ``sums`` (block rows, block columns, 6); the last blocks may be incomplete.
     """
     rows, cols = f.shape
-    for block_row in prange(sums.shape[0]):
+    for block_row in range(thread, sums.shape[0], threads):
         for block_col in range(sums.shape[1]):
             n, s_f, s_g, s_fg, s_ff, s_gg = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             first, last = block_col * size, min(cols, (block_col + 1) * size)
@@ -195,8 +195,7 @@ def autocorrelation(
     """
     lags = np.array([0, *lags_px])
     sums, counts = (np.zeros((len(residual), 2, len(lags))) for _ in range(2))
-    kernel: Callable[..., None] = lagged_products
-    kernel(np.ascontiguousarray(residual), lags, sums, counts)
+    in_parallel(lagged_products, _single(residual), lags, sums, counts)
     products, pairs = sums.sum(axis=0), counts.sum(axis=0)
     variance = products[0, 0] / max(1.0, pairs[0, 0])
     counted = pairs[:, 1:] > 0
@@ -209,6 +208,11 @@ def autocorrelation(
     return float(np.sqrt(np.mean(found**2)))
 
 
+def _single(image: NDArray[Any]) -> NDArray[Any]:
+    """Show an image to kernels as float32, which it nearly always is: compiled once."""
+    return readable(np.asarray(image, np.float32))
+
+
 def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> float:
     """Fraction of the image whose two grey levels are decorrelated [-].
 
@@ -218,8 +222,7 @@ def decorrelated_fraction(reference: NDArray[Any], residual: NDArray[Any]) -> fl
     """
     blocks = [-(-size // BLOCK_PX) for size in residual.shape]
     sums = np.empty((*blocks, 6))
-    kernel: Callable[..., None] = block_moments
-    kernel(np.ascontiguousarray(reference), np.ascontiguousarray(residual), BLOCK_PX, sums)
+    in_parallel(block_moments, _single(reference), _single(residual), BLOCK_PX, sums)
     count = sums[..., 0]
     f, g, fg, ff, gg = np.moveaxis(sums[..., 1:] / np.maximum(count, 1.0)[..., None], -1, 0)
     cov, var_f, var_g = fg - f * g, ff - f * f, gg - g * g

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.imaging.grid import PixelGrid
@@ -19,7 +18,7 @@ from modeharvest.imaging.mapping.elements import (
     to_bernstein,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel
 
 BEYOND = (0.25, 0.1, 0.03)
 """How far beyond an element's edges, in (xi, eta), its map is tried to be proved one to one."""
@@ -99,8 +98,9 @@ def tabulate_elements(
     )  # fmt: skip
     position_px = np.stack(grid.to_px(nodes[:, 0], nodes[:, 1]), axis=1)
     nodes_yx = np.ascontiguousarray(nodes, dtype=np.float64)
-    _tabulate(elements, nodes_yx, position_px, np.ascontiguousarray(cells, dtype=np.int64),
-         reference.coefficients, grid.rows)  # fmt: skip
+    in_parallel(_tabulate, elements, nodes_yx, position_px,
+                np.ascontiguousarray(cells, dtype=np.int64), reference.coefficients,
+                grid.rows)  # fmt: skip
     return elements
 
 
@@ -113,7 +113,7 @@ def _enlarged_slopes(reference: ReferenceElement, beyond: float) -> FloatArray:
     return np.asarray(control.reshape(9, -1))
 
 
-@compiled(parallel=True)
+@compiled()
 def _tabulate(
     elements: ElementTable,
     nodes: FloatArray,
@@ -121,8 +121,10 @@ def _tabulate(
     cells: IntArray,
     coefficients: FloatArray,
     rows: int,
+    thread: int,
+    threads: int,
 ) -> None:
-    for e in prange(len(cells)):
+    for e in range(thread, len(cells), threads):
         _tabulate_element(elements, e, nodes, position_px, cells[e], coefficients, rows)
 
 

@@ -21,11 +21,10 @@ from dataclasses import dataclass, field
 from math import comb
 
 import numpy as np
-from numba import prange
 from numpy.typing import ArrayLike
 
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.errors import InputError
 
 EXPONENTS = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [2, 1], [1, 2], [2, 2]])
@@ -182,7 +181,8 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     positions = np.ascontiguousarray(positions, dtype=np.float64)
     all_coefficients = np.empty((len(cells), len(points)))
     proved = np.empty(len(cells), dtype=np.bool_)
-    _prove(positions, np.ascontiguousarray(cells), shape_slopes, convert, all_coefficients, proved)
+    in_parallel(_prove, positions, np.ascontiguousarray(cells), shape_slopes, convert,
+                all_coefficients, proved)  # fmt: skip
     if proved.all():
         return np.empty(0, dtype=np.int64)
     unproved = np.flatnonzero(~proved)
@@ -210,7 +210,7 @@ def non_positive_jacobians(positions: FloatArray, cells: IntArray, element: str)
     return unproved[bad]
 
 
-@compiled(parallel=True)
+@compiled()
 def _prove(
     positions: FloatArray,
     cells: IntArray,
@@ -218,12 +218,14 @@ def _prove(
     convert: FloatArray,
     coefficients: FloatArray,
     proved: BoolArray,
+    thread: int,
+    threads: int,
 ) -> None:
     """Bernstein coefficients of every determinant, and whether all are positive.
 
     ``slopes`` (2, q, k): derivatives of the shape functions at the lattice's points.
     """
-    for e in prange(len(cells)):
+    for e in range(thread, len(cells), threads):
         proved[e] = _prove_one(positions, cells[e], slopes, convert, coefficients[e])
 
 

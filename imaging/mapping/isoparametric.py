@@ -16,9 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
@@ -45,7 +43,7 @@ from modeharvest.imaging.mapping.inversion import (
     value_and_slopes,
 )
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel
 from modeharvest.util.errors import InputError
 
 
@@ -110,18 +108,12 @@ def locate(
         np.empty(size, dtype=np.float32), 0, grid.cols, float(grid.x0), float(grid.y0),
         float(grid.pixel_size),
     )  # fmt: skip
-    order = _in_turn(start.size - 1)
-    overlapping = rasterise.rasterise(elements, fields, pixels, start, visits, order)
+    overlapping = np.zeros(start.size - 1, dtype=np.int64)
+    in_parallel(rasterise.rasterise, elements, fields, pixels, start, visits, overlapping)
     return Located(
         pixels.element.reshape(grid.shape), pixels.values.reshape(-1, *grid.shape),
-        pixels.residual.reshape(grid.shape), int(overlapping),
+        pixels.residual.reshape(grid.shape), int(overlapping.sum()),
     )  # fmt: skip
-
-
-def _in_turn(bands: int) -> IntArray:
-    """Order of the bands that gives each thread as many from every part of the image."""
-    threads = numba.get_num_threads()
-    return np.concatenate([np.arange(k, bands, threads) for k in range(threads)])
 
 
 def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArray) -> FloatArray:
@@ -134,7 +126,7 @@ def interpolate(located: Located, cells: IntArray, element: str, nodal: FloatArr
     fields = polynomials(element, cells, np.asarray(nodal, dtype=np.float64))
     out = np.empty((fields.shape[1], *located.element.shape))
     curved = not reference_element(element).triangular
-    rasterise.evaluate(fields, curved, located.element, located.xi, out)
+    in_parallel(rasterise.evaluate, fields, curved, located.element, located.xi, out)
     return out
 
 
@@ -187,8 +179,9 @@ def locate_points(
     xi = np.empty((row.size, 2))
     frame = (float(grid.x0), float(grid.y0), float(grid.pixel_size))
     points = (np.ascontiguousarray(row).ravel(), np.ascontiguousarray(col).ravel())
-    _locate(elements, _buckets(elements), *points, frame, owner, xi, residual)
-    shape, values = row.shape, np.moveaxis(xi.reshape(*row.shape, 2), -1, 0)
+    in_parallel(_locate, elements, _buckets(elements), *points, frame, owner, xi, residual)
+    # In memory as locate leaves it, or kernels are compiled for either.
+    shape, values = row.shape, np.ascontiguousarray(xi.T).reshape(2, *row.shape)
     return Located(owner.reshape(shape), values, residual.reshape(shape))
 
 
@@ -204,7 +197,7 @@ def _buckets(elements: ElementTable) -> _Buckets:
     return _Buckets(boxes, start, members, float(top), float(left), rows, cols)
 
 
-@compiled(parallel=True)
+@compiled()
 def _locate(
     elements: ElementTable,
     buckets: _Buckets,
@@ -214,9 +207,11 @@ def _locate(
     owner: NDArray[np.int32],
     xi: FloatArray,
     residual: NDArray[np.float32],
+    thread: int,
+    threads: int,
 ) -> None:
     """Fill owner, xi and residual; a thread writes its own points only."""
-    for block in prange((row.size + _BLOCK - 1) // _BLOCK):
+    for block in range(thread, (row.size + _BLOCK - 1) // _BLOCK, threads):
         for k in range(block * _BLOCK, min((block + 1) * _BLOCK, row.size)):
             e, s, t = _owner(elements, buckets, row[k], col[k])
             owner[k], xi[k, 0], xi[k, 1], residual[k] = e, s, t, np.nan

@@ -14,7 +14,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from modeharvest.imaging.mapping.affine import fill_affine
@@ -65,29 +64,29 @@ class Batch(NamedTuple):
     """Place among the pixels."""
 
 
-@compiled(parallel=True)
+@compiled()
 def rasterise(
     elements: ElementTable,
     fields: FloatArray,
     pixels: Pixels,
     start: IntArray,
     visits: IntArray,
-    order: IntArray,
-) -> int:
+    overlapping: IntArray,
+    thread: int,
+    threads: int,
+) -> None:
     """Fill ``pixels``, a whole image, and count those that lie inside more than one element.
 
     ``fields`` (m, c, 9) are polynomials over the elements; without any (c = 0) the values are
-    the local coordinates. The elements of band b are ``visits[start[b]:start[b + 1]]``;
-    ``order`` is that of the bands.
+    the local coordinates. The elements of band b are ``visits[start[b]:start[b + 1]]``, and the
+    pixels of it that were counted ``overlapping[b]``. A thread has bands from every part.
     """
     rows = pixels.element.size // pixels.cols
     everywhere = np.empty(0, dtype=np.bool_)
-    overlapping = 0
-    for i in prange(order.size):
-        top = order[i] * BAND
-        bottom, visited = min(top + BAND, rows), visits[start[order[i]] : start[order[i] + 1]]
-        overlapping += fill(elements, fields, pixels, everywhere, visited, top, bottom)
-    return overlapping
+    for band in range(thread, overlapping.size, threads):
+        top = band * BAND
+        bottom, visited = min(top + BAND, rows), visits[start[band] : start[band + 1]]
+        overlapping[band] = fill(elements, fields, pixels, everywhere, visited, top, bottom)
 
 
 @compiled()
@@ -293,20 +292,22 @@ def _write(
             out[where[k]] = value(a, not triangular, s[k], t[k])
 
 
-@compiled(parallel=True, relaxed=True)
+@compiled(relaxed=True)
 def evaluate(
     polynomials: FloatArray,
     curved: bool,
     element: NDArray[np.int32],
     xi: FloatArray,
     out: FloatArray,
+    thread: int,
+    threads: int,
 ) -> None:
     """Write a field's polynomials (m, c, 9) at located pixels to ``out`` (c, rows, cols).
 
     ``xi`` (rows, cols, 2) may lie in memory in any order.
     """
     cols = element.shape[1]
-    for row in prange(element.shape[0]):
+    for row in range(thread, element.shape[0], threads):
         begin = 0
         while begin < cols:
             e = element[row, begin]

@@ -24,12 +24,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-from numba import prange
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, PPoly
 
 from modeharvest.util.arrays import ComplexArray, FloatArray, IntArray
-from modeharvest.util.compiled import compiled
+from modeharvest.util.compiled import compiled, in_parallel
 
 DEGREE = 7
 _TAPS = DEGREE + 1
@@ -98,7 +97,7 @@ class PeriodicSpline:
         """Values at positions (row, col) [px], of the positions' shape; NaN where they are."""
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         out = np.empty(row.size)
-        _sample(self.table, row.ravel(), col.ravel(), out)
+        in_parallel(_sample, self.table, row.ravel(), col.ravel(), out)
         return out.reshape(row.shape)
 
     @property
@@ -150,9 +149,11 @@ def _weights() -> FloatArray:
     return np.ascontiguousarray(pieces.c[::-1, whole[::-1]])
 
 
-@compiled(parallel=True)
-def _sample(table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray) -> None:
-    for block in prange((out.size + BLOCK - 1) // BLOCK):
+@compiled()
+def _sample(
+    table: SplineTable, row: FloatArray, col: FloatArray, out: FloatArray, thread: int, threads: int
+) -> None:
+    for block in range(thread, (out.size + BLOCK - 1) // BLOCK, threads):
         first = block * BLOCK
         past = min(first + BLOCK, out.size)
         sample(table, row[first:past], col[first:past], out[first:past], workspace())

@@ -25,28 +25,41 @@ _PACKAGE = Path(__file__).parents[1]
 _kept = True
 
 
-def compiled(
-    *, parallel: bool = False, inline: bool = False, relaxed: bool = False
-) -> Callable[[F], F]:
+def compiled(*, inline: bool = False, relaxed: bool = False) -> Callable[[F], F]:
     """Compile a kernel at its first call; the machine code is cached on disk, if that is allowed.
 
-    ``parallel``: run the kernel's ``prange`` loops on numba's threads. ``inline``: put the code
-    into those that call it. ``relaxed``: let the compiler reorder sums and divide as numpy does; by
-    default floating-point arithmetic is strict, and division by zero an error.
+    ``inline``: put the code into those that call it. ``relaxed``: let the compiler reorder sums and
+    divide as numpy does; by default floating-point arithmetic is strict, and division by zero an
+    error.
     """
-    options: dict[str, Any] = {"parallel": parallel, "forceinline": inline, "nogil": True}
+    options: dict[str, Any] = {"forceinline": inline, "nogil": True}
     if relaxed:
         options |= {"fastmath": _RELAXED, "error_model": "numpy"}
 
     def decorate(kernel: F) -> F:
         global _kept
         try:
-            return cast(F, _stamped(numba.njit(kernel, cache=True, **options)))
+            return cast(F, _stamped(_for_types(numba.njit(kernel, cache=True, **options))))
         except RuntimeError:  # no folder for it can be written to
             _kept = False
-            return cast(F, numba.njit(kernel, **options))
+            return cast(F, _for_types(numba.njit(kernel, **options)))
 
     return decorate
+
+
+def _for_types(kernel: Any) -> Any:
+    """Have a kernel compiled once for a type, not also for a number that a calling kernel names.
+
+    Where the method of numba's that knows a caller's arguments is not found, it stays as it is.
+    """
+    template, of = getattr(kernel, "get_call_template", None), cast(Any, numba.types).unliteral
+    if template is not None:
+
+        def of_types(args: Any, kws: Any) -> Any:
+            return template([of(value) for value in args], {k: of(v) for k, v in kws.items()})
+
+        kernel.get_call_template = of_types
+    return kernel
 
 
 def _stamped(kernel: Any) -> Any:
@@ -122,8 +135,8 @@ def readable(values: NDArray[Any]) -> NDArray[Any]:
 def in_parallel(kernel: Callable[..., None], *arguments: Any) -> None:
     """Call ``kernel(*arguments, k, count)``, k = 0 ... count - 1, on as many threads as numba has.
 
-    For kernels that share out their work themselves, every count-th part to one thread. Those
-    with ``prange`` are simpler, and take three times as long to compile.
+    The kernels share out their work themselves, every count-th part to one thread: numba's own
+    ``prange`` takes three times as long to compile.
     """
     count = numba.get_num_threads()
     if count == 1:
