@@ -20,9 +20,8 @@ import numpy as np
 from refinement import refined_cell
 
 from modeharvest.fem.bloch.critical import critical_at, first_critical
-from modeharvest.fem.bloch.dispersion import ZONES
+from modeharvest.fem.bloch.dispersion import ZONES, zone_path
 from modeharvest.fem.bloch.eigen import BlochWaves, scan
-from modeharvest.fem.bloch.zone import zone_path
 from modeharvest.fem.lattice.bloch_map import factorise
 from modeharvest.fem.lattice.cell import CellPath, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell, hexagonal, square

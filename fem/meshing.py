@@ -314,15 +314,11 @@ def mesh_outlines(
 ) -> MeshBlock:
     """Mesh plane bodies bounded by smooth curves with T6 elements.
 
-    Parameters
-    ----------
-    parts
-        Of each body its loops, the outer one first, then those of holes. A loop is a sequence of
-        curves (k, 2) [any unit], each of which ends where the next one begins; between their ends
-        the curves are splines through their points.
-    size, edge_size
-        Edge length of the elements inside and along the loops [the same unit], growing from one to
-        the other over two elements; shorter ones where a loop is short.
+    parts : Of each body its loops, the outer one first, then those of holes. A loop is a sequence
+        of curves (k, 2) [any unit], each of which ends where the next one begins; between their
+        ends the curves are splines through their points.
+    size, edge_size : Edge length of the elements inside and along the loops [the same unit],
+        growing from one to the other over two elements; shorter ones where a loop is short.
     """
     grow = {"Mesh.MeshSizeExtendFromBoundary": 0, "Mesh.MeshSizeMax": size}
     with quiet_gmsh(), gmsh_options(grow):

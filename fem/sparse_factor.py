@@ -31,17 +31,11 @@ class Factor(Protocol):
 def factorise(matrix: csr_array, library: str | None = None) -> Factor:
     """Factorise a symmetric positive definite matrix, of sorted indices.
 
-    Parameters
-    ----------
+    ModuleNotFoundError if the library named isn't there. ArithmeticError if the matrix is singular,
+    here or in an update.
+
     matrix : (n, n), both triangles.
     library : a name among ``LIBRARIES``; by default the first one that is there.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If the library named isn't there.
-    ArithmeticError
-        If the matrix is singular, here or in an update.
     """
     for kind in LIBRARIES.values() if library is None else [LIBRARIES[library]]:
         try:

@@ -150,12 +150,9 @@ class Ansatz:
         their phases anchored at its holes: [1, 1, 1, -1, 1, 0, 0] in square stacking with an even
         number of holes both ways. The specimen's middle is the origin.
 
-        Parameters
-        ----------
-        fixed_mode
-            Keep the modes at the ideal pattern, for images without a pattern to find them from.
-        options
-            Degrees; the paper's by default.
+        fixed_mode : Keep the modes at the ideal pattern, for images without a pattern to find them
+            from.
+        options : Degrees; the paper's by default.
         """
         (a, b), (width, height) = specimen.cellular_half_size, specimen.half_size
         families = FAMILIES[specimen.stacking](specimen)
@@ -227,14 +224,10 @@ class Ansatz:
     def initial_guess(self, strain: float = 0.0, amplitude: float = 1.0) -> FloatArray:
         """Where a correlation begins, as in the paper.
 
-        Parameters
-        ----------
-        strain
-            Nominal compression along x [-], the shortening over the length of the cellular
-            part; v0x = -strain (x - centre), so that the ends of the cellular part move by half
-            the shortening. Positive in compression.
-        amplitude
-            The constant that every v_i starts with [mm]; not zero, because the modes would
+        strain : Nominal compression along x [-], the shortening over the length of the cellular
+            part; v0x = -strain (x - centre), so that the ends of the cellular part move by half the
+            shortening. Positive in compression.
+        amplitude : The constant that every v_i starts with [mm]; not zero, because the modes would
             not be observable. 1 mm with max ||phi|| = 0.04 is a pattern of 40 um.
         """
         a = np.zeros(self.size)
@@ -273,10 +266,7 @@ class Ansatz:
     def displacement(self, a: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """(..., 2): the whole displacement [mm] at unknowns ``a`` (size,).
 
-        Parameters
-        ----------
-        x, y
-            Two axes [mm], one-dimensional both (``grid.x`` and ``grid.y``), which give an array
+        x, y : Two axes [mm], one-dimensional both (``grid.x`` and ``grid.y``), which give an array
             (len(y), len(x), 2) fast; or arrays of any other shapes that broadcast together.
         """
         total = self.v0(a, x, y)

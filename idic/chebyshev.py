@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 
 from modeharvest.util.arrays import FloatArray
@@ -81,13 +82,8 @@ def orders(degree: int) -> tuple[tuple[int, int], ...]:
 def chebyshev(t: ArrayLike, degree: int) -> FloatArray:
     """T_0(t) ... T_degree(t), stacked along a new first axis."""
     t = np.asarray(t, dtype=np.float64)
-    values = np.empty((degree + 1, *t.shape))
-    values[0] = 1.0
-    if degree > 0:
-        values[1] = t
-    for k in range(2, degree + 1):
-        values[k] = 2.0 * t * values[k - 1] - values[k - 2]
-    return values
+    values = chebvander(t, degree).reshape(*t.shape, degree + 1)
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
 
 
 @dataclass(frozen=True)

@@ -261,6 +261,10 @@ def free_family(waves: ArrayLike, name: str = "free") -> ModeFamily:
     )
 
 
+_LARGEST = 0.04
+"""Of ||phi|| [-]."""
+
+
 @dataclass(frozen=True, eq=False)
 class FourierMode:
     """A mode phi: a family, its length, its scale and its support."""
@@ -281,13 +285,11 @@ class FourierMode:
             )
 
     @classmethod
-    def scaled(
-        cls, family: ModeFamily, half_wavelength: float, taper: Taper, maximum: float = 0.04
-    ) -> FourierMode:
-        """Choose the scale that makes max ||phi|| = ``maximum`` [-] at the family's start.
+    def scaled(cls, family: ModeFamily, half_wavelength: float, taper: Taper) -> FourierMode:
+        """Choose the scale that makes max ||phi|| the paper's 0.04 [-] at the family's start.
 
-        The paper's maximum is 0.04, ``half_wavelength`` is l [mm], ``taper`` the mode's support.
-        Raises InputError if the start gives a mode that is zero.
+        ``half_wavelength`` is l [mm], ``taper`` the mode's support. Raises InputError if the start
+        gives a mode that is zero.
         """
         unit = cls(family, half_wavelength, 1.0, taper)
         # Twelve wavelengths at k = 1, sampled at 1/32 of one, hold the maximum of any family
@@ -298,7 +300,7 @@ class FourierMode:
         largest = float(np.sqrt((phi**2).sum(axis=-1).max()))
         if not largest > 0:
             raise InputError(f"mode family {family.name!r}: the start gives a mode that is zero")
-        return cls(family, half_wavelength, maximum / largest, taper)
+        return cls(family, half_wavelength, _LARGEST / largest, taper)
 
     def phases(self, parameters: ArrayLike, x: FloatArray, y: FloatArray) -> FloatArray:
         """(w, ...): theta_w [rad] at positions [mm] that broadcast together."""

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.imaging.grid import PixelGrid
-from modeharvest.imaging.photographs.files import require_contrast
+from modeharvest.imaging.photographs.files import require_visible
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.util.compiled import readable
 from modeharvest.util.errors import InputError
@@ -157,7 +157,7 @@ class ImagePair:
             mask = checked_mask(getattr(self, name), name.replace("_", " "), self.grid)
             object.__setattr__(self, name, mask)
         for grey, what in zip(self.grey, ("reference", "deformed"), strict=True):
-            require_contrast(grey, what)
+            require_visible(grey, f"in the {what} image")
 
     @property
     def grey(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -219,33 +219,17 @@ def _add(
     threads: int,
 ) -> None:
     """``place`` (m, 2, 9): where in the pattern, (row, col) [px], the elements' points are."""
-    for band in range(thread, start.size - 1, threads):
-        visited = visits[start[band] : start[band + 1]]
-        _add_band(elements, place, pattern, background, visited, band, weight, selected, total)
-
-
-@compiled()
-def _add_band(
-    elements: ElementTable,
-    place: FloatArray,
-    pattern: SplineTable,
-    background: float,
-    visited: IntArray,
-    band: int,
-    weight: float,
-    selected: BoolArray,
-    total: FloatArray,
-) -> None:
     rows, cols = total.shape
-    top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
-    sums = total[top:bottom].ravel()
-    if not selected[top:bottom].any():
-        return
-    grey = _render_pixels(
-        elements, place, pattern, background, selected.ravel(), visited, top, bottom, cols
-    )
-    for k in range(grey.size):  # of others, too: what they get is not looked at
-        sums[k] += weight * grey[k]
+    for band in range(thread, start.size - 1, threads):
+        top, bottom = band * _BAND, min((band + 1) * _BAND, rows)
+        if not selected[top:bottom].any():
+            continue
+        visited, sums = visits[start[band] : start[band + 1]], total[top:bottom].ravel()
+        grey = _render_pixels(
+            elements, place, pattern, background, selected.ravel(), visited, top, bottom, cols
+        )
+        for k in range(grey.size):  # of others, too: what they get is not looked at
+            sums[k] += weight * grey[k]
 
 
 @compiled()

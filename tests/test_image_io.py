@@ -128,7 +128,7 @@ def test_not_finite(tmp_path: Path, value: float) -> None:
 
 def test_constant_image(tmp_path: Path) -> None:
     write_image(tmp_path / "a.tif", np.full((5, 5), 51, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"got 0\.2 in every pixel") as error:
+    with pytest.raises(InputError, match=r"got the constant grey level 0\.2") as error:
         read_image(tmp_path / "a.tif")
     refusal(error)
 

@@ -42,8 +42,8 @@ def test_images_are_kept_as_read_only_float32() -> None:
     [
         ({"deformed": F[:-1]}, "expected a deformed image of 12 x 10 px like the grid"),
         ({"reference": np.where(F[3, 4] == F, np.nan, F)}, "finite grey levels in the reference"),
-        ({"deformed": 0 * F}, "speckle in the deformed image, got the constant grey level 0"),
-        ({"reference": np.where(LEFT, 7, F)}, "speckle in the reference image"),
+        ({"deformed": 0 * F}, "contrast in the deformed image, got the constant grey level 0"),
+        ({"reference": np.where(LEFT, 7, F)}, "contrast in the reference image"),
         ({"mask": LEFT[:, 1:]}, "expected a mask of 12 x 10 px like the images"),
         ({"deformed_mask": LEFT & False}, "expected material in the deformed mask"),
     ],

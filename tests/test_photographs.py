@@ -224,7 +224,7 @@ def test_deep_colour_that_would_lose_bits_is_refused(tmp_path: Path) -> None:
 
 def test_constant_and_nan_images_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "flat.tif", np.full((9, 9), 7, dtype=np.uint8))
-    with pytest.raises(InputError, match="got 7 in every pixel"):
+    with pytest.raises(InputError, match="got the constant grey level 7"):
         read_photograph(tmp_path / "flat.tif")
     holed = speckle().astype(np.float32)
     holed[3, 4] = np.nan

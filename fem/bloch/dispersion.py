@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -151,7 +152,6 @@ def dispersion(
     count, bands : number of wave vectors, corners included, and of eigenvalues at each.
     """
     from modeharvest.fem.bloch.eigen import BlochWaves
-    from modeharvest.fem.bloch.zone import zone_path
 
     corners = [(label, wave_of(wave)) for label, wave in corners]
     if bands < 1 or not len(loads):
@@ -166,6 +166,32 @@ def dispersion(
     labels = tuple(label for label, _ in corners)
     arrays = (np.array(points), distances, np.array(loads, dtype=np.float64), np.array(values))
     return Dispersion(labels, tuple(stops), *arrays)
+
+
+def zone_path(
+    corners: Sequence[tuple[str, Wave]], lattice: FloatArray, count: int
+) -> tuple[list[Wave], list[int]]:
+    """``count`` wave vectors through the corners of a zone, about evenly spaced.
+
+    ``corners`` are names and phases [rad], such as ``ZONES["square"]``, ``lattice`` (2, 2) the
+    vectors as rows [mm]. Returns phases [rad], and the places of the corners among them. An
+    InputError refuses fewer than two corners, or fewer points than corners.
+    """
+    if len(corners) < 2 or count < len(corners):
+        what = "two corners or more and at least as many points"
+        raise InputError(f"zone path: expected {what}, got {len(corners)} and {count}")
+    ends = np.array([wave_of(wave) for _, wave in corners])
+    vectors = ends @ np.linalg.inv(lattice).T
+    lengths = np.linalg.norm(np.diff(vectors, axis=0), axis=1)
+    reached = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    spare = count - len(corners)
+    stops = [round(float(r) * spare) + k for k, r in enumerate(reached)]
+    points: list[Wave] = []
+    for (a, b), (start, stop) in zip(pairwise(ends), pairwise(stops), strict=True):
+        steps = np.arange(stop - start) / (stop - start)
+        points += [(float(p[0]), float(p[1])) for p in a + steps[:, None] * (b - a)]
+    points.append((float(ends[-1, 0]), float(ends[-1, 1])))
+    return points, stops
 
 
 def zone_map(

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from modeharvest.fem.bloch.critical import is_same
 from modeharvest.fem.bloch.eigen import BlochModes, BlochWaves
 from modeharvest.fem.bloch.modes import ModeSet
-from modeharvest.fem.bloch.zone import is_same
 from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 from modeharvest.fem.lattice.cells import UnitCell
 from modeharvest.fem.lattice.options import Wave, wave_of

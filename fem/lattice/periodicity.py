@@ -20,6 +20,7 @@ from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
+_SAME_PLACE = 1e-6  # of the shorter lattice vector: largest distance of partners
 # Neighbours that can touch a cell whose outline reaches no further than two cells.
 _NEIGHBOURS = [r for r in product(range(-2, 3), repeat=2) if r != (0, 0)]
 
@@ -43,11 +44,10 @@ class Periodicity:
         return int(self.master.max()) + 1
 
 
-def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -> Periodicity:
+def find_periodicity(mesh: Mesh, lattice: FloatArray) -> Periodicity:
     """Pair the nodes of a T6 mesh that a lattice translation carries into each other.
 
-    ``lattice`` are its vectors a1 and a2 as rows (2, 2) [mm], ``tolerance`` is the largest distance
-    of partners as a share of the shorter one [-].
+    ``lattice`` are its vectors a1 and a2 as rows (2, 2) [mm].
 
     An InputError refuses parallel vectors, and copies of the cell that overlap, touch without
     common nodes, or aren't connected along both vectors; it names the nodes.
@@ -62,7 +62,7 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray, tolerance: float = 1e-6) -
             "periodic cell: expected two lattice vectors that are not parallel, as rows [mm], "
             f"got {lattice.tolist()}"
         )
-    distance = tolerance * float(lengths.min())
+    distance = _SAME_PLACE * float(lengths.min())
     pairs = _pairs(mesh.nodes, lattice, distance)
     sides = boundary_sides(mesh)
     _refuse_overlap(mesh, lattice, np.unique(sides))
@@ -171,10 +171,10 @@ def _pieces(cells: IntArray, count: int) -> IntArray:
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _named(numbers: IntArray, nodes: FloatArray, most: int = 4) -> str:
+def _named(numbers: IntArray, nodes: FloatArray) -> str:
     """'3 nodes: 5 at (0, 1.2) mm, ...' for a message."""
-    places = (f"{k} at ({nodes[k, 0]:.5g}, {nodes[k, 1]:.5g}) mm" for k in numbers[:most])
-    more = ", ..." if len(numbers) > most else ""
+    places = (f"{k} at ({nodes[k, 0]:.5g}, {nodes[k, 1]:.5g}) mm" for k in numbers[:4])
+    more = ", ..." if len(numbers) > 4 else ""
     return f"{len(numbers)} nodes: {', '.join(places)}{more}"
 
 

@@ -188,37 +188,21 @@ def read_field(
 ) -> LocalField:
     """Read a displacement field of any DIC code.
 
-    Parameters
-    ----------
-    path
-        CSV, TXT, NPZ, HDF5 or MAT with x, y, u and v: points (n,), grids (rows, cols), or x
+    The file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC and DICe
+    mark failure) are kept as not valid. ``sigma`` in pixels is taken for the standard deviation of
+    both components. InputError if a column, the units or the axis are not known, or if shapes
+    don't agree.
+
+    path : CSV, TXT, NPZ, HDF5 or MAT with x, y, u and v: points (n,), grids (rows, cols), or x
         (cols,) and y (rows,) as axes of grids u and v.
-    grid
-        Pixels to millimetres, needed if anything is in pixels.
-    units
-        "px" or "mm", of positions and displacements; None: as the columns' names state.
-    displacement_units
-        Of u and v, if they are not those of x and y.
-    y_axis
-        "up" or "down": where y grows and v is positive; None: as the columns' names state. In
+    grid : Pixels to millimetres, needed if anything is in pixels.
+    units : "px" or "mm", of positions and displacements; None: as the columns' names state.
+    displacement_units : Of u and v, if they are not those of x and y.
+    y_axis : "up" or "down": where y grows and v is positive; None: as the columns' names state. In
         pixels, "up" counts from the lowest row.
-    first_pixel
-        What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
-    columns
-        Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma" and
-        "valid", where they can't be known by themselves.
-
-    Returns
-    -------
-    LocalField
-        With the file's points that are NaN, have ``valid`` zero or a negative ``sigma`` (as VIC
-        and DICe mark failure) kept as not valid. ``sigma`` in pixels is taken for the standard
-        deviation of both components.
-
-    Raises
-    ------
-    InputError
-        If a column, the units or the axis are not known, or shapes don't agree.
+    first_pixel : What the code calls the first pixel's centre, 0 or (as MATLAB) 1.
+    columns : Names, or numbers from 1, of columns for "x", "y", "u", "v", "sd_u", "sd_v", "sigma"
+        and "valid", where they can't be known by themselves.
     """
     table = read_table(path)
     chosen = choose(list(table), columns or {}, units, str(path))

@@ -270,19 +270,11 @@ def choose(
 ) -> dict[str, Column]:
     """Decide which of a file's columns plays which role.
 
-    Parameters
-    ----------
-    given
-        Names, or numbers from 1, of roles that the user knows.
-    units
-        "px" or "mm", to choose between a field in pixels and one in millimetres; or None.
-    where
-        The file, for messages.
+    InputError if a column is missing, or several could be meant.
 
-    Raises
-    ------
-    InputError
-        If a column is missing, or several could be meant.
+    given : Names, or numbers from 1, of roles that the user knows.
+    units : "px" or "mm", to choose between a field in pixels and one in millimetres; or None.
+    where : The file, for messages.
     """
     columns = [column(name) for name in names]
     chosen: dict[str, Column] = {}

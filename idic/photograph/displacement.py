@@ -68,22 +68,13 @@ def photographed_displacement(
 ) -> NodalResult:
     """Measure the displacement of a photograph on a mesh, from the images alone.
 
-    Parameters
-    ----------
-    pair
-        Reference and deformed image, the mask of the reference. Their brightness may differ.
-    mesh
-        Of the material, T6.
-    before
-        What was found in the image before, on the same mesh.
-    names
-        Of the two images, for messages.
+    InputError if the images don't show the same surface, or don't overlap; and as for
+    :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
 
-    Raises
-    ------
-    InputError
-        If the images don't show the same surface, or don't overlap; and as for
-        :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
+    pair : Reference and deformed image, the mask of the reference. Their brightness may differ.
+    mesh : Of the material, T6.
+    before : What was found in the image before, on the same mesh.
+    names : Of the two images, for messages.
     """
     start = block_motion(pair, mesh, before, names)
     return displacement_from(start, pair, mesh, progress=progress)

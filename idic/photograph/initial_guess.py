@@ -121,27 +121,15 @@ def initial_guess(
 ) -> InitialGuess:
     """Find ansatz and initial guess for a pair of images.
 
-    Parameters
-    ----------
-    cell_size
-        l, the distance of neighbouring holes [mm].
-    cellular
-        The part with holes [mm]; or several parts, each with modes of its own.
-    local
-        A displacement field of a local DIC; the grey levels are not looked at then.
-    holes
-        Displacements of the holes' centres.
-    lattice
-        (2, 2) vectors of the lattice of holes as rows [mm]; by default square, along x and y.
-    domain
-        Of the Chebyshev polynomials [mm]; by default the material's bounding box.
-    options
-        Degrees; the paper's by default.
+    InputError if the holes or the spectrum contradict the cell size.
 
-    Raises
-    ------
-    InputError
-        If the holes or the spectrum contradict the cell size.
+    cell_size : l, the distance of neighbouring holes [mm].
+    cellular : The part with holes [mm]; or several parts, each with modes of its own.
+    local : A displacement field of a local DIC; the grey levels are not looked at then.
+    holes : Displacements of the holes' centres.
+    lattice : (2, 2) vectors of the lattice of holes as rows [mm]; by default square, along x and y.
+    domain : Of the Chebyshev polynomials [mm]; by default the material's bounding box.
+    options : Degrees; the paper's by default.
     """
     options = options or AnsatzOptions()
     boxes = (cellular,) if isinstance(cellular, Box) else tuple(cellular)

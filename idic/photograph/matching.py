@@ -206,21 +206,13 @@ def match_blocks(
 ) -> BlockMatch:
     """Look for blocks of the reference in the deformed image, (rows, cols) both.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
-    expected
-        Where positions should have moved to, as ``HoleMotion.at`` gives it; nowhere by default.
-    reach_px
-        How far from there a block is searched for, along rows and columns [px].
-    count
-        About how many blocks an image would hold.
+    InputError if the images' sizes differ or there is no room for blocks.
 
-    Raises
-    ------
-    InputError
-        If the images' sizes differ or there is no room for blocks.
+    mask : (rows, cols) True on material of the reference; blocks lie in it. Everywhere by default.
+    expected : Where positions should have moved to, as ``HoleMotion.at`` gives it; nowhere by
+        default.
+    reach_px : How far from there a block is searched for, along rows and columns [px].
+    count : About how many blocks an image would hold.
     """
     f, g = (np.asarray(image, dtype=np.float32) for image in (reference, deformed))
     if f.ndim != 2 or f.shape != g.shape:

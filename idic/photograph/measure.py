@@ -106,23 +106,15 @@ def measure(
 ) -> MeasuredPhotograph:
     """Find ansatz and initial guess, and correlate.
 
-    Parameters
-    ----------
-    cell_size
-        l [mm].
-    how
-        The ansatz and how to correlate.
-    local
-        A local DIC's field.
-    before
-        What came out of the photograph before. If it shows all waves that are observed now, its
-        ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
-        found anew.
+    InputError if the two images don't show the same surface, or the spectrum contradicts the cell
+    size.
 
-    Raises
-    ------
-    InputError
-        If the two images don't show the same surface, or the spectrum contradicts the cell size.
+    cell_size : l [mm].
+    how : The ansatz and how to correlate.
+    local : A local DIC's field.
+    before : What came out of the photograph before. If it shows all waves that are observed now,
+        its ansatz is kept and its unknowns are the initial guess; if that doesn't converge, one is
+        found anew.
     """
     motion, matching = matched_holes(pair, geometry)
     holes = None if motion is None else motion.in_mm(geometry.grid)

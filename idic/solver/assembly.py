@@ -154,20 +154,13 @@ class Assembly:
 
         With brightness among the unknowns r = f - (1 + b) g(x + u) - c.
 
-        Parameters
-        ----------
-        a, reference, deformed
-            (size,) unknowns, f (rows, cols) in float32 or float64, and g.
-        with_matrix
-            Without the matrix the pass costs about half as much.
-        instrument
-            (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along x and y
-            [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h being
-            its products with the derivatives of the displacement and of the gain.
-        share
-            How much of h is the instrument; the rest is g's own [-].
-        runs
-            Of the pixels those that count; by default all.
+        a, reference, deformed : (size,) unknowns, f (rows, cols) in float32 or float64, and g.
+        with_matrix : Without the matrix the pass costs about half as much.
+        instrument : (3, rows, cols) what stands for (1 + b) times the gradient of g at x + u, along
+            x and y [grey levels/mm], and for g there; matrix and gradient are h'h and -h'r then, h
+            being its products with the derivatives of the displacement and of the gain.
+        share : How much of h is the instrument; the rest is g's own [-].
+        runs : Of the pixels those that count; by default all.
         """
         target = Target.images(reference, deformed, self.grid, instrument, share)
         return self._assemble(a, target, with_matrix, runs or self.runs)

@@ -160,24 +160,15 @@ def minimise(
 ) -> Minimum:
     """Minimise 1/2 sum r^2.
 
-    Parameters
-    ----------
-    evaluate
-        The normal equations at some unknowns, and whether with the matrix.
-    step_length
-        Rms difference of the displacement between two sets of unknowns [px].
-    start
-        (n,) unknowns.
-    options
-        When to stop.
-    factor
-        Binning.
-    on_iteration
-        Called with the number of each finished iteration.
-    curvature
-        (n, n) what to begin with in place of J'J, if something is known already.
-    eigenvalue_cutoff
-        Directions with an eigenvalue below this share of the largest one get no step [-].
+    evaluate : The normal equations at some unknowns, and whether with the matrix.
+    step_length : Rms difference of the displacement between two sets of unknowns [px].
+    start : (n,) unknowns.
+    options : When to stop.
+    factor : Binning.
+    on_iteration : Called with the number of each finished iteration.
+    curvature : (n, n) what to begin with in place of J'J, if something is known already.
+    eigenvalue_cutoff : Directions with an eigenvalue below this share of the largest one get no
+        step [-].
     """
     is_assembled = curvature is None
     here = evaluate(start, is_assembled)

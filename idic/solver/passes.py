@@ -288,19 +288,12 @@ def accumulate(
 ) -> None:  # fmt: skip
     """Sum the moments of pairs of base fields over the pixels of some bands of rows.
 
-    Parameters
-    ----------
-    target, runs, tables
-        :class:`Target`, :class:`Runs` and :class:`Tables`.
-    pairs
-        (pairs, 3): numbers of two base fields and the sum of their degrees.
-    fields
-        Number of base fields.
-    moments, left
-        (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how many pixels are
-        mapped outside the image; both zero on entry.
-    first, every
-        The bands to look at: each ``every``-th from ``first`` on.
+    target, runs, tables : :class:`Target`, :class:`Runs` and :class:`Tables`.
+    pairs : (pairs, 3): numbers of two base fields and the sum of their degrees.
+    fields : Number of base fields.
+    moments, left : (bands, pairs, K + 1, K + 1) sums of each band of rows, and (bands,) how many
+        pixels are mapped outside the image; both zero on entry.
+    first, every : The bands to look at: each ``every``-th from ``first`` on.
     """
     rows, bands = runs.row_start.size - 1, moments.shape[0]
     for band in range(first, bands, every):

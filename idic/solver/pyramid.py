@@ -154,15 +154,10 @@ def level_pair(
 
     Holes are kept out of the blur only if both masks are known: they have to look alike in both.
 
-    Parameters
-    ----------
-    edge_px
-        Pixels closer than this to the mask's edge are left out on the finest level [px].
-    order
-        Of the spline: 3, 5 or 11.
-    normalised
-        Give both images a local mean of 0 and a local contrast of 1, so that differences of
-        brightness that vary slowly are gone; for blurred levels only.
+    edge_px : Pixels closer than this to the mask's edge are left out on the finest level [px].
+    order : Of the spline: 3, 5 or 11.
+    normalised : Give both images a local mean of 0 and a local contrast of 1, so that differences
+        of brightness that vary slowly are gone; for blurred levels only.
     """
     grid, f_weight = pair.grid, pair.mask if pair.deformed_mask is not None else None
     is_finest = level == FULL

@@ -127,15 +127,10 @@ class ResidualTest:
     ) -> ResidualTest:
         """Test a residual of rms [grey levels], :func:`autocorrelation` and number of pixels.
 
-        Parameters
-        ----------
-        unknowns
-            Number of fitted unknowns.
-        noise_sd
-            Standard deviation of the residual that the images' noise predicts [grey levels], if
-            known (:meth:`modeharvest.idic.result.Result.residual_noise`); InputError if not > 0.
-        lags_px
-            Where the autocorrelation was taken.
+        unknowns : Number of fitted unknowns.
+        noise_sd : Standard deviation of the residual that the images' noise predicts [grey levels],
+            if known (:meth:`modeharvest.idic.result.Result.residual_noise`); InputError if not > 0.
+        lags_px : Where the autocorrelation was taken.
         """
         if noise_sd is None:
             return cls(correlation, pixels, lags_px=lags_px)

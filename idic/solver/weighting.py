@@ -130,17 +130,16 @@ class Weighting:
         )
 
 
-def best_blur(noise: float, size_px: float, order: int = 5, worth: float = WORTH_IT) -> float:
+def best_blur(noise: float, size_px: float, order: int = 5) -> float:
     """Blur of the gradient's image for the least variance of the unknowns [px]; 0 for none.
 
     ``noise`` and ``order`` as for :meth:`Weighting.excess`, the speckle's autocorrelation having a
-    full width at half maximum of ``size_px``; a blur has to spare the share ``worth`` of the
-    variance at least [-].
+    full width at half maximum of ``size_px``; a blur has to spare :data:`WORTH_IT` of the variance.
     """
     candidates = [Weighting(Gradient.REFERENCE, blur, size_px) for blur in (0.0, *_BLURS_PX)]
     excess = [weighting.excess(noise, order) for weighting in candidates]
     best = int(np.argmin(excess))
-    return candidates[best].blur_px if excess[0] - excess[best] > worth else 0.0
+    return candidates[best].blur_px if excess[0] - excess[best] > WORTH_IT else 0.0
 
 
 LEAST_BLUR_PX = 0.6
@@ -241,20 +240,13 @@ def root(
 ) -> Minimum:
     """Find the root, from a least-squares minimum.
 
-    Parameters
-    ----------
-    evaluate
-        -h'r at some unknowns, as the gradient of normal equations.
-    curvature
-        (n, n) A = h'J.
-    step_length, options, on_iteration
-        As for :func:`~modeharvest.idic.solver.gauss_newton.minimise`.
+    Returned with the minimum's own matrix J'J, and these steps alone; converged. If they don't
+    settle, the minimum itself with the outcome UNWEIGHTED.
 
-    Returns
-    -------
-    Minimum
-        With the minimum's own matrix J'J, and these steps alone; converged. If they don't settle,
-        the minimum itself with the outcome UNWEIGHTED.
+    evaluate : -h'r at some unknowns, as the gradient of normal equations.
+    curvature : (n, n) A = h'J.
+    step_length, options, on_iteration : As for
+        :func:`~modeharvest.idic.solver.gauss_newton.minimise`.
     """
     a, history = found.unknowns, list[Iteration]()
     here = evaluate(a)

@@ -202,24 +202,15 @@ def lattice_spectrum(
 ) -> LatticeSpectrum:
     """Fourier coefficients of a periodic field, exact for its shape functions to about 1e-8.
 
-    Parameters
-    ----------
-    mesh
-        One cell of the lattice, of any outline that tiles the plane [mm].
-    lattice
-        (2, 2) lattice vectors as rows [mm]; they need not be at right angles.
-    values
-        (n, 2) field at the nodes, periodic: the affine part is already removed [mm].
-    pitch
-        l [mm], which makes the wave vectors dimensionless.
-    reach
-        Largest |ξ| [1/l].
+    InputError if the field has another shape than the nodes, is not finite, not periodic, or
+    nothing but a translation; if the mesh is larger than the cell; if pitch or reach aren't
+    positive.
 
-    Raises
-    ------
-    InputError
-        If the field has another shape than the nodes, is not finite, not periodic, or nothing but a
-        translation; if the mesh is larger than the cell; if pitch or reach aren't positive.
+    mesh : One cell of the lattice, of any outline that tiles the plane [mm].
+    lattice : (2, 2) lattice vectors as rows [mm]; they need not be at right angles.
+    values : (n, 2) field at the nodes, periodic: the affine part is already removed [mm].
+    pitch : l [mm], which makes the wave vectors dimensionless.
+    reach : Largest |ξ| [1/l].
     """
     u, vectors = _checked_field(mesh, lattice, values, pitch)
     if not 0 < reach < np.inf:

@@ -145,16 +145,12 @@ def mode_family(
 ) -> FoundFamily:
     """Find the truncated Fourier series of a periodic field, and make it a family.
 
-    Parameters
-    ----------
-    mesh, lattice, values, pitch
-        As for :func:`~modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum` [any unit].
-    shared
-        Look for constraints; otherwise every wave has five parameters of its own (but one).
-    growth
-        Least share of the energy that a further star of waves must add [-]; larger for fewer waves.
-    info
-        To keep with the family.
+    mesh, lattice, values, pitch : As for
+        :func:`~modeharvest.idic.spectra.lattice_spectrum.lattice_spectrum` [any unit].
+    shared : Look for constraints; otherwise every wave has five parameters of its own (but one).
+    growth : Least share of the energy that a further star of waves must add [-]; larger for fewer
+        waves.
+    info : To keep with the family.
     """
     spectrum = lattice_spectrum(mesh, lattice, values, pitch)
     rule = MeshQuadrature(mesh, points_for(mesh, 6.0 * np.pi / pitch))

@@ -102,23 +102,14 @@ def spectral_density(
 ) -> Spectrum:
     """Transform a displacement field (rows, cols, 2) [mm], along x and y (up), given at pixels.
 
-    Parameters
-    ----------
-    mask
-        (rows, cols) True where there is material; elsewhere the displacement doesn't matter.
-    pitch
-        Unit cell size l [mm].
-    bins_per_cell
-        Pixels are averaged in blocks of at most l / ``bins_per_cell``. At the pattern's wave
-        vectors this lowers û by (π/2/24)²/6 = 0.07 % per direction.
-    padding
-        The bounding box of the material is padded with zeros to this many times its size, for the
-        resolution of ξ; no information is added.
+    InputError if shapes differ, the mask is all black, or the displacement is not finite in it.
 
-    Raises
-    ------
-    InputError
-        If shapes differ, the mask is all black, or the displacement is not finite in it.
+    mask : (rows, cols) True where there is material; elsewhere the displacement doesn't matter.
+    pitch : Unit cell size l [mm].
+    bins_per_cell : Pixels are averaged in blocks of at most l / ``bins_per_cell``. At the pattern's
+        wave vectors this lowers û by (π/2/24)²/6 = 0.07 % per direction.
+    padding : The bounding box of the material is padded with zeros to this many times its size, for
+        the resolution of ξ; no information is added.
     """
     _check(displacement, grid, mask, pitch)
     part = find_objects(mask.astype(np.uint8))[0]

@@ -87,9 +87,9 @@ class PlaneWave:
         return np.array([*self.amplitude, *self.k, self.phase])
 
 
-def find_peaks(spectrum: Spectrum, xi_max: float = 1.0) -> list[Peak]:
+def find_peaks(spectrum: Spectrum) -> list[Peak]:
     """All maxima of S_xx + S_yy outside the edges' lines, or clear ones on a line, by size."""
-    xi1, xi2, S_xx, S_yy = spectrum.window(xi_max)
+    xi1, xi2, S_xx, S_yy = spectrum.window(1.0)
     S = S_xx + S_yy
     lobes = [spectrum.pitch / size for size in spectrum.extent]
     on1, on2 = (

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from modeharvest.imaging.distortion.lens import Distortion, PolynomialDistortion
-from modeharvest.imaging.photographs.files import require_contrast
+from modeharvest.imaging.photographs.files import require_visible
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.util.arrays import FloatArray, FloatImage
 from modeharvest.util.errors import InputError
@@ -125,9 +125,7 @@ def checked_images(images: Sequence[ArrayLike], names: Sequence[str]) -> list[Fl
                 "expected images of one size, at least 64 x 64 px, got "
                 f"{found[0].shape} for the {names[0]} one and {image.shape} for the {name} one"
             )
-        if not np.isfinite(image).all():
-            raise InputError(f"expected finite grey levels in the {name} image")
-        require_contrast(image, name)
+        require_visible(image, f"in the {name} image")
     return found
 
 

@@ -25,14 +25,6 @@ from modeharvest.util.arrays import BoolArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, reading, require_plausible
 
-
-def require_contrast(grey: NDArray[Any], what: str) -> None:
-    """Raise InputError for a blank image."""
-    if grey.min() == grey.max():
-        got = f"the constant grey level {grey.flat[0]}"
-        raise InputError(f"expected a speckle in the {what} image, got {got}")
-
-
 LUMA = (0.2125, 0.7154, 0.0721)
 """Weights of red, green and blue in a grey level."""
 _TIFF = {".tif", ".tiff"}
@@ -98,17 +90,20 @@ def require_grey_levels(levels: NDArray[Any], path: Path | str) -> None:
         raise InputError(f"expected {what}, got {levels.dtype}; convert it to one of them")
 
 
-def require_visible(image: NDArray[Any], path: Path | str) -> None:
-    """Raise InputError for an image (rows, cols) with NaN or infinity, or of one level."""
-    count = int(np.count_nonzero(~np.isfinite(image)))
+def require_visible(grey: NDArray[Any], where: str) -> None:
+    """Raise InputError for grey levels with NaN or infinity, or all equal.
+
+    ``where`` they are: "at PATH", "in the reference image".
+    """
+    count = int(np.count_nonzero(~np.isfinite(grey)))
     if count:
         raise InputError(
-            f"expected finite grey levels at {path}, got {count} NaN or infinite px; "
+            f"expected finite grey levels {where}, got {count} NaN or infinite px; "
             "replace them and exclude them by a mask"
         )
-    if image.min() == image.max():
-        got = f"{image.flat[0]:g} in every pixel"
-        raise InputError(f"expected an image with contrast at {path}, got {got}")
+    if grey.min() == grey.max():
+        got = f"the constant grey level {grey.flat[0]:g}"
+        raise InputError(f"expected an image with contrast {where}, got {got}")
 
 
 def _read_tiff(path: Path, single: bool) -> StoredImage:
@@ -227,7 +222,7 @@ def read_image(path: Path | str) -> NDArray[np.float32]:
     stored = read_stored(Path(path), single=True)
     require_grey_levels(stored.levels, path)
     image = np.asarray(stored.grey, dtype=np.float32)
-    require_visible(image, path)
+    require_visible(image, f"at {path}")
     return image
 
 

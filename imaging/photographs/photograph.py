@@ -77,7 +77,7 @@ def read_photograph(path: Path | str) -> Photograph:
     if levels.ndim == 3 and (levels == levels[..., :1]).all():  # grey, stored as colour
         levels = levels[..., 0]
     image = np.ascontiguousarray(files.luma(levels.astype(np.float32)))
-    files.require_visible(image, path)
+    files.require_visible(image, f"at {path}")
     bits, full_scale = _scale(levels)
     saturated, black = _cut_off(levels, full_scale)
     notes = list(stored.notes)

@@ -2,7 +2,7 @@
 
 ``critical.json`` holds ``point``, the fields of
 :class:`modeharvest.runs.lattice.results.CriticalPoint`, and ``history``: for each load looked at
-the least stable wave (see ``fem.bloch.zone.LeastStable``).
+the least stable wave (see ``fem.bloch.critical.LeastStable``).
 """
 
 from __future__ import annotations
