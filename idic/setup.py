@@ -11,7 +11,7 @@ from modeharvest.idic.solver.pyramid import COARSE_TO_FINE, Level
 from modeharvest.idic.solver.weighting import Gradient
 from modeharvest.imaging.spline import ORDERS
 from modeharvest.util.errors import InputError
-from modeharvest.util.typed import nearest
+from modeharvest.util.typed import nearest, picked
 
 _WIDEST_PX = 100
 
@@ -134,12 +134,7 @@ class SquareLatticeOptions(AnsatzOptions):
 
     def options(self) -> CorrelationOptions:
         """How to correlate."""
-        return CorrelationOptions(
-            edge_px=self.edge_px,
-            order=self.order,
-            gradient=self.gradient,
-            gradient_blur_px=self.gradient_blur_px,
-        )
+        return CorrelationOptions(**picked(self, "edge_px order gradient gradient_blur_px"))
 
     def ansatz(self, specimen: Specimen) -> Ansatz:
         """The ansatz with the modes of a specimen's hole lattice."""

@@ -159,18 +159,11 @@ def _filter_rows(
 def _pad_mirrored(padded: NDArray[Any], pad: int) -> None:
     """Fill the frame of an array from what it frames, mirrored about the outermost values."""
     rows, cols = (size - 2 * pad for size in padded.shape)
-    up, left = (_reflected(size, pad) for size in (rows, cols))
+    up, left = (np.pad(np.arange(pad, pad + n), pad, mode="reflect") for n in (rows, cols))
     interior = padded[pad : pad + rows]
     interior[:, :pad] = interior[:, left[:pad]]
     interior[:, pad + cols :] = interior[:, left[pad + cols :]]
     padded[:pad], padded[pad + rows :] = padded[up[:pad]], padded[up[pad + rows :]]
-
-
-def _reflected(size: int, pad: int) -> NDArray[np.int64]:
-    """For each padded index the padded index of the value that it mirrors."""
-    period = 2 * size - 2
-    index = np.arange(-pad, size + pad) % period
-    return np.asarray(pad + np.minimum(index, period - index))
 
 
 types: Any = numba_types

@@ -207,7 +207,7 @@ def test_bad_input_is_named() -> None:
         ((mesh, SQUARE, np.full_like(u, np.nan), PITCH), "NaN"),
         ((mesh, SQUARE, sheared, PITCH), "remove the affine part"),
         ((mesh, SQUARE, np.ones_like(u), PITCH), "more than a translation"),
-        ((mesh, np.ones((2, 2)), u, PITCH), "two independent vectors"),
+        ((mesh, np.ones((2, 2)), u, PITCH), "not parallel"),
         ((mesh, 2 * SQUARE, u, PITCH), "very cell that is meshed"),
         ((mesh, SQUARE, u, 0.0), "pitch"),
         ((mesh, SQUARE, u, PITCH, -1.0), "reach"),

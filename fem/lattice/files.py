@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.fem.field import Mesh, read_any_mesh
 from modeharvest.fem.lattice.cells import UnitCell
+from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.fem.meshing import REVERSED_T6, gmsh_options, quiet_gmsh, require_size
 from modeharvest.util.arrays import FloatArray, IntArray
 from modeharvest.util.errors import InputError
@@ -258,13 +259,7 @@ def _lattice(given: ArrayLike | None, nodes: FloatArray) -> FloatArray:
     """The lattice vectors given, or those of a rectangle around the nodes."""
     if given is None:
         return np.diag(np.ptp(nodes, axis=0))
-    try:
-        vectors = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        vectors = np.empty(0)
-    if vectors.shape != (2, 2) or not np.isfinite(vectors).all():
-        raise InputError(f"expected two lattice vectors of two numbers [mm] as rows, got {given}")
-    return vectors
+    return lattice_vectors(given, "periodic cell")
 
 
 _SIDES = ((0, 1), (1, 2), (2, 0))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
@@ -77,6 +77,23 @@ def wave_of(given: Any) -> Wave:
             f"lattice's plane, got {given}"
         )
     return float(phases[0]), float(phases[1])
+
+
+def lattice_vectors(given: ArrayLike, what: str) -> FloatArray:
+    """Two vectors of a lattice as rows (2, 2) [mm]; an InputError, of ``what``, refuses others."""
+    try:
+        vectors = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):  # words, or rows of different lengths
+        vectors = np.empty(0)
+    if vectors.shape == (2, 2):
+        lengths = np.linalg.norm(vectors, axis=1)
+        if 1e-6 * np.prod(lengths) < abs(np.linalg.det(vectors)) < np.inf:
+            return vectors
+    got = np.asarray(given, dtype=object).tolist()
+    raise InputError(
+        f"{what}: expected two lattice vectors of two numbers [mm] that are not parallel, as rows, "
+        f"got {got}"
+    )
 
 
 Rates = tuple[tuple[float | None, float | None], tuple[float | None, float | None]]

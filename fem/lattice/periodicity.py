@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh, boundary_sides
+from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.errors import InputError
 
@@ -52,17 +53,10 @@ def find_periodicity(mesh: Mesh, lattice: FloatArray) -> Periodicity:
     An InputError refuses parallel vectors, and copies of the cell that overlap, touch without
     common nodes, or aren't connected along both vectors; it names the nodes.
     """
-    lattice = np.asarray(lattice, dtype=np.float64)
     if mesh.element != "T6":
         raise InputError(f"periodic cell: expected a T6 mesh, got {mesh.element}")
-    is_2x2 = lattice.shape == (2, 2)
-    lengths = np.linalg.norm(lattice, axis=1) if is_2x2 else np.zeros(2)
-    if not is_2x2 or not 1e-6 * np.prod(lengths) < abs(np.linalg.det(lattice)) < np.inf:
-        raise InputError(
-            "periodic cell: expected two lattice vectors that are not parallel, as rows [mm], "
-            f"got {lattice.tolist()}"
-        )
-    distance = _SAME_PLACE * float(lengths.min())
+    lattice = lattice_vectors(lattice, "periodic cell")
+    distance = _SAME_PLACE * float(np.linalg.norm(lattice, axis=1).min())
     pairs = _pairs(mesh.nodes, lattice, distance)
     sides = boundary_sides(mesh)
     _refuse_overlap(mesh, lattice, np.unique(sides))

@@ -15,6 +15,7 @@ from scipy.ndimage import find_objects, label
 from scipy.spatial import KDTree
 from skimage.draw import polygon2mask
 
+from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.photograph.holes import HoleLattice, find_holes
@@ -205,7 +206,7 @@ class Cells:
         """Take what is given, and the rest from the mask; raises InputError if they differ."""
         if not cell_size > 0:
             raise InputError(f"initial guess: expected a positive cell size, got {cell_size} mm")
-        vectors = lattice_vectors(cell_size, lattice)
+        vectors = _matching_vectors(cell_size, lattice)
         centres = np.zeros((0, 2)) if holes is None else np.column_stack([holes.x, holes.y])
         if holes is None and pair.mask is not None and not pair.mask.all():
             centres = hole_centres(pair, boxes, cell_size)
@@ -259,18 +260,14 @@ def _middle_hole(centres: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray((centres - np.round(steps) @ vectors)[near].mean(axis=0))
 
 
-def lattice_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
+def _matching_vectors(cell_size: float, lattice: ArrayLike | None) -> FloatArray:
     """(2, 2) vectors of the lattice of holes as rows [mm], the first one nearest to the x axis.
 
     Raises InputError if it isn't one, or its shortest distance isn't the cell size within 7 %.
     """
     if lattice is None:
         return cell_size * np.eye(2)
-    vectors = np.asarray(lattice, dtype=np.float64)
-    if vectors.shape != (2, 2) or not abs(np.linalg.det(vectors)) > 1e-6 * np.sum(vectors**2):
-        raise InputError(
-            f"initial guess: expected two lattice vectors [mm] as rows, got {vectors.tolist()}"
-        )
+    vectors = lattice_vectors(lattice, "initial guess")
     i = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
     lengths = np.linalg.norm(i[np.any(i != 0, axis=1)] @ vectors, axis=1)
     shortest = float(lengths.min())

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 from scipy.special import roots_jacobi
 
 from modeharvest.fem.field import Mesh
+from modeharvest.fem.lattice.options import lattice_vectors
 from modeharvest.imaging.mapping.elements import reference_element, shape_functions, shape_gradients
 from modeharvest.util.arrays import ComplexArray, FloatArray
 from modeharvest.util.errors import InputError
@@ -257,15 +258,11 @@ def _checked_field(
     mesh: Mesh, lattice: ArrayLike, values: ArrayLike, pitch: float
 ) -> tuple[FloatArray, FloatArray]:
     """Field (n, 2) and lattice (2, 2) as arrays, or an InputError."""
-    u, vectors = np.asarray(values, dtype=np.float64), np.asarray(lattice, dtype=np.float64)
+    u, vectors = np.asarray(values, dtype=np.float64), lattice_vectors(lattice, "periodic field")
     if u.shape != mesh.nodes.shape:
         raise InputError(f"periodic field: expected shape {mesh.nodes.shape}, got {u.shape}")
     if not np.isfinite(u).all():
         raise InputError("periodic field: expected finite values at all nodes, got NaN")
-    if vectors.shape != (2, 2) or not abs(np.linalg.det(vectors)) > 0:
-        raise InputError(
-            f"lattice: expected two independent vectors as rows, got {vectors.tolist()}"
-        )
     if not 0 < pitch < np.inf:
         raise InputError(f"pitch: expected a positive length in mm, got {pitch}")
     _check_periodic(mesh, vectors, u)

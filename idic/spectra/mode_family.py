@@ -45,7 +45,7 @@ from modeharvest.idic.spectra.waves import GROWTH, select_waves
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_record, reading, write_json
-from modeharvest.util.typed import to_plain
+from modeharvest.util.typed import picked, to_plain
 
 
 def overlap(
@@ -218,9 +218,7 @@ def write_family(
         "format": FORMAT,
         "conventions": _CONVENTIONS,
         **to_plain(found.family),
-        "pitch": found.pitch,
-        "amplitude": found.amplitude,
-        "captured": found.captured,
+        **picked(found, "pitch amplitude captured"),
         "growth": [list(step) for step in found.growth],
         "text": list(found.text),
         "waves": found.waves.tolist(),
@@ -229,10 +227,8 @@ def write_family(
     if spectrum is not None:
         u = spectrum.coefficients  # as [[re, im] of u_x, [re, im] of u_y] for each wave vector
         content["spectrum"] = {
-            "pitch": spectrum.pitch,
+            **picked(spectrum, "pitch energy material"),
             "lattice": spectrum.lattice.tolist(),
-            "energy": spectrum.energy,
-            "material": spectrum.material,
             "translation": list(spectrum.translation),
             "xi": spectrum.xi.tolist(),
             "coefficients": np.stack([u.real, u.imag], axis=-1).tolist(),
