@@ -77,7 +77,7 @@ def test_without_a_pattern_the_mode_is_held(images: ImageSet) -> None:
     """Before buckling, at 7.8 %: the lattice's own pattern, its origin on a junction, held."""
     start = start_of(images, 0.078)
     assert start.fixed
-    assert start.pattern.family == "none"
+    assert start.regions[0].pattern.family == "none"
     assert start.ansatz.modes[0].family.size == 0
     assert any("fixed at the square pattern" in s for s in start.text)
     x, y = np.linspace(-5, 5, 31), np.linspace(-9, 9, 41)
@@ -96,7 +96,7 @@ def test_a_local_field_is_taken_at_its_word(images: ImageSet) -> None:
     truth, mask = images.truth(0.128).displacement, images.mask()
     local = sampled_field(truth, images.grid, mask, 4)
     start = start_of(images, 0.128, local=local)
-    assert start.pattern.start is not None
+    assert start.regions[0].pattern.start is not None
     off = (start.ansatz.displacement(start.unknowns, images.grid.x, images.grid.y) - truth)[mask]
     # What the ansatz can't say is 0.5 px here; the start has lower degrees, besides.
     assert np.sqrt(np.mean(off**2)) / PIXEL < 1.0

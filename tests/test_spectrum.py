@@ -66,7 +66,7 @@ mode_strategy = st.tuples(
 def test_parseval():
     s = spectrum_of(patterned(REFERENCE_MODE))
     cell = (s.xi1[1] - s.xi1[0]) * (s.xi2[1] - s.xi2[0]) / PITCH**2
-    assert np.sum(s.S_xx + s.S_yy) * cell == pytest.approx(s.energy, rel=1e-12)
+    assert np.sum(s.S_xx + s.S_yy) * cell == pytest.approx(np.sum(s.source**2) * s.cell, rel=1e-12)
 
 
 def test_transform_of_a_wave_on_a_rectangle():

@@ -102,11 +102,6 @@ class InitialGuess:
         """Names of the modes' families."""
         return " and ".join(mode.family.name for mode in self.ansatz.modes) or "none"
 
-    @property
-    def pattern(self) -> WavePattern:
-        """Of the first region."""
-        return self.regions[0].pattern
-
 
 def initial_guess(
     pair: ImagePair,

@@ -107,8 +107,6 @@ PERIODIC = 1e-4
 single precision leaves, far below what an affine part does."""
 PARTNERS = 1e-4
 """Distance, in lattice vectors, up to which nodes are partners; elements are far larger."""
-SAME_WAVE = 1e-6
-"""Difference [1/l] of wave vectors that are the same."""
 LEAST_SHARE = 1e-6
 """Least share of the energy of what is listed as a peak: below, symmetry forbids the wave and
 the number is the mesh's."""
@@ -164,28 +162,6 @@ class LatticeSpectrum:
         """(n,) share of the energy at each wave vector [-]; over all of them, the sum is 1."""
         area = abs(float(np.linalg.det(self.lattice)))
         return np.asarray((self.S_xx + self.S_yy) / (area * self.energy))
-
-    @property
-    def share(self) -> float:
-        """Share of the energy at all the wave vectors within reach [-]."""
-        return float(self.shares.sum())
-
-    def at(self, xi: ArrayLike) -> ComplexArray:
-        """(2,) û of u_x and u_y [mm³] at a wave vector; 0 where the cell has none of them.
-
-        Raises InputError if it is beyond the reach.
-        """
-        wanted = np.asarray(xi, dtype=np.float64)
-        farthest = float(np.linalg.norm(self.xi, axis=1).max())
-        if not np.linalg.norm(wanted) <= farthest + SAME_WAVE:
-            raise InputError(
-                f"lattice spectrum: expected |ξ| <= {farthest:.4g}, got {wanted.tolist()}; "
-                "compute it with a larger reach"
-            )
-        distance = np.abs(self.xi - wanted).max(axis=1)
-        nearest = int(np.argmin(distance))
-        found = distance[nearest] <= SAME_WAVE
-        return np.asarray(self.coefficients[nearest] * found)
 
     @property
     def peaks(self) -> tuple[LatticePeak, ...]:

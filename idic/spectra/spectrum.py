@@ -71,11 +71,6 @@ class Spectrum:
         """Area of a bin [mm²]."""
         return float((self.x[1] - self.x[0]) * (self.y[1] - self.y[0]))
 
-    @property
-    def energy(self) -> float:
-        """∫ ‖u‖² dA of the transformed field [mm⁴]; Parseval: the integral of S over ξ/l."""
-        return float(np.sum(self.source**2) * self.cell)
-
     def at(self, xi: ArrayLike) -> ComplexArray:
         """(2,) transform of u_x and u_y [mm³] at any wave vector (ξ1, ξ2) [1/l]."""
         xi1, xi2 = np.asarray(xi, dtype=np.float64) / self.pitch
