@@ -29,7 +29,7 @@ WHOLE_FIELD = (
     "validation/whole_field.py",
 )
 """What measures the whole displacement; see docs/decisions/0014-size.md."""
-MOST = {"whole field": (17, 3_950), "all else": (185, 40_490)}
+MOST = {"whole field": (17, 3_950), "all else": (180, 40_120)}
 """Modules and lines."""
 
 PRIVATE_WORDS = """
