@@ -13,6 +13,7 @@ from dolfinx.fem import petsc as dolfinx_petsc
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.sparse import coo_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.util.errors import MissingDependencyError
@@ -71,25 +72,34 @@ def assemble_matrix(form: Any, bcs: list[Any], diagonal: float, matrix: Any = No
     return matrix
 
 
-def create_symmetric_matrix(form: Any) -> PETSc.Mat:
-    """An empty PETSc matrix that keeps its upper triangle only, in blocks of two components.
+def create_symmetric_matrix(V: Any) -> PETSc.Mat:
+    """An empty PETSc matrix of this rank's cells alone, over all components of ``V`` that it has.
 
-    Assembling into it takes half the time: the lower halves of elements' matrices are left out,
-    and a place is looked for once a block.
+    It keeps its upper triangle only, in blocks of two components. Assembling into it takes half the
+    time: the lower halves of elements' matrices are left out, a place is looked for once a block.
     """
-    pattern = dolfinx.fem.create_sparsity_pattern(form)
-    pattern.finalize()
-    columns, ends = pattern.graph
-    count = pattern.index_map(0).size_local  # the columns after those are other ranks'
-    rows = np.repeat(np.arange(count), np.diff(ends[: count + 1]))
-    columns = np.asarray(columns[: ends[count]])
-    is_own = columns < count
-    own = np.bincount(rows[is_own & (columns >= rows)], minlength=count)
-    others = np.bincount(rows[~is_own], minlength=count)
-    matrix = dolfinx_petsc.create_matrix(form, PETSc.Mat.Type.SBAIJ)
-    matrix.setPreallocationNNZ((own.astype(np.int32), others.astype(np.int32)))
+    cells, nodes = V.dofmap.list, V.dofmap.index_map
+    count = nodes.size_local + nodes.num_ghosts
+    rows, columns = np.repeat(cells, cells.shape[1], axis=1), np.tile(cells, cells.shape[1])
+    is_upper = columns >= rows
+    places = coo_array((is_upper[is_upper], (rows[is_upper], columns[is_upper])), (count, count))
+    matrix = PETSc.Mat().create(PETSc.COMM_SELF)
+    matrix.setSizes((2 * count, 2 * count))
+    matrix.setType(PETSc.Mat.Type.SBAIJ)
+    matrix.setBlockSize(2)
+    matrix.setPreallocationNNZ(np.diff(places.tocsr().indptr).astype(PETSc.IntType))
     matrix.setOption(PETSc.Mat.Option.IGNORE_LOWER_TRIANGULAR, True)
+    same = PETSc.LGMap().create(np.arange(count, dtype=PETSc.IntType), 2, comm=PETSc.COMM_SELF)
+    matrix.setLGMap(same, same)
     return matrix
+
+
+def shared_nodes(V: Any) -> NDArray[np.int64]:
+    """Local numbers of the nodes of this rank's cells that other ranks' cells have, too."""
+    ghosts = dolfinx.fem.Function(V).x
+    ghosts.array[2 * V.dofmap.index_map.size_local :] = 1.0
+    ghosts.petsc_vec.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    return np.flatnonzero(ghosts.array[::2])
 
 
 def assemble_vector(form: Any, vector: PETSc.Vec) -> None:

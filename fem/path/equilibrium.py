@@ -19,11 +19,9 @@ from modeharvest.fem.experiment import require_edges
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.hyperelastic import Hyperelastic
 from modeharvest.fem.materials import Material
+from modeharvest.fem.path.factor import BodyFactor, factorise
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
-
-_ROOMS = (60, 200, 600)  # to try, for the pivoting of an indefinite matrix [%]
-_TOO_SMALL = (-8, -9)  # MUMPS' INFOG(1) where it was not enough
 
 
 @dataclass(frozen=True)
@@ -44,54 +42,6 @@ class EdgeCompression:
 
     def __post_init__(self) -> None:
         require_edges(self.edges)
-
-
-class SymmetricFactor:
-    """The LDL^T factorisation of a symmetric matrix by MUMPS: solutions and inertia.
-
-    The order of elimination is found once, so the matrix' pattern must stay.
-    """
-
-    def __init__(self, matrix: PETSc.Mat) -> None:
-        self._matrix, self._pc = matrix, PETSc.PC().create(matrix.comm)
-        self._pc.setOperators(matrix)
-        self._pc.setType(PETSc.PC.Type.CHOLESKY)
-        self._pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
-        self._pc.setFactorSetUpSolverType()
-        # Solved with directly: a PC would first factorise a matrix that has changed.
-        self._factor = self._pc.getFactorMatrix()
-        self._factor.setMumpsIcntl(13, 1)  # the root front on one rank: its inertia is counted too
-        self._factor.setMumpsIcntl(24, 1)  # null pivots are detected instead of divided by
-        self._factor.setMumpsIcntl(8, 0)  # no scaling: the unknowns are alike
-        self.update()
-
-    def update(self) -> None:
-        """Factorise anew, after the matrix has been assembled anew."""
-        for room in _ROOMS:
-            self._factor.setMumpsIcntl(14, room)
-            self._pc.setUp()
-            if self._factor.getMumpsInfog(1) not in _TOO_SMALL:
-                break
-            self._matrix.stateIncrease()  # or it would be taken for factorised
-        if self._factor.getMumpsInfog(1) < 0:
-            raise ArithmeticError(f"MUMPS failed with INFOG(1) = {self._factor.getMumpsInfog(1)}")
-
-    @property
-    def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the matrix, by Sylvester's law of inertia."""
-        return int(self._factor.getInertia()[0])
-
-    def solve(self, rhs: PETSc.Vec) -> PETSc.Vec:
-        """The solution for one right-hand side."""
-        solution = rhs.duplicate()
-        self._factor.solve(rhs, solution)
-        return solution
-
-    def solve_block(self, rhs: PETSc.Mat) -> PETSc.Mat:
-        """The solutions for the columns of a dense matrix: a quarter of the time for each."""
-        solutions = rhs.duplicate()
-        self._factor.matSolve(rhs, solutions)
-        return solutions
 
 
 class Structure:
@@ -116,8 +66,8 @@ class Structure:
         self._load_form = self._forms.stiffness_along(self._direction)
         self._along_form = self._forms.stiffness_along(self._along)
         self.factorisations = 0
-        self.tangent = dolfinx_api.create_symmetric_matrix(self._forms.stiffness)
-        self._factor: SymmetricFactor | None = None
+        self.tangent = dolfinx_api.create_symmetric_matrix(self.V)
+        self._factor: BodyFactor | None = None
 
     def _constrain(self, loading: EdgeCompression) -> None:
         x = self.V.tabulate_dof_coordinates()  # ghosts included
@@ -200,12 +150,12 @@ class Structure:
         self._load(u)
         return dolfinx_api.assemble_matrix(self._forms.stiffness, self._bcs, 1.0, self.tangent)
 
-    def factor(self, u: PETSc.Vec) -> SymmetricFactor:
+    def factor(self, u: PETSc.Vec) -> BodyFactor:
         """Factorise the tangent stiffness at ``u``; as the matrix, always the same object."""
         self.factorisations += 1
         tangent = self.stiffness(u)
         if self._factor is None:
-            self._factor = SymmetricFactor(tangent)
+            self._factor = factorise(tangent, self.V)
         else:
             self._factor.update()
         return self._factor

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 from petsc4py import PETSc
 
-from modeharvest.fem.path.equilibrium import Structure, SymmetricFactor
+from modeharvest.fem.path.equilibrium import Structure
+from modeharvest.fem.path.factor import BodyFactor
 
 _PATIENCE = 12  # chord iterations still to come for which a new factor isn't worth its cost
 _MAX_FACTORS = 8
@@ -38,7 +39,7 @@ class Constraint:
 class Linearisation:
     """How the structure answers to small changes of an equilibrium: serves states nearby, too."""
 
-    factor: SymmetricFactor
+    factor: BodyFactor
     """Of the tangent stiffness."""
     tangent: PETSc.Vec
     """du/d(strain) along the path [mm]."""
@@ -97,7 +98,7 @@ class _Iterate:
         self.structure, self.constraint = structure, constraint
         self.u, self.strain = guess.copy(), strain
         structure.prescribe(self.u, strain)
-        self.factor: SymmetricFactor | None = None
+        self.factor: BodyFactor | None = None
         self.load: PETSc.Vec | None = None
         if near is None:
             self._weigh()
@@ -190,7 +191,7 @@ class _NewtonStep:
     share: float = 1.0
 
 
-def path_tangent(structure: Structure, factor: SymmetricFactor, load: PETSc.Vec) -> PETSc.Vec:
+def path_tangent(structure: Structure, factor: BodyFactor, load: PETSc.Vec) -> PETSc.Vec:
     """du/d(strain) along the equilibrium path [mm], constrained components included."""
     tangent = factor.solve(load)
     tangent.scale(-1.0)

@@ -1,7 +1,7 @@
 """The stability of an equilibrium: eigenpairs of the tangent stiffness nearest to zero.
 
 Stability itself is read from the inertia of the LDL^T factor
-(``SymmetricFactor.negative_pivots``), which can't miss a mode. The eigenpairs, by Lanczos' method
+(``BodyFactor.negative_pivots``), which can't miss a mode. The eigenpairs, by Lanczos' method
 in blocks, say which mode it is and how far from zero.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from modeharvest.fem.path.equilibrium import SymmetricFactor
+from modeharvest.fem.path.factor import BodyFactor
 from modeharvest.util.arrays import FloatArray
 
 _NOISE = 1  # vectors at random in a start: the modes given may lack a symmetry
@@ -45,7 +45,7 @@ class Mode:
 
 
 def lowest_modes(
-    factor: SymmetricFactor,
+    factor: BodyFactor,
     mass: PETSc.Mat,
     count: int,
     near: Sequence[Mode] = (),
@@ -91,7 +91,7 @@ class _Krylov:
     says by which combinations of the vectors to come K^-1 M leads out of it.
     """
 
-    def __init__(self, factor: SymmetricFactor, mass: PETSc.Mat, start: FloatArray) -> None:
+    def __init__(self, factor: BodyFactor, mass: PETSc.Mat, start: FloatArray) -> None:
         self._factor, self._mass = factor, mass
         self._comm = mass.comm.tompi4py()
         self._rows: FloatArray = np.empty((2, _ROOM, start.shape[1]))
