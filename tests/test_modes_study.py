@@ -19,7 +19,7 @@ from modeharvest.fem.field import Mesh, Snapshot, Solution
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.modes import square_family
 from modeharvest.idic.spectra.mode_family import wave_sum
-from modeharvest.report.study_modes import modes_findings, report_modes
+from modeharvest.report.study_modes import report_modes
 from modeharvest.runs.case import shipped_solution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
@@ -205,7 +205,7 @@ def test_a_specimen_without_a_pattern_says_so(measured: tuple[Any, ...]) -> None
     row = table[table["varied"] == "d/l"].iloc[0]
     assert (row["first"], row["ratio"]) == ("none", 0.6)
     assert math.isnan(row["a1"])
-    found = report_modes(study, table, folder)
+    found = report_modes(study.analyse(table, folder), study.seeds)
     assert any("d/l 0.6: no pattern, stable up to 28 %" in s for s in found.text)
     assert len(frame(found.tables, "Buckling")) == 3
     assert list(frame(found.tables, "Parameters")["level"]) == ["", "3.8 mm"]
@@ -223,7 +223,7 @@ def test_other_ends_are_told_and_left_out(measured: tuple[Any, ...]) -> None:
     odd.loc[1, ["first", "simulation"]] = ["other", "the branch could be followed to 0.1 l only"]
     odd.loc[1, "pattern_share"] = 0.2
     odd.loc[2, "outcome"] = "local_minimum"
-    said = " ".join(modes_findings(ModesAnalysis.of(odd), folder, "seed 0").text)
+    said = " ".join(report_modes(ModesAnalysis.of(odd, folder), "seed 0").text)
     assert "On 1 specimen with d/l" in said
     assert "base: measured in a state that is not stable" in said
     assert "d/l 0.6: buckles into something else first (the pattern is 4 %" in said

@@ -18,7 +18,7 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.setup import SquareLatticeOptions
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.speckle.pattern import SpeckleSpec
-from modeharvest.report.study_resolution import measured_waves, noise_floors, resolution_findings
+from modeharvest.report.study_resolution import measured_waves, noise_floors, report_resolution
 from modeharvest.runs.study import StudyCase
 from modeharvest.util.errors import InputError
 from modeharvest.validation.studies.buckled import (
@@ -206,7 +206,7 @@ def test_scatter_is_what_the_covariance_says(table: pd.DataFrame, subject: Resol
 def test_findings_of_a_resolution_study(
     table: pd.DataFrame, subject: ResolutionSpec, curves: TransferCurves
 ) -> None:
-    found = resolution_findings(ResolutionAnalysis.of(table, subject, curves), "seed 0")
+    found = report_resolution(ResolutionAnalysis.of(table, subject, curves), "seed 0")
     degrees = found.numbers["degrees"]
     finest = [d["finest_px"]["v0 x"] for d in degrees]
     floor = [d["floor_px"]["v0"] for d in degrees]

@@ -103,7 +103,7 @@ def test_numbers_of_a_robustness_study() -> None:
     table.loc[98, "outcome"] = "local_minimum"
     table.loc[99, ["error", "outcome"]] = ["MemoryError: too large", None]
     table.loc[99, ["distance_px", "epsilon_percent"]] = np.nan
-    found = report_robustness(RobustnessStudy(), table, Path())
+    found = report_robustness(RobustnessStudy().analyse(table, Path()), "seed 0")
     numbers = found.numbers
     assert (numbers["initial_guesses"], numbers["same_minimum"], numbers["failed"]) == (100, 97, 1)
     assert numbers["success"] == 0.97
@@ -126,7 +126,7 @@ def test_the_basin_ends_where_the_first_start_is_lost() -> None:
                             + ["converged"] * (4 - lost))  # fmt: skip
         parts.append(part.assign(radius=radius))
     table = pd.concat(parts, ignore_index=True)
-    found = report_robustness(RobustnessStudy(), table, Path())
+    found = report_robustness(RobustnessStudy().analyse(table, Path()), "seed 0")
     (said,) = [s for s in found.text if "All initial guesses converge" in s]
     assert "up to 10 % off" in said
     assert "50 %: 1 of 4" in said
@@ -241,7 +241,7 @@ def test_noise_study_on_tiny_images(
     assert len(cases) == 5
     rows = [{**case, "error": "", **asdict(one_realisation(case, folder))}
             for case in cases]  # fmt: skip
-    found = report_noise(study, pd.DataFrame(rows), folder)
+    found = report_noise(study.analyse(pd.DataFrame(rows), folder), study.seeds)
     summary = frame(found.attachments, "Noise levels").set_index("quantity")
     # Eight of 77 x 4 errors' standard deviations: the bound to within a factor.
     assert 0.6 < summary.loc["all unknowns", "rms error / bound"] < 1.6
@@ -254,7 +254,7 @@ def test_noise_study_on_tiny_images(
     plus, minus = (np.array(r["unknowns"]) - rows[0]["unknowns"] for r in rows[1:3])
     assert np.linalg.norm(plus + minus) < 0.5 * np.linalg.norm(plus - minus)
     with pytest.raises(InputError, match="two whole pairs"):
-        report_noise(study, pd.DataFrame(rows[:4]), folder)
+        study.analyse(pd.DataFrame(rows[:4]), folder)
 
 
 # -- systematic errors --------------------------------------------------------------------
@@ -277,7 +277,7 @@ def test_systematic_study_on_tiny_images(subject: ImagePairSpec, folder: Path) -
         VirtualImagePair.images_folder(folder, c["images"]).is_dir() for c in cases if not c["keep"]
     }
     assert (kept, gone) == ({True}, {False})
-    found = report_systematic(study, pd.DataFrame(rows), folder)
+    found = report_systematic(study.analyse(pd.DataFrame(rows), folder), study.seeds)
     levels = frame(found.tables, "Every level").set_index(["name", "level"])
     moved = levels["moved from the base [px]"]
     assert moved["order", 5] == 0.0

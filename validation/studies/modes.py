@@ -218,15 +218,17 @@ class ModesAnalysis:
     """Those whose pattern was there to be measured and was: converged on a pattern."""
     sizes: pd.DataFrame
     """Of these the base and those that differ from it in d/l only."""
+    folder: Path
+    """The study's, where the specimens are."""
 
     @classmethod
-    def of(cls, table: pd.DataFrame) -> ModesAnalysis:
+    def of(cls, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
         """From the table of all specimens."""
         ran = table[table["error"] == ""]
         is_converged = ran["outcome"] == "converged" if "outcome" in ran else False
         measured = ran[(ran["first"] == "pattern") & is_converged]
         sizes = measured[measured["varied"].isin([BASE, "d/l"])].sort_values("ratio")
-        return cls(ran, measured, sizes)
+        return cls(ran, measured, sizes, folder)
 
 
 @dataclass(frozen=True)
@@ -305,7 +307,7 @@ class MeasuredModesStudy(Study[ModesAnalysis]):
 
     def analyse(self, table: pd.DataFrame, folder: Path) -> ModesAnalysis:
         """The specimens whose pattern was measured."""
-        return ModesAnalysis.of(table)
+        return ModesAnalysis.of(table, folder)
 
     def _others(self, base: SpecimenSpec) -> Iterator[tuple[str, str, SpecimenSpec]]:
         """What is varied, its level as text, and the specimen."""

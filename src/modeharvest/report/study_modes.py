@@ -21,7 +21,6 @@ from modeharvest.validation.studies.modes import (
     IDEAL,
     PARAMETERS,
     WAVE_VECTORS,
-    MeasuredModesStudy,
     ModesAnalysis,
     SpecimenPatterns,
     deviations,
@@ -214,22 +213,14 @@ def draw_patterns(specimens: Mapping[str, SpecimenPatterns]) -> Figure:
     return drawn
 
 
-def report_modes(study: MeasuredModesStudy, table: pd.DataFrame, folder: Path) -> Findings:
+def report_modes(found: ModesAnalysis, seeds: str) -> Findings:
     """The modes' parameters and overlaps, against d/l and all else, and the patterns."""
-    return modes_findings(study.analyse(table, folder), folder, study.seeds)
-
-
-def modes_findings(found: ModesAnalysis, folder: Path, seeds: str) -> Findings:
-    """The findings of an analysis.
-
-    ``found``: the analysis. ``folder``: of the study, where the specimens are. ``seeds``: in words.
-    """
     ran, measured, sizes = found.ran, found.measured, found.sizes
     return Findings(
         numbers={"specimens": ran.drop(columns=["error"]).to_dict("records")},
         text=_text(found),
         keys=_keys(sizes),
-        figures=_figures(measured, sizes, folder, seeds),
+        figures=_figures(measured, sizes, found.folder, seeds),
         tables=[
             ReportTable.of("Buckling", buckling_table(ran)),
             ReportTable.of("Parameters", parameters_summary(measured)),

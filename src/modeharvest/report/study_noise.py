@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from modeharvest.report.figures.curves import SMALL, WIDE, curve
 from modeharvest.report.figures.maps import ColourScale, colour_bar
 from modeharvest.report.model import Card, Findings, KeyNumber, ReportTable, number, text_of
 from modeharvest.util.arrays import FloatArray
-from modeharvest.validation.studies.noise import NoiseStudy
 from modeharvest.validation.studies.noise_statistics import (
     CAUSES,
     PARTS,
@@ -304,9 +302,8 @@ def _figures(found: NoiseAnalysis, causes: pd.DataFrame, shown: float, seeds: st
     ]  # fmt: skip
 
 
-def report_noise(study: NoiseStudy, table: pd.DataFrame, folder: Path) -> Findings:
+def report_noise(found: NoiseAnalysis, seeds: str) -> Findings:
     """Bias, scatter and coverage, for each unknown, for the fields, and as maps."""
-    found = study.analyse(table, folder)
     levels, ours, row = found.by_bound, found.by_least, found.noise_free.row
     shown = sorted(levels)[len(levels) // 2]
     summary = summary_table(levels, ours, found.by_hessian, found.points.pair)
@@ -326,7 +323,7 @@ def report_noise(study: NoiseStudy, table: pd.DataFrame, folder: Path) -> Findin
             *_other_text(found),
         ),
         keys=_keys(levels, ours, shown),
-        figures=_figures(found, causes, shown, study.seeds),
+        figures=_figures(found, causes, shown, seeds),
         tables=[
             ReportTable.of("Noise levels", with_errors(summary)),
             ReportTable.of("Rms over the bound, by its causes [-]", causes.round(3)),

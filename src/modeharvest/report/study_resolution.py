@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -22,7 +21,6 @@ from modeharvest.validation.studies.buckled import ResolutionSpec
 from modeharvest.validation.studies.resolution import (
     MOTIONS,
     ResolutionAnalysis,
-    ResolutionStudy,
 )
 from modeharvest.validation.studies.transfer import (
     AXES,
@@ -209,13 +207,8 @@ def _measured_text(
     return text
 
 
-def report_resolution(study: ResolutionStudy, table: pd.DataFrame, folder: Path) -> Findings:
+def report_resolution(found: ResolutionAnalysis, seeds: str) -> Findings:
     """Transfer, noise floors and indicators by degree."""
-    return resolution_findings(study.analyse(table, folder), study.seeds)
-
-
-def resolution_findings(found: ResolutionAnalysis, seeds: str) -> Findings:
-    """The findings of an analysis; ``seeds`` in words."""
     spec, curves, degrees = found.spec, found.curves, found.degrees
     floors = noise_floors(found.rows, spec)
     waves = measured_waves(found.rows, spec, curves)

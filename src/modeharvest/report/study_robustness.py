@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,7 +17,7 @@ from modeharvest.validation.studies.robustness import (
     PUBLISHED,
     SAME_PX,
     GuessStatistics,
-    RobustnessStudy,
+    RobustnessAnalysis,
     success_interval,
 )
 
@@ -141,9 +140,8 @@ def _figures(
     ]  # fmt: skip
 
 
-def report_robustness(study: RobustnessStudy, table: pd.DataFrame, folder: Path) -> Findings:
+def report_robustness(found: RobustnessAnalysis, seeds: str) -> Findings:
     """Success, epsilon and distance, and the basin's picture."""
-    found = study.analyse(table, folder)
     radius, strains = found.statistics.radius, by_strain(found.strains)
     basin = by_radius(found.moved[found.moved["radius"] > 0.0])
     tables = {"Basin of convergence": basin}
@@ -160,7 +158,7 @@ def report_robustness(study: RobustnessStudy, table: pd.DataFrame, folder: Path)
             *_strain_text(strains),
         ),
         keys=_keys(found.statistics),
-        figures=_figures(found.at_radius, basin, strains, radius, study.seeds),
+        figures=_figures(found.at_radius, basin, strains, radius, seeds),
         tables=[ReportTable.of(title, table) for title, table in tables.items()],
     )
 

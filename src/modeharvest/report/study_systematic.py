@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from modeharvest.validation.studies.systematic import (
     BASE,
     FACTORS,
     SystematicAnalysis,
-    SystematicStudy,
 )
 
 ERROR_LABELS = {
@@ -95,10 +93,9 @@ _CURVES: dict[str, dict[str, Any]] = {
 _COLUMNS = 3
 
 
-def report_systematic(study: SystematicStudy, table: pd.DataFrame, folder: Path) -> Findings:
+def report_systematic(found: SystematicAnalysis, seeds: str) -> Findings:
     """Errors against each factor, as curves and tables."""
-    found = study.analyse(table, folder)
-    bases, seeds, levels = found.bases, study.seeds, by_level(found)
+    bases, levels = found.bases, by_level(found)
     spans = by_factor(levels)
     drawn = partial(draw_factors, levels, bases)
     figure = Card.captioned("factors", drawn, "systematic-factors", True, seeds=seeds)

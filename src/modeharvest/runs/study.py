@@ -96,14 +96,14 @@ class StudyCase(Case):
         return {**super().plain(), "study": with_kind(self.study, KINDS)}
 
 
-FINDINGS: dict[type[Any], Callable[[Any, pd.DataFrame, Path], Findings]] = {
+FINDINGS: dict[type[Any], Callable[[Any, str], Findings]] = {
     RobustnessStudy: report_robustness,
     NoiseStudy: report_noise,
     SystematicStudy: report_systematic,
     ResolutionStudy: report_resolution,
     MeasuredModesStudy: report_modes,
 }
-"""For each kind of study what reads its table: failed cases have an ``error``, and no result."""
+"""For each kind of study what draws its analysis, with the seeds in words."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class StudyAnalysis(StagedRun[StudyCase]):
                 first = table["error"].iloc[0]
                 raise InputError(f"all {len(table)} cases failed; the first: {first}")
             with self.timed("findings"):
-                findings = FINDINGS[type(study)](study, table, folder)
+                findings = FINDINGS[type(study)](study.analyse(table, folder), study.seeds)
             return self._write_report(campaign, table, findings)
 
     def _write_report(
