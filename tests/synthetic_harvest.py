@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.modes import FourierMode, square_family
+from modeharvest.idic.photograph.geometry import Geometry, Part, SpecimenTable
 from modeharvest.idic.photograph.holes import find_hole_lattice
+from modeharvest.idic.photograph.region import Region
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Iteration, Outcome
+from modeharvest.idic.solver.noise import CameraNoise
 from modeharvest.idic.spectra.pattern import read_pattern
 from modeharvest.idic.spectra.spectrum import spectral_density
 from modeharvest.idic.uncertainty.covariance import field_errors
@@ -25,6 +28,8 @@ from modeharvest.imaging.distortion.calibrate import Calibration, DegreeTrial
 from modeharvest.imaging.distortion.fit import PolynomialModel
 from modeharvest.imaging.distortion.lens import PolynomialDistortion
 from modeharvest.imaging.grid import PixelGrid
+from modeharvest.runs.photographs.case import Images, ImageScale, PhotographCase
+from modeharvest.runs.photographs.prepare import Optics
 from modeharvest.runs.photographs.results import (
     FrameTruth,
     Harvest,
@@ -175,23 +180,23 @@ def harvest(
         TruthCheck("largest v₁ against the best fit", 1.2, "within 3", True, "%"),
         TruthCheck("distortion, affine part aside", 0.07, 0.05, False, "px"),
     )
-    return Harvest(
+    case = PhotographCase(
         title="Made up <for tests>",
-        experiment={"specimen": {"cell_size": PITCH}, "correlation": {"order": 5}},
-        grid=GRID,
+        images=Images("reference.tif", tuple(f"{one.name}.tif" for one in frames)),
+        scale=ImageScale(GRID.pixel_size),
+        specimen=SpecimenTable(PITCH),
+    )
+    region = Region(CELLULAR, DOMAIN, ())
+    return Harvest(
+        case=case,
+        geometry=Geometry(GRID, MASK, find_hole_lattice(MASK), region, (Part("", CELLULAR),)),
         reference=reference,
-        mask=MASK,
-        lattice=find_hole_lattice(MASK),
-        cellular=CELLULAR,
-        domain=DOMAIN,
         frames=frames,
+        noise=CameraNoise(NOISE, "measured from 3 exposures"),
         skipped=(("IMG_3.tif", "expected an image <of 290 x 250 px>, got a damaged file"),),
         timeline=timeline,
         buckling=find_buckling(timeline),
-        calibration=calibration(),
-        lens=lens(),
-        noise_sd=NOISE,
-        noise_source="measured from 3 exposures",
+        optics=Optics(lens(), calibration()),
         full_scale=LEVELS,
         text=("The material was found by its speckle.",),
         truth=HarvestTruth(truth, lens(1.01), rows),

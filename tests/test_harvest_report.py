@@ -43,6 +43,7 @@ from modeharvest.report.photographs import (
     photograph_panels,
     photographs_report,
 )
+from modeharvest.runs.photographs.prepare import Optics
 from modeharvest.runs.photographs.results import Harvest
 from modeharvest.runs.photographs.summary import harvest_summary
 
@@ -78,9 +79,9 @@ def bare(harvest: Harvest) -> Harvest:
     """One photograph of which only the correlation is known."""
     frame = replace(harvest.frames[1], mask=None, by_model_error=None, model_error_covariance=None,
                     spectrum=None, pattern=None, local=None, start_text=())  # fmt: skip
-    return replace(harvest, frames=(frame,), lattice=None, skipped=(), timeline=(), buckling=None,
-                   calibration=None, lens=None, full_scale=None, text=(), truth=None,
-                   versions={})  # fmt: skip
+    return replace(harvest, geometry=replace(harvest.geometry, lattice=None), frames=(frame,),
+                   skipped=(), timeline=(), buckling=None, optics=Optics(), full_scale=None,
+                   text=(), truth=None, versions={})  # fmt: skip
 
 
 def test_the_user_s_guide_has_every_key_of_the_summary(summary: dict[str, Any]) -> None:

@@ -72,7 +72,7 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         keys=key_numbers(summary),
         sections=[
             *([_reference(harvest, summary, states)] if harvest else []),
-            *([_optics(harvest, summary)] if harvest and harvest.lens is not None else []),
+            *([_optics(harvest, summary)] if harvest and harvest.optics.distortion else []),
             *(_with_readings(sections, shown, names) if states else []),
             Section("truth", "Obtained and expected values", _truth_cards(summary)),
             *([_timeline(harvest, summary)] if harvest else []),
@@ -305,13 +305,13 @@ def _reference(harvest: Harvest, summary: Summary, states: Sequence[PhotographSt
 
 def _optics(harvest: Harvest, summary: Summary) -> Section:
     """Distortion, its standard deviation and its error, as far as they are known."""
-    lens, grid, numbers = harvest.lens, harvest.grid, summary["optics"]
+    lens, grid, numbers = harvest.optics.distortion, harvest.grid, summary["optics"]
     assert lens is not None
 
     cards = [Card.captioned("distortion", partial(figures.draw_distortion, lens, grid),
                             largest=number(numbers["max_px"]))]  # fmt: skip
-    if harvest.calibration is not None:
-        drawn = partial(figures.draw_distortion_sd, harvest.calibration, grid)
+    if harvest.optics.calibration is not None:
+        drawn = partial(figures.draw_distortion_sd, harvest.optics.calibration, grid)
         cards.append(Card.captioned("distortion-sd", drawn, rms=number(numbers["sd_rms_px"])))
     if harvest.truth is not None and harvest.truth.distortion is not None:
         drawn = partial(figures.draw_distortion_error, lens, harvest.truth.distortion, grid)

@@ -145,7 +145,7 @@ def draw_deformed(state: PhotographState) -> Figure:
 
 def draw_closeup(state: PhotographState) -> Figure:
     """Draw some cells of a deformed photograph, pixel by pixel, with the boundary as measured."""
-    grid, middle = state.view.grid, np.array(state.harvest.cellular.centre)
+    grid, middle = state.view.grid, np.array(state.harvest.geometry.region.cellular.centre)
     x, y = middle + state.motion(*middle[:, None, None])[0, 0]
     half = 0.5 * CLOSE * state.view.pitch
     corners = grid.to_px([x - half, x + half], [y + half, y - half])
@@ -191,7 +191,8 @@ def draw_residual(state: PhotographState) -> Figure:
     gain, offset = ansatz.gain_and_offset(a, x, y)
     picked = np.ix_(rows, cols)
     residual = (harvest.reference[picked] - gain * value - offset) / (full or 1.0)
-    values = np.where(eroded(harvest.mask, harvest.edge_px)[picked], residual, np.nan)
+    compared = eroded(harvest.mask, harvest.case.correlation.edge_px)
+    values = np.where(compared[picked], residual, np.nan)
     scale = ColourScale.signed(values, "" if full else "levels", 0.99)
     return maps.draw_field(map_frame, values, scale, state.motion)
 
@@ -292,9 +293,9 @@ def draw_reference(harvest: Harvest, boundary: MeshBoundary, levels: tuple[float
     axes.set(xlim=harvest.grid.extent[:2], ylim=harvest.grid.extent[2:])
     style.draw_path(axes, boundary.path(), fill=False, ec=GOLD, lw=0.9, rasterized=True)
     shown = [Line2D([], [], color=GOLD, lw=1.2, label="material")]
-    if harvest.lattice is not None:
-        shown += _draw_lattice(axes, harvest.lattice, harvest.grid)
-    shown.append(_draw_box(axes, harvest.cellular))
+    if harvest.geometry.lattice is not None:
+        shown += _draw_lattice(axes, harvest.geometry.lattice, harvest.grid)
+    shown.append(_draw_box(axes, harvest.geometry.region.cellular))
     axes.legend(handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown),
                 handlelength=1.6, columnspacing=1.4, borderaxespad=0.1)  # fmt: skip
     return drawn

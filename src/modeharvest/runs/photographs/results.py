@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.photograph.geometry import Geometry
-from modeharvest.idic.photograph.holes import HoleLattice
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise, residual_test
 from modeharvest.idic.result import Result
+from modeharvest.idic.solver.noise import CameraNoise
 from modeharvest.idic.solver.residual_test import ResidualTest
 from modeharvest.idic.spectra.pattern import WavePattern, read_pattern
 from modeharvest.idic.spectra.spectrum import Spectrum, measured_spectrum
 from modeharvest.idic.uncertainty.covariance import FieldErrors, covariance, field_errors
 from modeharvest.idic.uncertainty.identifiability import Identifiability, identifiability
-from modeharvest.imaging.distortion.calibrate import Calibration
 from modeharvest.imaging.distortion.lens import Distortion
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.runs.photographs.case import PhotographCase
-from modeharvest.runs.photographs.prepare import PreparedPhotographs
+from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.util.arrays import BoolArray, FloatArray, FloatImage
 from modeharvest.validation.onset import Buckling, ImageAmplitude, mean_strain
 from modeharvest.validation.whole_field import WholeField, WholeFieldSummary
@@ -129,33 +128,20 @@ class HarvestTruth:
 class Harvest:
     """All that the report of a harvest shows; what is None or empty is left out."""
 
-    title: str
-    experiment: Mapping[str, Any]
-    grid: PixelGrid
+    case: PhotographCase
+    geometry: Geometry
+    """The reference's material, holes and cellular part, on the pixels of the ideal images."""
     reference: FloatImage
-    mask: BoolArray
-    """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels], and
-    where it shows material."""
-    cellular: Box
-    """The part that has holes [mm]."""
-    domain: Box
-    """The box of the material [mm]."""
+    """(rows, cols) the photograph of the undeformed state, free from distortion [grey levels]."""
     frames: tuple[HarvestedFrame, ...]
     """In the order of the test."""
-    noise_sd: float
-    """Of each photograph [grey levels]."""
-    noise_source: str
-    """Where that is known from."""
-    lattice: HoleLattice | None = None
-    """The holes that were found and the lattice fitted to them."""
+    noise: CameraNoise
     skipped: tuple[tuple[str, str], ...] = ()
     """Names of photographs that were not used, and why."""
     timeline: Sequence[ImageAmplitude] = ()
     """In the order of the test."""
     buckling: Buckling | None = None
-    calibration: Calibration | None = None
-    lens: Distortion | None = None
-    """Both of the optics; the lens alone if it was given."""
+    optics: Optics = field(default_factory=Optics)
     full_scale: float | None = None
     """Largest grey level of the camera; None if not known."""
     text: tuple[str, ...] = ()
@@ -163,18 +149,23 @@ class Harvest:
     truth: HarvestTruth | None = None
     command: str = "modeharvest harvest EXPERIMENT.toml"
     toml: str = ""
-    """Both make this page again; the experiment's values are shown if ``toml`` is empty."""
+    """Both make this page again; the case's values are shown if ``toml`` is empty."""
     versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The pixels of the ideal images."""
+        return self.geometry.grid
+
+    @property
+    def mask(self) -> BoolArray:
+        """(rows, cols) True on material of the reference."""
+        return self.geometry.mask
 
     @property
     def pitch(self) -> float:
         """Unit cell size l [mm]."""
-        return float(self.experiment.get("specimen", {}).get("cell_size", 0.0))
-
-    @property
-    def edge_px(self) -> int:
-        """Width of the rim of the material that was not compared [px]."""
-        return int(self.experiment.get("correlation", {}).get("edge_px", 0))
+        return self.case.specimen.cell_size
 
 
 _ALONG = 120

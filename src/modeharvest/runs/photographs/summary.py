@@ -95,16 +95,16 @@ def _largest_values(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str
 def harvest_summary(harvest: Harvest) -> dict[str, Any]:
     """The content of ``summary.json``, plain JSON values."""
     summary = {
-        "title": harvest.title,
-        "experiment": harvest.experiment,
+        "title": harvest.case.title or "Photographs of a test",
+        "experiment": harvest.case.plain(),
         "pixel_size_mm": harvest.grid.pixel_size,
         "cell_size_mm": harvest.pitch,
-        "cellular_mm": astuple(harvest.cellular),
-        "domain_mm": astuple(harvest.domain),
+        "cellular_mm": astuple(harvest.geometry.region.cellular),
+        "domain_mm": astuple(harvest.geometry.region.domain),
         "noise": {
-            "sd": harvest.noise_sd,
-            "of_full_scale": _share(harvest.noise_sd, harvest.full_scale),
-            "source": harvest.noise_source,
+            "sd": harvest.noise.sd,
+            "of_full_scale": _share(harvest.noise.sd, harvest.full_scale),
+            "source": harvest.noise.source,
         },
         "frames": [_frame(harvest, frame) for frame in harvest.frames],
         "timeline": [
@@ -112,8 +112,8 @@ def harvest_summary(harvest: Harvest) -> dict[str, Any]:
             for m in harvest.timeline
         ],
         "buckling": harvest.buckling,
-        "lattice": _lattice(harvest.lattice) if harvest.lattice else None,
-        "optics": harvest.lens and _optics(harvest, harvest.lens),
+        "lattice": _lattice(harvest.geometry.lattice) if harvest.geometry.lattice else None,
+        "optics": harvest.optics.distortion and _optics(harvest, harvest.optics.distortion),
         "skipped": [{"name": name, "reason": reason} for name, reason in harvest.skipped],
         "text": harvest.text,
         "truth": [] if harvest.truth is None else harvest.truth.rows,
@@ -141,9 +141,9 @@ def _frame(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any]:
         "weighting": result.weighting.text,
         **picked(identified, "model_error_px condition_number undetermined"),
         "errors_px": {
-            "noise": rms_errors(frame, frame.by_noise, harvest.cellular),
+            "noise": rms_errors(frame, frame.by_noise, harvest.geometry.region.cellular),
             "model_error": frame.by_model_error
-            and rms_errors(frame, frame.by_model_error, harvest.cellular),
+            and rms_errors(frame, frame.by_model_error, harvest.geometry.region.cellular),
         },
         "local": _local(harvest, frame),
         "whole_field": whole_summary(harvest, frame),
@@ -192,7 +192,7 @@ def _lattice(lattice: HoleLattice) -> dict[str, Any]:
 def _optics(harvest: Harvest, lens: Distortion) -> dict[str, Any]:
     rows, cols = (np.linspace(0.0, size - 1.0, 25) for size in harvest.grid.shape)
     at = rows[:, None], cols[None, :]
-    length, found = np.hypot(*lens.shift(*at)), harvest.calibration
+    length, found = np.hypot(*lens.shift(*at)), harvest.optics.calibration
     summary = {"max_px": length.max(), "rms_px": np.sqrt(np.mean(length**2) / 2.0)}
     if found is not None:
         summary |= {
