@@ -341,30 +341,31 @@ def _mode_numbers(
     noise = result.standard_errors()
     is_any = len(found.unobservable) < len(parts)
     model = _model_errors(comparison, measured) if is_any else (None,) * ansatz.size
-    if measured.specimen.is_staggered:
-        modes = []
-        for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True)):
-            family, is_observable = mode.family, i not in found.unobservable
-            at, at_best = (
-                tuple(two_waves_near(fit.mode_parameters(i), start[part], pitch))
-                for fit in (result, best)
-            )
-            modes.append(ModeSummary(
-                family.name, tuple(family.names), tuple(family.units), at, tuple(start[part]),
-                tuple(noise[part]), model[part] if is_observable else (), at_best,
-                found.amplitude_px[i], is_observable,
-            ))  # fmt: skip
+    is_staggered = measured.specimen.is_staggered
+    modes = []
+    for i, (mode, part) in enumerate(zip(ansatz.modes, parts, strict=True)):
+        family, is_observable, ideal = mode.family, i not in found.unobservable, start[part]
+        at, at_best = (
+            two_waves_near(fit.mode_parameters(i), ideal, pitch) if is_staggered
+            else mode_pattern.mode_equivalent(fit.mode_parameters(i), pitch, ideal)[0]
+            for fit in (result, best)
+        )  # fmt: skip
+        modes.append(ModeSummary(
+            family.name, tuple(family.names), tuple(family.units), tuple(at), tuple(ideal),
+            tuple(noise[part]), model[part] if is_observable else (), tuple(at_best),
+            found.amplitude_px[i], is_observable,
+        ))  # fmt: skip
+    if is_staggered:
         return {"modes": tuple(modes)}
-    parameters, ideal = result.mode_parameters(), start[parts[0]]
+    (only,) = modes
+    deviation = mode_pattern.mode_deviation(result.mode_parameters(), pitch, only.ideal)
     return {
-        "mode": tuple(mode_pattern.mode_equivalent(parameters, pitch, ideal)[0]),
-        "mode_ideal": tuple(ideal),
-        "mode_standard_error": tuple(noise[parts[0]]),
-        "mode_model_error": model[parts[0]] if not found.unobservable else (),
-        "mode_deviation_percent": tuple(mode_pattern.mode_deviation(parameters, pitch, ideal)),
-        "mode_best_fit": tuple(
-            mode_pattern.mode_equivalent(best.mode_parameters(), pitch, ideal)[0]
-        ),
+        "mode": only.found,
+        "mode_ideal": only.ideal,
+        "mode_standard_error": only.standard_error,
+        "mode_model_error": only.model_error,
+        "mode_deviation_percent": tuple(deviation),
+        "mode_best_fit": only.best_fit,
     }
 
 

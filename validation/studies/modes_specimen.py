@@ -26,7 +26,7 @@ from modeharvest.idic.spectra.mode_family import overlap
 from modeharvest.imaging.imageset import image_key
 from modeharvest.imaging.spec import ImagingSpec
 from modeharvest.util.arrays import FloatArray
-from modeharvest.util.errors import InputError, dolfinx_missing
+from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json
 from modeharvest.util.stages import digest
 from modeharvest.util.typed import made, to_plain
@@ -45,11 +45,9 @@ def buckle(experiment: Experiment, wanted: float, largest: float) -> Solution:
     reached, see :meth:`PatternCells.amplitude` [mm]; ``largest``: nominal strain up to which to
     look for the first critical point [-]. MissingDependencyError without dolfinx.
     """
-    try:
+    with requiring_dolfinx("simulating specimens needs"):
         from modeharvest.fem.meshing import mesh_specimen
         from modeharvest.fem.simulate import simulate_pattern
-    except ModuleNotFoundError as error:
-        raise dolfinx_missing("simulating specimens needs") from error
     mesh = mesh_specimen(experiment.specimen, experiment.mesh_size)
     pattern = PatternCells(mesh, experiment.specimen)
     return simulate_pattern(experiment, mesh, pattern, wanted, largest)
@@ -222,10 +220,8 @@ class LatticeMode:
         """
         ratio, pitch = specimen.diameter / specimen.pitch, specimen.pitch
         lattice = StudiedLattice(ratio, material=material, pitch=pitch, divisions=divisions)
-        try:
+        with requiring_dolfinx("the mode of an infinite lattice needs"):
             return cls(pattern_mode(lattice))
-        except ModuleNotFoundError as error:
-            raise dolfinx_missing("the mode of an infinite lattice needs") from error
 
     @property
     def aspect(self) -> float:

@@ -71,27 +71,26 @@ class VariedFactor:
         )  # fmt: skip
 
     def number(self, level: float | str) -> float:
-        """A level as a number; InputError if there is no such name."""
-        if isinstance(level, str):
-            if level not in self.names:
+        """A level as a number; InputError if it is none of the factor's."""
+        by_name = isinstance(level, str)
+        if by_name or self.names:
+            known = self.names if by_name else range(len(self.names))
+            if level not in known:
                 expected = f"one of {list(self.names)}" if self.names else "numbers"
                 raise InputError(f"study: expected {expected} for {self.label}, got {level!r}")
-            return self.names.index(level)
-        return level
+        number = self.names.index(level) if isinstance(level, str) else level
+        if self.whole and number != round(number):
+            raise InputError(f"study: expected whole numbers for {self.label}, got {number:g}")
+        return number
 
     def label_of(self, level: float) -> str:
         """How a level is called."""
         return self.names[round(level)] if self.names else f"{level:g}"
 
-    def set(self, setting: StudySetting, level: float) -> StudySetting:
+    def set(self, setting: StudySetting, level: float | str) -> StudySetting:
         """Change a setting; InputError if the level is out of the factor's range."""
-        if self.names and level not in range(len(self.names)):
-            raise InputError(
-                f"study: expected one of {list(self.names)} for {self.label}, got {level:g}"
-            )
-        if self.whole and level != round(level):
-            raise InputError(f"study: expected whole numbers for {self.label}, got {level:g}")
-        return self.change(setting, round(level) if self.whole else float(level))
+        number = self.number(level)
+        return self.change(setting, round(number) if self.whole else float(number))
 
 
 def _speckle_size(setting: StudySetting, factor: float) -> StudySetting:

@@ -118,12 +118,10 @@ class Stages:
         """
         if on_first(lambda: self.is_finished(name, key)):
             return
-        with exclusive(self.folder):
-            begin = time.perf_counter()
+        with exclusive(self.folder), self.timed(name):
             on_first(lambda: self._forget(name))
             files = list(work() if collective else on_first(lambda: list(work())))
             on_first(lambda: self._remember(name, key, files))
-            on_first(lambda: self.took(name, time.perf_counter() - begin))
 
     def require_whole(self, path: Path, advice: str) -> None:
         """Raise InputError if a file is not what the stage that left it wrote.
@@ -143,9 +141,13 @@ class Stages:
         """What stages took [s]; empty if nobody knows."""
         return dict(_table(self.folder / TIMINGS))
 
-    def took(self, name: str, seconds: float) -> None:
-        """Take down what a stage took [s]."""
-        write_json(self.folder / TIMINGS, {**self.timings, name: seconds})
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Take down what the work of a stage takes [s]."""
+        begin = time.perf_counter()
+        yield
+        seconds = {name: time.perf_counter() - begin}
+        on_first(lambda: write_json(self.folder / TIMINGS, self.timings | seconds))
 
     def _record(self) -> dict[str, dict[str, Any]]:
         """The finished stages; what makes no sense, as in a damaged file, is left out."""
@@ -193,13 +195,6 @@ class StagedRun(Generic[C]):
         """Do a stage unless it is finished (see :class:`Stages`); returns what its files say."""
         self.stages.do(name, key, work, collective=collective)
         return read()
-
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        """Take down what work takes that stores its own outcome."""
-        begin = time.perf_counter()
-        yield
-        self.stages.took(name, time.perf_counter() - begin)
 
 
 def stage_key(content: object, *folders: str) -> str:
