@@ -24,14 +24,13 @@ from modeharvest.idic.ansatz import Ansatz
 from modeharvest.idic.modes import FourierMode, Taper, free_family
 from modeharvest.idic.uncertainty.covariance import field_errors
 from modeharvest.idic.uncertainty.identifiability import identifiability
-from modeharvest.imaging.distortion.lens import PolynomialDistortion
+from modeharvest.imaging.distortion.lens import PolynomialDistortion, apart_without_affine
 from modeharvest.report.figures.boundaries import mask_boundary
 from modeharvest.report.figures.photographs import (
     MOST_SHOWN,
     PhotographState,
     photograph_states,
     shown_frames,
-    unaffine,
 )
 from modeharvest.report.model import write_page
 from modeharvest.report.photographs import (
@@ -299,8 +298,10 @@ def test_an_affine_part_of_a_distortion_is_not_an_error() -> None:
     c = found.coefficients.copy()
     c[:, :3] += [[3.0, 1.0, -2.0], [1.0, 0.5, 0.2]]
     same = PolynomialDistortion(found.shape, c)
-    assert np.abs(unaffine(found, same, made_up.GRID)).max() < 1e-10
-    assert np.abs(unaffine(found, made_up.lens(2.0), made_up.GRID)).max() > 0.5
+    row, col = (np.linspace(0.0, n - 1.0, 40) for n in found.shape)
+    at = row[:, None], col[None, :]
+    assert np.abs(apart_without_affine(found, same, *at)).max() < 1e-10
+    assert np.abs(apart_without_affine(found, made_up.lens(2.0), *at)).max() > 0.5
 
 
 def test_warnings_outcomes_and_the_noise_are_told(summary: dict[str, Any]) -> None:

@@ -15,8 +15,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import best_fit
@@ -32,6 +34,11 @@ def lengths(field: FloatArray) -> FloatArray:
     """(...) Euclidean lengths of the vectors of a field (..., 2)."""
     x, y = field[..., 0], field[..., 1]
     return np.asarray(np.sqrt(x * x + y * y))
+
+
+def rms(values: NDArray[Any]) -> float:
+    """Root of the mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @dataclass(frozen=True)

@@ -373,6 +373,21 @@ def _observed_from(distortion: Distortion, shape: tuple[int, ...], band: slice) 
     return distortion.observed(row, col)
 
 
+def apart_without_affine(
+    found: Distortion, true: Distortion, row: ArrayLike, col: ArrayLike
+) -> FloatArray:
+    """(2, ...) S_found - S_true [px] at positions that broadcast together [px].
+
+    Without its affine part, which can't be observed.
+    """
+    row, col = np.broadcast_arrays(row, col)
+    apart = np.stack(found.shift(row, col)) - np.stack(true.shift(row, col))
+    basis = np.column_stack([np.ones(row.size), row.ravel(), col.ravel()])
+    flat = apart.reshape(2, -1).T
+    affine = basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]
+    return np.asarray((flat - affine).T.reshape(apart.shape))
+
+
 def ideal_points(distortion: Distortion, shape: tuple[int, int]) -> Positions:
     """Ideal positions, each (rows, cols) [px], that the pixels show; InputError if S folds."""
     row, col = np.ogrid[: shape[0], : shape[1]]

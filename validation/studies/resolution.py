@@ -35,6 +35,7 @@ from modeharvest.validation.studies.transfer import (
     subset_indicator,
     wave_share,
 )
+from modeharvest.validation.truth import rms
 from modeharvest.validation.workers import Case, Cases
 
 Row = dict[str, Any]
@@ -138,13 +139,9 @@ def _rms_px(
 ) -> Row:
     """Rms [px] of fields [mm] at ``spec.sparse``, v1's as the largest v1 phi1 that it makes."""
     _, cellular = spec.sparse
-    rms = {"v0": _rms(v0), "v1": LARGEST * _rms(v1[cellular]), "v1phi1": _rms(v1phi1[cellular]),
-           "u": _rms(u)}  # fmt: skip
-    return {name: value / spec.buckled.pixel_size for name, value in rms.items()}
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    mm = {"v0": rms(v0), "v1": LARGEST * rms(v1[cellular]), "v1phi1": rms(v1phi1[cellular]),
+          "u": rms(u)}  # fmt: skip
+    return {name: value / spec.buckled.pixel_size for name, value in mm.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import AnyDistortion, read_distortion, write_distortion
-from modeharvest.imaging.distortion.lens import Distortion, ideal_points
+from modeharvest.imaging.distortion.lens import Distortion, apart_without_affine, ideal_points
 from modeharvest.imaging.distortion.target import CalibrationTarget, photograph_target
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.imageset import ImageSet, image_key, make_images
@@ -49,6 +49,7 @@ from modeharvest.util.files import atomic, copy_whole, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
+from modeharvest.validation.truth import rms
 from modeharvest.validation.whole_field import compare_whole
 
 _SIDECAR = "twin.json"
@@ -231,7 +232,7 @@ def _frame_rows(
 ) -> list[TruthCheck]:
     """What of one photograph was found, against the truth and the best fit of the ansatz."""
     px, found = result.grid.pixel_size, result.displacement()
-    left, lost = (_rms(field[inside]) / px for field in (true - found, best.displacement() - found))
+    left, lost = (rms(field[inside]) / px for field in (true - found, best.displacement() - found))
     rows = [
         TruthCheck(f"{name}: w = truth − IDIC, rms", left, "as measured", True, "px"),
         TruthCheck(f"{name}: IDIC − best fit, rms", lost, "small against w", lost < left, "px"),
@@ -263,14 +264,6 @@ def _frame_rows(
 def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthCheck:
     """Rms difference of two distortions per component, without what is affine in it."""
     row, col = np.linspace(0, grid.rows - 1, 60), np.linspace(0, grid.cols - 1, 75)
-    R, C = (axis.ravel() for axis in np.meshgrid(row, col, indexing="ij"))
-    apart = np.stack(found.shift(R, C)) - np.stack(true.shift(R, C))
-    design = np.column_stack([np.ones(R.size), R, C])
-    affine = design @ np.linalg.lstsq(design, apart.T, rcond=None)[0]
-    rms = _rms(apart.T - affine)
+    found_rms = rms(apart_without_affine(found, true, row[:, None], col[None, :]))
     words = "distortion of the lens: found − true without the affine part, rms per component"
-    return TruthCheck(words, rms, f"≤ {_LENS_PX:g}", rms <= _LENS_PX, "px")
-
-
-def _rms(values: NDArray[Any]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return TruthCheck(words, found_rms, f"≤ {_LENS_PX:g}", found_rms <= _LENS_PX, "px")

@@ -24,7 +24,7 @@ from modeharvest.idic.spectra.pattern import WavePattern
 from modeharvest.idic.spectra.spectrum import Spectrum
 from modeharvest.idic.uncertainty.covariance import FieldErrors
 from modeharvest.imaging.distortion.calibrate import Calibration
-from modeharvest.imaging.distortion.lens import Distortion
+from modeharvest.imaging.distortion.lens import Distortion, apart_without_affine
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.report.figures import fits, maps, style
@@ -321,19 +321,7 @@ def draw_distortion_sd(calibration: Calibration, grid: PixelGrid) -> Figure:
 
 def draw_distortion_error(found: Distortion, true: Distortion, grid: PixelGrid) -> Figure:
     """Draw the length of S_found - S_true without its affine part, which can't be observed."""
-    return _coloured(grid, np.hypot(*unaffine(found, true, grid)))
-
-
-def unaffine(found: Distortion, true: Distortion, grid: PixelGrid) -> FloatArray:
-    """(2, n, m) S_found - S_true [px] on a coarse grid over the image, its affine part removed."""
-    rows, cols = _positions(grid, _CELLS)
-    pairs = zip(found.shift(rows, cols), true.shift(rows, cols), strict=True)
-    difference = np.stack([np.broadcast_arrays(a - b, rows + cols)[0] for a, b in pairs])
-    row, col = np.broadcast_arrays(rows, cols)
-    basis = np.stack([np.ones(row.size), row.ravel(), col.ravel()], axis=1)
-    flat = difference.reshape(2, -1).T
-    left = flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]
-    return np.asarray(left.T.reshape(difference.shape))
+    return _coloured(grid, np.hypot(*apart_without_affine(found, true, *_positions(grid, _CELLS))))
 
 
 def _positions(grid: PixelGrid, count: int) -> tuple[FloatArray, FloatArray]:
