@@ -201,21 +201,10 @@ def grading_report(grading: Grading) -> Report:
                       "of the material, within one spacing of a measured point"),
         ],
         sections=[
-            Section(
-                "ranking", "Ranking", _ranking(grading),
-                caption("section-scores", edge=grading.edge_px, common=common)["lead"],
-            ),
-            Section(
-                "curves", "Distribution, regions, wavelengths", _score_curves(grading),
-                "Lost points are missing in the histogram and count as wrong in the distribution. "
-                "The spectrum is that of the error without its affine part, gaps counted as zero.",
-            ),
-            Section(
-                "maps", "Maps",
-                [_score_maps(of_field, scale, n) for n, of_field in enumerate(drawn)],
-                "Lengths of errors share one logarithmic scale; components have a scale for each "
-                "field. Blank: nothing measured within one spacing.",
-            ),
+            Section.of("ranking", _ranking(grading), "scores", edge=grading.edge_px, common=common),
+            Section.of("curves", _score_curves(grading), "score-curves"),
+            Section.of("maps", [_score_maps(field, scale, n) for n, field in enumerate(drawn)],
+                       "score-maps"),
         ],
         warnings=grading.notes,
         command=f"modeharvest score FIELD … --truth DIR --strain {grading.strain} --out DIR",
@@ -408,15 +397,10 @@ def star_report(grading: StarGrading) -> Report:
                       "standard deviation of v without motion"),
         ],
         sections=[
-            Section(
-                "ranking", "Ranking", Card.tabular(table, wide=True),
-                caption("section-resolution")["lead"],
-            ),
-            Section("curves", "Curves", _star_curves(grades),
-                    "Bands and bars are two standard errors. Grey lines: equal indicators."),
-            Section("maps", "Maps", [_star_maps(grade, n) for n, grade in enumerate(grades)],
-                    "The whole image, stretched along y; blank: nothing was measured. Errors have "
-                    "a scale for each code."),
+            Section.of("ranking", Card.tabular(table, wide=True), "resolution"),
+            Section.of("curves", _star_curves(grades), "star-curves"),
+            Section.of("maps", [_star_maps(grade, n) for n, grade in enumerate(grades)],
+                       "star-maps"),
         ],
         warnings=grading.notes,
         command="modeharvest benchmark resolution FIELD … --still FIELD … --set DIR --out DIR",

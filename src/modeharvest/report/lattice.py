@@ -333,15 +333,9 @@ def _mode_section(run: LatticeRun) -> Section:
             partial(figures.draw_lattice, still, run.pitch, u),
             f"eigenvalue {number(float(value))} N/mm⁴",
         ))  # fmt: skip
-    many = (
-        f"A set of {len(drawn)} modes, orthonormal over the material: any combination of modes of "
-        "the same eigenvalue is a mode as well. "
-    )
-    lead = (
-        f"{many if len(drawn) > 1 else ''}At a load of {percent(modes.load)}; drawn upon the "
-        f"undeformed lattice with a largest displacement of {DRAWN_AMPLITUDE} l."
-    )
-    return Section("modes", "Modes", [Card("Modes", drawn, wide=True)], lead)
+    many = text_of("lattice-modes", count=len(drawn)) if len(drawn) > 1 else ""
+    return Section.of("modes", [Card("Modes", drawn, wide=True)], many=many,
+                      load=percent(modes.load), largest=DRAWN_AMPLITUDE)  # fmt: skip
 
 
 def _branch_cards(summary: Summary, run: LatticeRun | None) -> list[Card]:

@@ -192,9 +192,9 @@ class Section:
     lead: str = ""
 
     @classmethod
-    def of(cls, name: str, cards: Sequence[Card], **values: object) -> Section:
-        """With the title and the lead of that name."""
-        return cls(name, cards=cards, **caption(f"section-{name}", **values))
+    def of(cls, name: str, cards: Sequence[Card], text: str = "", /, **values: object) -> Section:
+        """With the title and the lead named ``text``, or as the section."""
+        return cls(name, cards=cards, **caption(f"section-{text or name}", **values))
 
 
 @dataclass(frozen=True, eq=False)
