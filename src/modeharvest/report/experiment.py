@@ -101,10 +101,7 @@ def experiment_report(summary: Summary, data: ExperimentData | None = None) -> R
         },
         versions=summary.get("versions", {}),
         hero=_hero(data) if data is not None else None,
-        hero_caption=Markup(
-            "{}: the deformed speckle turns, from left to right, into the length of the "
-            "pattern that was measured in it, in the deformed configuration."
-        ).format(states[-1].label if states else ""),
+        hero_caption=text_of("experiment-hero", state=states[-1].label if states else ""),
     )
 
 
@@ -131,11 +128,10 @@ def _expected(summary: Summary) -> str:
 
 def _energies(summary: Summary) -> list[str]:
     return [
-        f"At {percent(row['nominal_strain'])} the buckled state stores an energy of "
-        f"{number(row['branch_N'])} N·mm per mm of thickness, the unstable one at the same strain "
-        f"{number(row['unstable_N'])} N·mm."
+        text_of("experiment-energy", at=percent(row["nominal_strain"]),
+                stable=number(row["branch_N"]), unstable=number(row["unstable_N"]))
         for row in summary.get("energy_below_unstable", [])
-    ]
+    ]  # fmt: skip
 
 
 def key_numbers(summary: Summary) -> list[KeyNumber]:
@@ -310,12 +306,7 @@ def panel_numbers(key: str, snapshot: Snapshot) -> str:
         return whole_panel_numbers(key, snapshot["whole_field"])
     part = {"w": "w", "best": "best_fit", "loss": "idic_to_best_fit"}.get(key, "")
     details = snapshot.get("details_px", {}).get(part)
-    if details is None:
-        return ""
-    return (
-        f"rms {details['rms_per_component']:.3g} px per component; lengths: median "
-        f"{details['median_length']:.3g} px, largest {details['max_length']:.3g} px"
-    )
+    return "" if details is None else text_of("experiment-lengths", **details)
 
 
 def _path_cards(solution: Solution) -> list[Card]:

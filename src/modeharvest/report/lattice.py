@@ -84,9 +84,7 @@ def lattice_report(summary: Summary, run: LatticeRun | None = None) -> Report:
         costs={"nodes of the primitive cell": number(len(run.mesh.nodes))} if run else {},
         versions=summary["versions"],
         hero=_hero(run) if run else None,
-        hero_caption="The pattern growing from left to right, up to a largest displacement of "
-        f"{DRAWN_AMPLITUDE} l. No equilibrium; the colours are the displacement’s length."
-        if summary["modes"] else "",
+        hero_caption=text_of("lattice-hero", largest=DRAWN_AMPLITUDE) if summary["modes"] else "",
     )  # fmt: skip
 
 
@@ -133,10 +131,8 @@ def findings(summary: Summary) -> list[str]:
     """What was found, in sentences."""
     text, point = [], summary["critical"]
     if point is not None and point["found"]:
-        text.append(
-            f"Critical strain {100 * point['load']:.4f} % under {point['loading']} loading, "
-            f"k·a = {waves_text(point)}: {proof(point)}."
-        )
+        text.append(text_of("lattice-critical", point=point, load=100 * point["load"],
+                            waves=waves_text(point), proof=proof(point)))  # fmt: skip
     elif point is not None:
         text.append(f"Under {point['loading']} loading: {summary['outcome']}; {proof(point)}.")
     text += [
@@ -445,26 +441,19 @@ def study_rows(rows: Sequence[ModeRow]) -> list[tuple[Cell, ...]]:
 
 def study_text(study: LatticeModeStudy) -> list[str]:
     """What a study shows, drawn from its rows."""
-    text = [
-        f"Under {limit.loading} loading the pattern is what buckles first from d/l = "
-        f"{limit.with_:.4g} on; at {limit.without:.4g} it is {_KINDS[limit.instead]}."
-        for limit in study.limits
-    ]
+    text = [text_of("lattice-limit", limit=limit, instead=_KINDS[limit.instead])
+            for limit in study.limits]  # fmt: skip
     limited = {limit.loading for limit in study.limits}
     for loading in dict.fromkeys(row.loading for row in study.ratios):
         rows = [row for row in study.ratios if row.loading == loading]
         if loading not in limited and all(row.is_first for row in rows):
             ratios = [row.ratio for row in rows]
-            text.append(f"Under {loading} loading it is the first for every d/l "
-                        f"looked at, from {min(ratios):.4g} to {max(ratios):.4g}.")  # fmt: skip
+            text.append(text_of("lattice-always", loading=loading, least=min(ratios),
+                                most=max(ratios)))  # fmt: skip
     if study.ratios:
         best = max(study.ratios, key=lambda row: row.overlap)
         worst = min(study.ratios, key=lambda row: row.overlap)
-        text.append(
-            f"The overlap with Eq. (mode) lies between {worst.overlap:.3f} (d/l = "
-            f"{worst.ratio:.4g}, {worst.loading}) and {best.overlap:.4f} (d/l = {best.ratio:.4g}, "
-            f"{best.loading})."
-        )
+        text.append(text_of("lattice-overlap", worst=worst, best=best))
     text += _likeness_text(study.scales, "cell sizes", " (1 to rounding by construction: equations "
                            "and mesh scale, only rounding differs)")  # fmt: skip
     return text + _likeness_text(study.materials, "materials", "")

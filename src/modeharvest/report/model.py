@@ -41,7 +41,7 @@ def caption(name: str, **values: object) -> dict[str, Any]:
     return {key: Markup(text).format(**values) for key, text in _captions()[name].items()}
 
 
-def text_of(name: str, **values: object) -> str:
+def text_of(name: str, /, **values: object) -> str:
     """The text of that name in ``captions.toml``, plain text, with values filled in."""
     return _captions()["text"][name].format(**values)
 

@@ -90,8 +90,8 @@ def photographs_report(summary: Summary, harvest: Harvest | None = None) -> Repo
         case=summary["experiment"],
         versions=summary["versions"],
         hero=hero,
-        hero_caption=f"{last['name']}, {photograph_label(last).lower()}: the photograph turns, "
-        "from left to right, into the length of the pattern that was measured in it.",
+        hero_caption=text_of("photographs-hero", name=last["name"],
+                             state=photograph_label(last).lower()),
     )  # fmt: skip
 
 
