@@ -366,9 +366,8 @@ def test_levels_out_of_range_are_told_before_anything_runs(
         ("speckle_size", 0.0, "above 0 times"),
         ("fill_factor", 2.0, "fill factor of 0"),
     ):
-        study = SystematicStudy(factors=(name,), levels={name: (level,)})
         with pytest.raises(InputError, match=said):
-            study.prepare(subject, folder)
+            SystematicStudy(factors=(name,), levels={name: (level,)}).prepare(subject, folder)
 
 
 def test_a_solution_of_another_experiment_is_not_taken(

@@ -73,11 +73,10 @@ class VariedFactor:
     def number(self, level: float | str) -> float:
         """A level as a number; InputError if it is none of the factor's."""
         by_name = isinstance(level, str)
-        if by_name or self.names:
-            known = self.names if by_name else range(len(self.names))
-            if level not in known:
-                expected = f"one of {list(self.names)}" if self.names else "numbers"
-                raise InputError(f"study: expected {expected} for {self.label}, got {level!r}")
+        known = self.names if by_name else range(len(self.names))
+        if (by_name or self.names) and level not in known:
+            expected = f"one of {list(self.names)}" if self.names else "numbers"
+            raise InputError(f"study: expected {expected} for {self.label}, got {level!r}")
         number = self.names.index(level) if isinstance(level, str) else level
         if self.whole and number != round(number):
             raise InputError(f"study: expected whole numbers for {self.label}, got {number:g}")
