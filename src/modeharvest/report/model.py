@@ -298,8 +298,7 @@ def study_report(
         warnings=[f"case {case['file']} failed: {case['error']}" for case in summary["failed"]],
         notes=_study_notes(summary),
         command=summary["command"],
-        remark=f"{summary['seeds'].capitalize()}. Run it again after an interruption: finished "
-        "cases are not repeated.",
+        remark=text_of("study-again", seeds=summary["seeds"].capitalize()),
         case=summary["case"],
         files=files or {},
         versions=summary["versions"],
@@ -315,13 +314,8 @@ def _study_notes(summary: Mapping[str, Any]) -> list[str]:
         for label, count in summary["other_results_by_version"].items()
     ]
     if summary["failed"]:
-        notes.append(f"{len(summary['failed'])} of {summary['cases']} cases failed; their "
-                     "tracebacks are in cases/.")  # fmt: skip
-    return [
-        *notes,
-        "A virtual experiment: what a real one adds (a lens, light, friction, a specimen that is "
-        "not plane) is not in it.",
-    ]
+        notes.append(text_of("study-failed", count=len(summary["failed"]), of=summary["cases"]))
+    return [*notes, text_of("study-virtual")]
 
 
 def draw_figures(figures: Iterable[ReportFigure], progress: Progress = silent) -> dict[str, str]:

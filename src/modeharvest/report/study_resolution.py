@@ -237,10 +237,7 @@ def report_resolution(found: ResolutionAnalysis, seeds: str) -> Findings:
 
 
 def _figures(found: ResolutionAnalysis, waves: pd.DataFrame, seeds: str) -> list[Card]:
-    again = (
-        " At one cell half of the wave is the pattern again: cos(πx/l) cos(2πx/l) holds cos(πx/l) "
-        "/ 2."
-    )
+    again = text_of("resolution-again")
     return [
         *(Card.captioned(f"transfer-{part}",
                          partial(draw_transfer, part, found.curves, waves, found.spec),

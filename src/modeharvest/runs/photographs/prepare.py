@@ -41,6 +41,7 @@ from modeharvest.imaging.photographs.photograph import (
     read_photograph,
     read_reference,
 )
+from modeharvest.report.model import text_of
 from modeharvest.runs.photographs.case import DistortionTable, PhotographCase
 from modeharvest.util.arrays import BoolArray, FloatImage
 from modeharvest.util.errors import InputError
@@ -200,25 +201,14 @@ def calibration_text(found: Calibration) -> tuple[str, ...]:
     row, col = (np.linspace(0.0, n - 1.0, 25) for n in found.distortion.shape)
     size = np.hypot(*found.distortion.shift(row[:, None], col[None, :])).max()
     turned = np.abs(found.angles).max()
-    text = (
-        f"S is a polynomial of degree {chosen.degree}, the one of {len(found.trials)} degrees with "
-        f"the lowest BIC; it reaches {size:.2f} px, and its standard deviation is "
-        f"{chosen.sd_px:.4f} px rms over the image.",
-        f"Degree {chosen.degree} is the highest that was tried, and it changed S by "
-        f"{chosen.change_px:.4f} px rms: a higher one may fit better still."
-        if chosen is found.trials[-1] and len(found.trials) > 1 else "",
-        "The shifts were taken as exact. S is relative to the stage's axes and scale; its "
-        "constant part can't be observed and is zero at the polynomial's mean."
-        if found.model.fixed == 1 else
-        "The shifts were not known, so the affine part of S can't be observed and is zero: "
-        "scale and skew of the image are open, as with any pixel size that isn't measured.",
-        f"The target turned by up to {1e3 * turned:.3f} mrad between the photographs "
-        f"(standard deviation {1e3 * found.angles_sd.max():.3f}); that was taken into account."
-        if turned > 0.0 else "",
-        "It was taken for granted that the target is flat, rigid and moves in its plane: a tilt "
-        "or a change of the distance to the lens would be taken for distortion.",
-    )  # fmt: skip
-    return tuple(filter(None, text))
+    text = [text_of("calibration-degree", chosen=chosen, count=len(found.trials), size=size)]
+    if chosen is found.trials[-1] and len(found.trials) > 1:
+        text.append(text_of("calibration-highest", chosen=chosen))
+    text.append(text_of(f"calibration-shifts-{'given' if found.model.fixed == 1 else 'unknown'}"))
+    if turned > 0.0:
+        sd = 1e3 * found.angles_sd.max()
+        text.append(text_of("calibration-turned", turned=1e3 * turned, sd=sd))
+    return (*text, text_of("calibration-target"))
 
 
 def calibrated_lens(folder: Path) -> Optics:
