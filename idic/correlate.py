@@ -68,24 +68,15 @@ def correlate(
     Minimises 1/2 sum (f(x) - g(x + u(x, a)))^2 over the pixels of the reference that show material:
     the paper's Eqs. (r), (dof_opt) and (u_dic).
 
-    Parameters
-    ----------
-    pair
-        Of images. Without a mask every pixel counts; without a deformed mask g is taken as it is.
-    ansatz
-        The kinematics.
-    strain
-        Nominal compression along x that the initial guess has, see :meth:`Ansatz.initial_guess`
-        [-]; by default the pair's, or 0 where that isn't known.
-    guess
-        (size,) unknowns to begin with, instead.
-    options, progress
-        How to correlate; listener.
+    InputError if both strain and guess are given, or the guess isn't one for the ansatz.
 
-    Raises
-    ------
-    InputError
-        If both strain and guess are given, or the guess isn't one for the ansatz.
+    pair : Of images. Without a mask every pixel counts; without a deformed mask g is taken as it
+        is.
+    ansatz : The kinematics.
+    strain : Nominal compression along x that the initial guess has, see
+        :meth:`Ansatz.initial_guess` [-]; by default the pair's, or 0 where that isn't known.
+    guess : (size,) unknowns to begin with, instead.
+    options, progress : How to correlate; listener.
     """
     options = options or CorrelationOptions()
     course, levels = _Course(options, progress), options.levels
@@ -170,26 +161,13 @@ def fit_displacement(
 
     Minimises 1/2 sum ||u(x) - u(x, a)||^2 over the pixels with the same engine.
 
-    Parameters
-    ----------
-    displacement
-        (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
-    grid, ansatz, guess
-        The pixels, the kinematics, and (size,) unknowns to begin with.
-    mask
-        (rows, cols) True where the displacement counts; everywhere by default.
-    options, progress
-        Tolerances and limits; listener.
+    Its ``residual_rms`` is in mm *per component*; sqrt(2) times it is the rms of the norm.
+    InputError if sizes differ, the mask is empty or the displacement is NaN inside it.
 
-    Returns
-    -------
-    Result
-        ``residual_rms`` is in mm *per component*; sqrt(2) times it is the rms of the norm.
-
-    Raises
-    ------
-    InputError
-        If sizes differ, the mask is empty or the displacement is NaN inside it.
+    displacement : (rows, cols, 2) u at the reference pixels [mm]; may be NaN outside the mask.
+    grid, ansatz, guess : The pixels, the kinematics, and (size,) unknowns to begin with.
+    mask : (rows, cols) True where the displacement counts; everywhere by default.
+    options, progress : Tolerances and limits; listener.
     """
     options = options or GaussNewtonOptions()
     course = _Course(CorrelationOptions(gauss_newton=options), progress)

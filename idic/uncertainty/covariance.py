@@ -250,14 +250,10 @@ class FieldErrors:
 def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLike) -> FieldErrors:
     """Propagate a covariance of the unknowns to the fields.
 
-    Parameters
-    ----------
-    x, y
-        Positions [mm] that broadcast together, or two axes. The errors are as smooth as the ansatz:
-        a coarse grid will do.
-    covariance
-        (n, n) of the unknowns: ``result.covariance(noise_sd)``, or one of a :class:`Covariance`.
-        Unknowns of infinite variance make the fields they touch infinite.
+    x, y : Positions [mm] that broadcast together, or two axes. The errors are as smooth as the
+        ansatz: a coarse grid will do.
+    covariance : (n, n) of the unknowns: ``result.covariance(noise_sd)``, or one of a
+        :class:`Covariance`. Unknowns of infinite variance make the fields they touch infinite.
     """
     ansatz, a = result.ansatz, result.unknowns
     matrix = np.asarray(covariance, dtype=np.float64)
