@@ -3,8 +3,8 @@
 
 ENV := scripts/env
 OUT := out/demo
-# On all cores, each with its own part of the files; who is done takes over from the others.
-PYTEST := python -m pytest -n logical --maxprocesses 8 --dist worksteal
+# On all cores, a file at a time to each: what the tests of a file share is made once.
+PYTEST := python -m pytest -n logical --maxprocesses 8 --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help demo lattices test lint test-next bench shipped clean

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 from collections.abc import Iterator
@@ -51,7 +52,8 @@ def coarse_pictures() -> Iterator[None]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """One thread for kernels where several processes share out the tests."""
+    """One thread for kernels where several processes share out the tests, file by file."""
+    config.option.loadscopereorder = False  # many tests in a file don't mean that it takes long
     if hasattr(config, "workerinput"):
         import numba
 
@@ -66,6 +68,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         with precompiling(("image", "correlate")) as kernels:
             for stage in kernels.children:
                 kernels.wait(stage)
+
+
+def pytest_collection_finish() -> None:
+    """Keep what the imports left, which is for good, out of every collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_pycollect_makemodule(

@@ -46,11 +46,11 @@ LATTICE = """
 kind = "square"
 pitch = 1.0
 diameter = 0.8696
-mesh_size = 0.2
+mesh_size = 0.3
 [loading]
 kind = "equibiaxial"
 [search]
-divisions = 4
+divisions = 2
 [dispersion]
 points = 8
 map_divisions = 0

@@ -207,6 +207,8 @@ def located_at(
     for _ in range(8):
         off = np.einsum("ka,kai->ki", shape_functions(mesh.element, xi), x) - target
         F = np.einsum("kai,kaj->kij", x, shape_gradients(mesh.element, xi))
-        xi -= np.linalg.solve(F, off[..., None])[..., 0]
-        xi = np.clip(xi, -1.0, 2.0)
+        step = np.linalg.solve(F, off[..., None])[..., 0]
+        xi = np.clip(xi - step, -1.0, 2.0)
+        if abs(step).max(initial=0.0) < 1e-12:  # in local coordinates: settled
+            break
     return element, xi
