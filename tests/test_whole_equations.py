@@ -17,15 +17,14 @@ from modeharvest.idic.finite_element.pixels import (
     continued_pixels,
     images_on,
     normal_equations,
-    pixels_of,
 )
 from modeharvest.idic.finite_element.system import (
     Body,
+    SmoothnessRoots,
     interior_sides,
-    smoothness_matrix,
-    smoothness_samples,
 )
 from modeharvest.idic.solver.pyramid import FULL
+from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
 
 
@@ -45,7 +44,7 @@ def straight(mesh: Mesh) -> Mesh:
 def test_smoothness_vanishes_for_quadratic_fields_alone(mesh: Mesh) -> None:
     mesh = straight(mesh)
     x, y = mesh.nodes.T
-    values, vectors = np.linalg.eigh(smoothness_matrix(mesh).toarray())
+    values, vectors = np.linalg.eigh(SmoothnessRoots.of(mesh).matrix().toarray())
     assert (values[:6] < 1e-9 * values[-1]).all()
     assert values[6] > 1e3 * abs(values[:6]).max()
     quadratic = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
@@ -54,7 +53,10 @@ def test_smoothness_vanishes_for_quadratic_fields_alone(mesh: Mesh) -> None:
 
 
 def test_curved_elements_leave_affine_fields_smooth(mesh: Mesh) -> None:
-    R, affine = smoothness_matrix(mesh), np.column_stack([np.ones(len(mesh.nodes)), mesh.nodes])
+    R, affine = (
+        SmoothnessRoots.of(mesh).matrix(),
+        np.column_stack([np.ones(len(mesh.nodes)), mesh.nodes]),
+    )
     assert abs(R @ affine).max() < 1e-12 * abs(R).max()
 
 
@@ -63,7 +65,7 @@ def test_waves_cost_the_sixth_power_of_their_wave_number() -> None:
     cost = {}
     for size in (16, 32):
         mesh = square(size)
-        R = smoothness_matrix(mesh)
+        R = SmoothnessRoots.of(mesh).matrix()
         for waves in (1, 2):
             u = np.cos(2.0 * np.pi * waves * mesh.nodes[:, 0])
             cost[size, waves] = float(u @ R @ u)
@@ -87,8 +89,8 @@ def square(count: int) -> Mesh:
 
 
 def test_samples_have_the_covariance_of_smoothness(mesh: Mesh) -> None:
-    R, count = smoothness_matrix(mesh), 2000
-    found = smoothness_samples(mesh, count).reshape(len(mesh.nodes), 2, count)
+    roots, count = SmoothnessRoots.of(mesh), 2000
+    R, found = roots.matrix(), roots.samples(count).reshape(len(mesh.nodes), 2, count)
     x, y = mesh.nodes.T
     for field in (np.sin(5 * x), x * y, np.cos(9 * y)):
         along = np.tensordot(field, found, 1)
@@ -111,9 +113,10 @@ def test_every_side_inside_has_two_cells(mesh: Mesh) -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_gradient_against_finite_differences(share: float) -> None:
     pair = plate_pair(quadratic_field)
-    body = Body(plate_mesh(), np.zeros((len(plate_mesh().nodes), 2)))
+    body = Body(plate_mesh())
     level = images_on(pair, FULL, 4, 5)
-    pixels = pixels_of(body.mesh, level.grid, level.mask, level.reference)
+    covered = locate(body.mesh.nodes, body.mesh.cells, "T6", level.grid).mask
+    pixels = body.pixels.on(level.grid, level.mask & covered, level.reference)
     if share:
         _, d_row, d_col = images_on(
             type(pair)(pair.deformed, pair.reference, GRID, pair.deformed_mask, pair.mask),
@@ -124,11 +127,11 @@ def test_gradient_against_finite_differences(share: float) -> None:
     random = np.random.default_rng(1)
     u = quadratic_field(body.mesh.nodes)
     there = normal_equations(pixels, body.mesh, level, u, share)
-    M, gradient = body.assembled(there)
+    M, gradient = body.matrix(there.blocks), body.vector(there.gradient)
     assert there.outside == 0
     if share:
         # At the truth both gradients are the same, but for what splines make of the images.
-        other, _ = body.assembled(normal_equations(pixels, body.mesh, level, u, 0.0))
+        other = body.matrix(normal_equations(pixels, body.mesh, level, u, 0.0).blocks)
         assert abs(M - other).max() < 2e-3 * abs(other).max()
         return
     step = 1e-6 * random.standard_normal(u.shape)

@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.fields import (
@@ -40,7 +39,7 @@ from modeharvest.idic.finite_element.fields import (
     mean_around,
     nodal_gradient,
 )
-from modeharvest.idic.finite_element.system import Body
+from modeharvest.idic.finite_element.system import SAMPLES, Linearised
 from modeharvest.util.arrays import FloatArray, IntArray
 
 _PROBES = 4
@@ -50,29 +49,6 @@ _STEP = 1.4
 _TINY = float(np.finfo(np.float64).tiny)
 _LEAST_PX, _MOST_PX = 6.0, 400.0
 """Shorter ones leave single nodes to what splines make of edges."""
-
-
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Normal equations at some displacement of the nodes."""
-
-    u: FloatArray
-    """(2 n,) [mm]."""
-    M: csr_array
-    gradient: FloatArray
-    """(2 n, 2 n) and (2 n,): sums of h h' and of h r."""
-    square_sum: float
-    pixels: int
-    """Sum of r^2, and how many pixels it is over."""
-    blocks: FloatArray
-    """(m, 3, 6, 6) parts of M, element by element."""
-    share: FloatArray
-    """(m,) of each element's slopes that is signal, not noise [-]."""
-    excess: FloatArray
-    """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
-    R: csr_array
-    penalty: FloatArray
-    """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +65,12 @@ class Risk:
     """Estimated standard deviation of the residual's noise [grey levels]."""
 
 
-def risk(body: Body, at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> Risk:
+def risk(at: Linearised, cutoff_px: float, pixel_size: float, excess: float) -> Risk:
     """Estimate the risk of one cut-off wavelength; ``excess`` is c."""
-    weight = body.weight(at.M, at.R, cutoff_px * pixel_size)
+    weight = at.weight(cutoff_px * pixel_size)
     z = np.random.default_rng(0).choice([-1.0, 1.0], (at.u.size, _PROBES))
     right = at.gradient - weight * at.penalty
-    found = body.factor(at.M, at.R, weight).solve(np.column_stack([right, at.M @ z]))
+    found = at.factor(weight).solve(np.column_stack([right, at.M @ z]))
     step = found[:, 0]
     Q = at.square_sum - 2.0 * float(step @ at.gradient) + float(step @ (at.M @ step))
     t = float(np.sum(z * found[:, 1:])) / _PROBES
@@ -103,17 +79,17 @@ def risk(body: Body, at: Linearised, cutoff_px: float, pixel_size: float, excess
 
 
 def least_risk(
-    body: Body, at: Linearised, first_px: float, pixel_size: float, excess: float
+    at: Linearised, first_px: float, pixel_size: float, excess: float
 ) -> tuple[Risk, ...]:
     """Try cut-off wavelengths from one on until the risk rises on both sides; ascending."""
-    tried = {0: risk(body, at, first_px, pixel_size, excess)}
+    tried = {0: risk(at, first_px, pixel_size, excess)}
     while True:
         best = min(tried, key=lambda k: tried[k].value)
         missing = [k for k in (best - 1, best + 1) if k not in tried]
         if not missing or not _LEAST_PX < tried[best].cutoff_px < _MOST_PX:
             return tuple(tried[k] for k in sorted(tried))
         cutoff = first_px * _STEP ** missing[0]
-        tried[missing[0]] = risk(body, at, cutoff, pixel_size, excess)
+        tried[missing[0]] = risk(at, cutoff, pixel_size, excess)
 
 
 def best_of(tried: tuple[Risk, ...]) -> float:
@@ -126,18 +102,8 @@ def best_of(tried: tuple[Risk, ...]) -> float:
     return max(float(tried[k].cutoff_px * _STEP**shift), _LEAST_PX)
 
 
-_SAMPLES = 16
-"""Of the distribution of noise: its standard deviations are known to 18 %."""
-
-
 _STRONGER = 4.0
 """Weight of the regularisation that shows its bias, over the weight used [-]."""
-
-
-def newton_step(body: Body, at: Linearised, cutoff: float, times: float = 1.0) -> FloatArray:
-    """(2 n,) Gauss-Newton step for a cut-off wavelength [mm], or with its weight so many times."""
-    weight = times * body.weight(at.M, at.R, cutoff)
-    return body.factor(at.M, at.R, weight).solve(at.gradient - weight * at.penalty)
 
 
 class Deviations(NamedTuple):
@@ -166,9 +132,7 @@ class Deviations(NamedTuple):
         )
 
 
-def deviations(
-    body: Body, at: Linearised, cutoff: float, noise: float, unknowns: float
-) -> Deviations:
+def deviations(at: Linearised, cutoff: float, noise: float, unknowns: float) -> Deviations:
     """Estimate what noise and smoothing make of u.
 
     By noise, A^-1 e for random e of the covariance M times that of the noise, more of it in
@@ -179,22 +143,22 @@ def deviations(
     noise : its standard deviation at long wavelengths [grey levels].
     unknowns : their effective number.
     """
-    mesh = body.mesh
-    stronger = newton_step(body, at, cutoff, _STRONGER)
-    weight = body.weight(at.M, at.R, cutoff)
-    factor = body.factor(at.M, at.R, weight)
-    change = (stronger - factor.solve(at.gradient - weight * at.penalty)).reshape(-1, 2)
-    blocks = at.blocks * at.excess[:, None, None, None]
-    samples = body.samples(blocks, _SAMPLES), body.prior_samples(_SAMPLES)
-    by_noise, prior = (factor.solve(right).reshape(-1, 2, _SAMPLES) for right in samples)
-    blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
-    # The roughness that was found is that of so many unknowns, or the weight is too large.
-    grown = float((at.u - body.start.ravel()) @ at.penalty)
-    rough = weight * grown / max(noise**2 * unknowns, _TINY)
-    wide = np.sqrt(weight * blank * max(1.0, rough))
-    found = noise * (by_noise + wide[:, None, None] * prior)
-    slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, _SAMPLES, 2)
-    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / _SAMPLES
+    mesh = at.body.mesh
+    weight = at.weight(cutoff)
+    factor = at.factor(weight)
+    here = at.step(cutoff)
+    random = at.body.samples(at.blocks * at.excess[:, None, None, None])
+    found = noise * factor.solve(random).reshape(-1, 2, SAMPLES)
+    if at.prior.samples is not None:
+        blank = mean_around(mesh, np.repeat(1.0 - at.share, 6).reshape(-1, 6))
+        # The roughness that was found is that of so many unknowns, or the weight is too large.
+        grown = float((at.u - at.prior.start) @ at.penalty)
+        rough = weight * grown / max(noise**2 * unknowns, _TINY)
+        wide = noise * np.sqrt(weight * blank * max(1.0, rough))
+        found += wide[:, None, None] * factor.solve(at.prior.samples).reshape(-1, 2, SAMPLES)
+    change = (at.step(cutoff, _STRONGER) - here).reshape(-1, 2)
+    slopes = nodal_gradient(mesh, found.reshape(len(found), -1)).reshape(-1, 2, SAMPLES, 2)
+    spread = np.einsum("nisj,nksl->nijkl", slopes, slopes).reshape(-1, 4, 4) / SAMPLES
     error = interpolation_error(mesh, at.u.reshape(-1, 2))
     return Deviations(found, error, spread).with_bias(mesh, change)
 

@@ -18,28 +18,25 @@ from modeharvest.fem.field import Mesh, boundary_sides
 from modeharvest.fem.materials import Material
 from modeharvest.idic.finite_element.cutoff import (
     Deviations,
-    Linearised,
     Risk,
     best_of,
     contradicted,
     deviations,
     least_risk,
-    newton_step,
     risk,
 )
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
+from modeharvest.idic.finite_element.mesh import quadratic
 from modeharvest.idic.finite_element.pixels import (
     NONE_CONTINUED,
+    ContinuedPixels,
     ElementPixels,
     continued,
     continued_pixels,
     images_on,
     normal_equations,
-    pixels_of,
-    require_cover,
 )
 from modeharvest.idic.finite_element.result import NodalResult, Step
-from modeharvest.idic.finite_element.system import Body, Imbalance
+from modeharvest.idic.finite_element.system import Body, Imbalance, Linearised, Smoothness
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.final_smoothing import speckle_size, spline_order
 from modeharvest.idic.solver.noise import NoiseTransfer, estimated_noise, slope_noise
@@ -52,7 +49,7 @@ from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.progress import Progress, silent
 
-_FIRST_PX = 20.0
+_FIRST_PX = 18.0
 """Cut-off wavelength from which on the best one is sought [px]."""
 _FIRST_WITH_LAW_PX = 150.0
 _WRONG = 0.075
@@ -61,8 +58,11 @@ because smoothing takes more away at edges than bars know. Measured values: docs
 """
 _BLANK = 0.01
 """Part of the material without speckle, beyond which that is warned of."""
+_SHORT_PX = 0.1
+"""After shorter steps the matrices are kept, where only the images make them change and steps get
+shorter; rms over the nodes [px]."""
 _ROUNDS = 3
-_SETTLED = 0.25
+_SETTLED = 0.5
 """Relative change of the cut-off wavelength that needs no other round."""
 
 
@@ -110,8 +110,8 @@ class FiniteElementOptions:
     steps: int = 4
     """Of Gauss-Newton in each stage, at most."""
     tolerance_px: float = 5e-3
-    """The last stage ends with a step shorter than that, earlier ones with ten times that [px]; rms
-    over the nodes."""
+    """The last stage ends with a step shorter than that, those before with ten times that, or on
+    blurred images with 80 times [px]; rms over the nodes."""
     longest_step_px: float = 8.0
     """Of a node [px]."""
 
@@ -134,7 +134,7 @@ Start = Callable[[FloatArray], FloatArray]
 def measure_displacement(
     pair: ImagePair,
     start: Result | Start,
-    mesh: Mesh | None = None,
+    on: Mesh | Body | None = None,
     *,
     options: FiniteElementOptions | None = None,
     progress: Progress = silent,
@@ -149,122 +149,166 @@ def measure_displacement(
     pair : of images. Without a mask every pixel counts.
     start : where the measurement begins: a correlation's result, or any displacement closer to the
         truth than about 10 px; what is found is smooth relative to it.
-    mesh : T6 or T3, in the reference's frame [mm]; by default made from the pair's mask.
+    on : a mesh, T6 or T3, in the reference's frame [mm]; by default made from the pair's mask. For
+        several images a Body, so that what they have in common is done once.
     options : how to measure.
     progress : listener.
     """
-    options = options or FiniteElementOptions()
-    warnings: tuple[str, ...] = ()
-    if mesh is None:
-        edge = options.edge_element_px
-        mask, warnings = meshable(pair.masks[0], edge)
-        pair = replace(pair, mask=mask)
-        mesh = mesh_of_mask(mask, pair.grid, options.element_px, edge)
-    mesh = quadratic(mesh)
-    begin = (
-        start.ansatz.displacement_at(start.unknowns, mesh.nodes)
-        if isinstance(start, Result)
-        else np.asarray(start(mesh.nodes), dtype=np.float64)
-    )
-    if begin.shape != mesh.nodes.shape or not np.isfinite(begin).all():
-        raise InputError(
-            f"expected a start of finite displacements {mesh.nodes.shape} at the nodes, got "
-            f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
-        )
-    course = _Measurement(pair, Body(mesh, begin), options, warnings)
-    for k, stage in enumerate(options.stages):
-        progress(k, len(options.stages) + 1, "whole displacement")
+    course = _Measurement.begun(pair, start, on, options or FiniteElementOptions())
+    count = len(course.options.stages) + 1
+    for k, stage in enumerate(course.options.stages):
+        progress(k, count, "whole displacement")
         course.through(stage)
-    progress(len(options.stages), len(options.stages) + 1, "whole displacement")
+    progress(count - 1, count, "whole displacement")
     course.regularise()
     progress(1, 1, "whole displacement")
     return course.result()
+
+
+def coarse_displacement(
+    pair: ImagePair, start: Result | Start, on: Body, *, options: FiniteElementOptions
+) -> FloatArray:
+    """(n, 2) u [mm] after the stages before the last; for the rest see `measure_displacement`."""
+    course = _Measurement.begun(pair, start, on, options)
+    for stage in options.stages:
+        course.through(stage)
+    return course.u.reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelOnMesh:
+    """A level of a pair of images on a mesh, and what weighs its residual."""
+
+    level: Level
+    images: LevelPair
+    pixels: ElementPixels
+    share: float = 0.0
+    """Of the reference's gradient in what weighs the residual [-]."""
+    blur: float = 0.0
+    """Of the image whose gradient that is [px]."""
+    slope_noise: float = 0.0
+    """Variance of that gradient by noise [grey levels^2/mm^2]."""
+    continued: ContinuedPixels = NONE_CONTINUED
 
 
 class _Measurement:
     """A measurement on its way: the images of a stage, the displacement of the nodes."""
 
     def __init__(
-        self, pair: ImagePair, body: Body, options: FiniteElementOptions, warnings: tuple[str, ...]
+        self, pair: ImagePair, body: Body, start: FloatArray, options: FiniteElementOptions
     ) -> None:
-        self.pair, self.body, self.options = pair, body, options
-        self.u = body.start.ravel().copy()
+        self.pair, self.body, self.start, self.options = pair, body, start, options
+        self.prior: Smoothness | Imbalance = Smoothness(body, start)
+        self.u = start.ravel().copy()
         self.history: list[Step] = []
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
-        self._level: Level | None = None
-        self.images: LevelPair
-        self.pixels: ElementPixels
-        self.share, self.slope_noise, self.continued = 0.0, 0.0, NONE_CONTINUED
+        self.on: _LevelOnMesh | None = None
+        self.kept: Linearised | None = None
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
         self.tried: tuple[Risk, ...] = ()
-        self.warnings = warnings
+        self.warnings = body.changes
         self.speckle_px = speckle_size(pair.reference, pair.mask)
         self.order = options.order or spline_order(self.speckle_px)
+
+    @classmethod
+    def begun(
+        cls, pair: ImagePair, start: Result | Start, on: Mesh | Body | None,
+        options: FiniteElementOptions,
+    ) -> _Measurement:  # fmt: skip
+        """From a start; on a mesh of the pair's mask if there is none."""
+        if on is None:
+            sizes = options.element_px, options.edge_element_px
+            on = Body.of_mask(pair.masks[0], pair.grid, *sizes)
+        body = on if isinstance(on, Body) else Body(quadratic(on))
+        nodes = body.mesh.nodes
+        begin = (
+            start.ansatz.displacement_at(start.unknowns, nodes)
+            if isinstance(start, Result)
+            else np.asarray(start(nodes), dtype=np.float64)
+        )
+        if begin.shape != nodes.shape or not np.isfinite(begin).all():
+            raise InputError(
+                f"expected a start of finite displacements {nodes.shape} at the nodes, got "
+                f"{begin.shape} with {int((~np.isfinite(begin)).sum())} NaN or infinite"
+            )
+        pair = pair if body.mask is None else replace(pair, mask=pair.masks[0] & body.mask)
+        return cls(pair, body, begin, options)
 
     def _lap(self, step: str) -> None:
         now = time.perf_counter()
         self.laps[step] = self.laps.get(step, 0.0) + now - self._last
         self._last = now
 
-    def _prepare(self, level: Level) -> None:
-        if level == self._level:
-            return
-        order = self.order if level == FULL else 5
-        self._level, self.images = level, images_on(self.pair, level, self.options.edge_px, order)
-        grid, mask = self.images.grid, self.images.mask
-        self.pixels = pixels_of(self.body.mesh, grid, mask, self.images.reference)
-        require_cover(self.pixels, mask)
-        if level == FULL:
-            self._weigh_by_reference()
-        else:
-            self.share, self.slope_noise, self.continued = 0.0, 0.0, NONE_CONTINUED
-        self._lap("images")
+    def _prepare(self, level: Level) -> _LevelOnMesh:
+        if self.on is None or self.on.level != level:
+            order = self.order if level == FULL else 5
+            images = images_on(self.pair, level, self.options.edge_px, order)
+            pixels = self.body.pixels.on(images.grid, images.mask, images.reference)
+            self.on, self.kept = _LevelOnMesh(level, images, pixels), None
+            if level == FULL:
+                self.on = self._weighed_by_reference(self.on)
+            self._lap("images")
+        return self.on
 
-    def _weigh_by_reference(self) -> None:
+    def _weighed_by_reference(self, on: _LevelOnMesh) -> _LevelOnMesh:
         """Weigh the residual by the reference's gradient, blurred as noise asks for."""
         f, mask, px = self.pair.reference, self.pair.masks[0], self.pair.grid.pixel_size
         spline = SplineImage.of(continued(f, mask), self.order)
-        _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
+        _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
         noise = estimated_noise(f, mask).sd ** 2
         square = 0.5 * float(np.mean(d_row**2 + d_col**2)) - noise * slope_noise(self.order, 0.0)
         blur = best_blur(noise / max(square, 0.2 * square), self.speckle_px, self.order)
         if blur > 0.0:
             spline = SplineImage.of(smoothed(f, mask, blur), self.order)
-            _, d_row, d_col = spline.sample(self.pixels.row, self.pixels.col)
+            _, d_row, d_col = spline.sample(on.pixels.row, on.pixels.col)
         slope = np.stack([d_col, -d_row]).astype(np.float32) / np.float32(px)
-        self.pixels, self.share, self.blur = self.pixels._replace(slope=slope), 1.0, blur
-        self.slope_noise = noise * slope_noise(self.order, blur) / px**2
-        self.continued = continued_pixels(self.pair, noise)
+        return replace(
+            on, pixels=on.pixels._replace(slope=slope), share=1.0, blur=blur,
+            slope_noise=noise * slope_noise(self.order, blur) / px**2,
+            continued=continued_pixels(self.pair, noise),
+        )  # fmt: skip
 
     def linearised(self) -> Linearised:
-        nodal = self.u.reshape(-1, 2)
+        """Normal equations at u; after short steps with the matrices that there are."""
+        on, kept, body = self.on, self.kept, self.body
+        assert on is not None
+        nodal, is_new = self.u.reshape(-1, 2), kept is None
         found = normal_equations(
-            self.pixels, self.body.mesh, self.images, nodal, self.share, self.continued
+            on.pixels, body.mesh, on.images, nodal, on.share, on.continued, is_new
         )
         if found.pixels == 0:
             raise InputError("expected pixels of the material in both images, got none in common")
-        found, share = found.weighed(self.slope_noise)
-        M, gradient = self.body.assembled(found)
+        R, penalty = self.prior.linearised(self.u)
+        if kept is None:
+            blocks, share = found.weighed(on.slope_noise)
+            M = body.matrix(blocks)
+            ratio = body.energies(M) / body.energies(R)
+        else:
+            blocks, M, share, ratio = kept.blocks, kept.M, kept.share, kept.ratio
+        gradient = body.vector(share[:, None, None] * found.gradient)
         mean = found.squares / np.maximum(found.counts, 1.0)
         least = np.finfo(np.float64).tiny
         excess = np.maximum(mean * found.pixels / max(found.square_sum, least), 1.0)
         self._lap("pixels")
-        return Linearised(
-            self.u, M, gradient, found.square_sum, found.pixels, found.blocks, share, excess,
-            *self.body.penalty(self.u),
+        self.kept = Linearised(
+            body, self.prior, self.u, M, gradient, found.square_sum, found.pixels, blocks, share,
+            excess, R, penalty, ratio,
         )  # fmt: skip
+        return self.kept
 
     def through(self, stage: Stage, tolerance_px: float | None = None) -> None:
         """Take steps until they are short."""
         self._prepare(stage.level)
         px = self.pair.grid.pixel_size
         if tolerance_px is None:
-            tolerance_px = 10.0 * self.options.tolerance_px
+            times = 10.0 if stage.level == FULL else 80.0
+            tolerance_px = times * self.options.tolerance_px
+        last = np.inf
         for number in range(1, self.options.steps + 1):
             at = self.linearised()
-            step = newton_step(self.body, at, stage.cutoff_px * px)
+            step = at.step(stage.cutoff_px * px)
             length = np.linalg.norm(step.reshape(-1, 2), axis=1) / px
             share = np.minimum(1.0, self.options.longest_step_px / np.maximum(length, 1e-12))
             self.u = at.u + step * np.repeat(share, 2)
@@ -273,6 +317,9 @@ class _Measurement:
             self.history.append(
                 Step(stage.level, stage.cutoff_px, number, residual, rms, float(length.max()))
             )
+            if not self.prior.is_linear or rms > min(_SHORT_PX, 0.5 * last):
+                self.kept = None
+            last = rms
             self._lap("factor")
             if rms < tolerance_px:
                 break
@@ -285,15 +332,16 @@ class _Measurement:
         if law is not None:
             mesh = self.body.mesh
             self.free = self.u.copy(), self._assessed()[2]
-            self.body.law = Imbalance(mesh, law.material, law.loaded(mesh.nodes))
+            self.prior = Imbalance(mesh, law.material, law.loaded(mesh.nodes))
+            self.kept = None
             self._regularised(_FIRST_WITH_LAW_PX, given)
 
     def _assessed(self) -> tuple[Linearised, Risk, Deviations]:
         """What there is at the present displacement."""
         at, excess, px = self.linearised(), self._excess(), self.pair.grid.pixel_size
-        here = risk(self.body, at, self.cutoff_px, px, excess)
+        here = risk(at, self.cutoff_px, px, excess)
         noise = here.noise * np.sqrt(excess)
-        return at, here, deviations(self.body, at, self.cutoff_px * px, noise, here.unknowns)
+        return at, here, deviations(at, self.cutoff_px * px, noise, here.unknowns)
 
     def _against_law_free(self, sd: Deviations) -> Deviations:
         """Count the difference to the law-free solution as bias; notice a law that is wrong."""
@@ -320,8 +368,8 @@ class _Measurement:
             cutoff = first_px
             for _ in range(_ROUNDS):
                 self.through(Stage(FULL, cutoff))
-                before = cutoff
-                self.tried = least_risk(self.body, self.linearised(), before, px, self._excess())
+                before, self.kept = cutoff, None  # the risk needs the matrix at u itself
+                self.tried = least_risk(self.linearised(), before, px, self._excess())
                 cutoff = best_of(self.tried)
                 self._lap("cut-off")
                 if abs(np.log(cutoff / before)) < _SETTLED:
@@ -356,8 +404,9 @@ class _Measurement:
                 "the mesh, or of the mask, shows no speckle that is in both images; check them"
             )
         self._lap("standard deviations")
-        outside = int(self.pixels.start[-1]) - at.pixels
-        counts = np.diff(self.pixels.start)
+        on = self._prepare(FULL)
+        outside = int(on.pixels.start[-1]) - at.pixels
+        counts = np.diff(on.pixels.start)
         blank = float(counts[at.share == 0.0].sum() / counts.sum())
         if blank > _BLANK:
             self.warnings += (
@@ -367,7 +416,7 @@ class _Measurement:
         return NodalResult(
             mesh=self.body.mesh,
             displacement=self.u.reshape(-1, 2),
-            start=self.body.start,
+            start=self.start,
             standard_deviation=np.hypot(sd.by_noise, sd.bias),
             noise_deviation=sd.by_noise,
             gradient_covariance=sd.gradient,
@@ -379,7 +428,7 @@ class _Measurement:
             pixels=at.pixels,
             outside=outside,
             effective_unknowns=here.unknowns,
-            blur_px=self.blur,
+            blur_px=on.blur,
             library=self.body.library,
             history=tuple(self.history),
             timings_s=self.laps,

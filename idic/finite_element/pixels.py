@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.solver.noise import estimated_noise
-from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, level_pair
+from modeharvest.idic.solver.pyramid import FULL, Level, LevelPair, eroded, level_pair
 from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.isoparametric import locate
 from modeharvest.imaging.pair import ImagePair
@@ -86,7 +86,10 @@ def continued_pixels(pair: ImagePair, noise_f: float) -> ContinuedPixels:
     outermost = mask & ~inside
     noise_g, ratio = estimated_noise(g, mask).sd ** 2, _LARGEST_VARIANCE
     if inside.any():
-        error = float(np.mean((continued(g, inside)[outermost] - g[outermost]) ** 2))
+        found, (rows, cols) = np.empty(g.shape, np.float32), np.nonzero(outermost)
+        of_material = readable(g), readable(inside)
+        in_parallel(_continue, *of_material, readable(rows), readable(cols), found)
+        error = float(np.mean((found[outermost] - g[outermost]) ** 2))
         # The tried pixel has noise itself, and so would have the one that is missing.
         excess, noise = max(0.0, error - 2.0 * noise_g), float(noise_f + noise_g)
         ratio = min(ratio, excess / noise) if noise > 0.0 else ratio
@@ -99,12 +102,13 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     Parameters
     ----------
     image : (rows, cols) grey levels.
-    mask : (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is
-        kept.
+    mask : (rows, cols) True on material; farther than 4 px from it there is its mean.
     """
-    distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
-    filled = np.ascontiguousarray(image[tuple(nearest)])
-    rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
+    outside = ~mask
+    beyond = eroded(outside, _REACH_PX)
+    filled = np.ascontiguousarray(image, np.float32).copy()
+    filled[beyond] = image[mask].mean(dtype=np.float64)
+    rows, cols = np.nonzero(outside & ~beyond)
     of_material = readable(image), readable(mask)
     in_parallel(_continue, *of_material, readable(rows), readable(cols), filled)
     return filled
@@ -160,35 +164,47 @@ class ElementPixels(NamedTuple):
     """(2, p) float32 gradient of f there, along x and y [grey levels/mm]; or (2, 0)."""
 
 
-def pixels_of(mesh: Mesh, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
-    """Sort the pixels of a mask by the elements of a T6 mesh; those beside the mesh are left out.
+class MeshPixels:
+    """Pixels of masks sorted by the elements of a T6 mesh, those of each mask once."""
 
-    ``image`` (rows, cols) is f.
-    """
-    located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
-    flat = np.flatnonzero(mask & located.mask)
-    element = located.element.ravel()[flat]
-    order = np.argsort(element, kind="stable")
-    flat, element = flat[order], element[order]
-    row, col = np.divmod(flat, grid.cols)
-    start = np.searchsorted(element, np.arange(len(mesh.cells) + 1))
-    xi = located.values.reshape(2, -1)[:, flat].astype(np.float32)
-    grey = np.asarray(image, np.float32).ravel()[flat]
-    none = np.empty((2, 0), np.float32)
-    return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, grey, none)
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._kept: dict[tuple[PixelGrid, int], tuple[BoolArray, ElementPixels]] = {}
+
+    def on(self, grid: PixelGrid, mask: BoolArray, image: NDArray[Any]) -> ElementPixels:
+        """Those of a mask (rows, cols) that are in the mesh, with f (rows, cols) there.
+
+        InputError if pixels of the mask lie farther than 2 px from those in elements.
+        """
+        key = grid, int(mask.sum())
+        kept = self._kept.get(key)
+        if kept is None or not np.array_equal(kept[0], mask):
+            kept = self._kept[key] = mask, self._sorted(grid, mask)
+        pixels = kept[1]
+        grey = np.asarray(image, np.float32)[pixels.row, pixels.col]
+        return pixels._replace(grey=grey)
+
+    def _sorted(self, grid: PixelGrid, mask: BoolArray) -> ElementPixels:
+        mesh = self.mesh
+        located = locate(mesh.nodes, mesh.cells, mesh.element, grid, "mesh of the material")
+        _require_cover(located.mask, mask)
+        flat = np.flatnonzero(mask & located.mask)
+        element = located.element.ravel()[flat]
+        order = np.argsort(element, kind="stable")
+        flat, element = flat[order], element[order]
+        row, col = np.divmod(flat, grid.cols)
+        start = np.searchsorted(element, np.arange(len(mesh.cells) + 1))
+        xi = located.values.reshape(2, -1)[:, flat].astype(np.float32)
+        none = np.empty((2, 0), np.float32)
+        return ElementPixels(start, row.astype(np.int32), col.astype(np.int32), xi, none[0], none)
 
 
-_BEYOND_PX = 2.0
-"""How far from the mesh the edge of a mask may be."""
+_BEYOND_PX = 2
+"""How far from the mesh the edge of a mask may be, along rows and columns."""
 
 
-def require_cover(pixels: ElementPixels, mask: BoolArray) -> None:
-    """Raise InputError if pixels of a mask lie farther than 2 px from those in elements."""
-    if pixels.row.size == mask.sum():
-        return
-    there = np.zeros_like(mask)
-    there[pixels.row, pixels.col] = True
-    far = mask & (ndimage.distance_transform_edt(~there) > _BEYOND_PX)
+def _require_cover(covered: BoolArray, mask: BoolArray) -> None:
+    far = mask & eroded(~covered, _BEYOND_PX)
     if far.any():
         row, col = np.argwhere(far)[0]
         raise InputError(
@@ -203,7 +219,8 @@ class NodalEquations:
     """Normal equations of the nodes' displacements, element by element."""
 
     blocks: FloatArray
-    """(m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2]."""
+    """(m, 3, 6, 6) sums of N_a N_b h_i h_j for i j = x x, x y, y y [grey levels^2/mm^2], or
+    (0, 3, 6, 6)."""
     gradient: FloatArray
     """(m, 6, 2) sums of N_a h_i r [grey levels^2/mm]."""
     squares: FloatArray
@@ -224,8 +241,8 @@ class NodalEquations:
         """How many that is over."""
         return int(self.counts.sum())
 
-    def weighed(self, noise: float) -> tuple[NodalEquations, FloatArray]:
-        """The equations, each element weighed by its share of signal (m,) from 0 to 1.
+    def weighed(self, noise: float) -> tuple[FloatArray, FloatArray]:
+        """The blocks, each element weighed by its share of signal (m,) from 0 to 1; and that.
 
         ``noise``: variance of the slopes h that is noise [grey levels^2/mm^2]. Such slopes show no
         displacement: of a sum of h h' only that share is what an element's residual changes by.
@@ -233,8 +250,7 @@ class NodalEquations:
         slopes = self.blocks[:, [0, 2]].sum(axis=(1, 2, 3))  # shape functions sum to 1
         share = 1.0 - 2.0 * noise * self.weights / np.maximum(slopes, np.finfo(np.float64).tiny)
         share[(share < _LEAST_SHARE) | (slopes <= 0.0)] = 0.0
-        blocks = share[:, None, None, None] ** 2 * self.blocks
-        return replace(self, blocks=blocks, gradient=share[:, None, None] * self.gradient), share
+        return share[:, None, None, None] ** 2 * self.blocks, share
 
 
 def normal_equations(
@@ -244,6 +260,7 @@ def normal_equations(
     u: FloatArray,
     share: float,
     continued_in_g: ContinuedPixels = NONE_CONTINUED,
+    with_blocks: bool = True,
 ) -> NodalEquations:
     """Pass over all pixels.
 
@@ -256,9 +273,14 @@ def normal_equations(
     share : of the reference's gradient, pushed forward, in what weighs the residual; the rest is
         that of the deformed image at x + u [-].
     continued_in_g : pixels of the deformed image that are continued, by which residuals weigh.
+    with_blocks : whether the blocks are needed, which take most of the time.
     """
     m = len(mesh.cells)
-    blocks, gradient, sums = np.zeros((m, 3, 6, 6)), np.zeros((m, 6, 2)), np.zeros((m, 4))
+    blocks, gradient, sums = (
+        np.zeros((m * with_blocks, 3, 6, 6)),
+        np.zeros((m, 6, 2)),
+        np.zeros((m, 4)),
+    )
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
     g = level.deformed
     in_parallel(
@@ -291,11 +313,9 @@ def accumulate_elements(
             for m in range(n):
                 sums[e, 0] += own[2, m] * own[2, m]
                 sums[e, 3] += own[3, m]
-            _add(n, N, own, h, blocks[e], gradient[e])
-        for a in range(6):
-            for b in range(a):
-                for k in range(3):
-                    blocks[e, k, a, b] = blocks[e, k, b, a]
+            _add(n, N, own, gradient[e])
+            if blocks.shape[0]:
+                _add_products(n, N, own, h, blocks[e])
 
 
 @compiled(relaxed=True)
@@ -380,18 +400,27 @@ def _weigh(n: int, outside: Any, variance: float, own: Any) -> None:
 
 
 @compiled(relaxed=True)
-def _add(n: int, N: Any, own: Any, h: Any, blocks: Any, gradient: Any) -> None:
-    """Add a block's products to an element's sums, its upper triangle."""
+def _add(n: int, N: Any, own: Any, gradient: Any) -> None:
+    """Add a block's slopes times residuals to an element's sums."""
     g_x, g_y, residual = own[0], own[1], own[2]
     for a in range(6):
-        N_a, h_x, h_y = N[a], h[0], h[1]
+        N_a = N[a]
         r_x = r_y = 0.0
         for m in range(n):
-            h_x[m], h_y[m] = N_a[m] * g_x[m], N_a[m] * g_y[m]
-            r_x += h_x[m] * residual[m]
-            r_y += h_y[m] * residual[m]
+            r_x += N_a[m] * g_x[m] * residual[m]
+            r_y += N_a[m] * g_y[m] * residual[m]
         gradient[a, 0] += r_x
         gradient[a, 1] += r_y
+
+
+@compiled(relaxed=True)
+def _add_products(n: int, N: Any, own: Any, h: Any, blocks: Any) -> None:
+    """Add a block's products of slopes to an element's sums."""
+    g_x, g_y = own[0], own[1]
+    for a in range(6):
+        N_a, h_x, h_y = N[a], h[0], h[1]
+        for m in range(n):
+            h_x[m], h_y[m] = N_a[m] * g_x[m], N_a[m] * g_y[m]
         for b in range(a, 6):
             N_b = N[b]
             xx = xy = yy = 0.0
@@ -402,3 +431,6 @@ def _add(n: int, N: Any, own: Any, h: Any, blocks: Any, gradient: Any) -> None:
             blocks[0, a, b] += xx
             blocks[1, a, b] += xy
             blocks[2, a, b] += yy
+            if a < b:
+                blocks[0, b, a], blocks[1, b, a] = blocks[0, a, b], blocks[1, a, b]
+                blocks[2, b, a] = blocks[2, a, b]

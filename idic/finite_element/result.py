@@ -136,8 +136,16 @@ class NodalResult:
         self, name: str, where: Where = None, material: Material | None = None
     ) -> FloatArray:
         """Standard deviation of :meth:`field` by noise and smoothing of u; the same shapes."""
-        sd = deviation_of(name, self.deformation_gradient, self.gradient_covariance, material)
-        return self.deviation_at(sd, where)
+        key, known = (name, material), self._deviations
+        if key not in known:
+            F, covariance = self.deformation_gradient, self.gradient_covariance
+            known[key] = deviation_of(name, F, covariance, material)
+        return self.deviation_at(known[key], where)
+
+    @cached_property
+    def _deviations(self) -> dict[tuple[str, Material | None], FloatArray]:
+        """Those at the nodes that were asked for."""
+        return {}
 
     def microfluctuation(self, result: Result, where: Where = None) -> FloatArray:
         """(n, 2), (rows, cols, 2) or (k, 2) w = u - v0 - sum v_i phi_i [mm], of a correlation's."""

@@ -23,15 +23,19 @@ M. Genet, C. R. Mecanique 351 (2023), doi 10.5802/crmeca.228. A factor of the mo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.materials import Material, stress_and_tangent
 from modeharvest.fem.sparse_factor import Factor, factorise
-from modeharvest.idic.finite_element.pixels import NodalEquations
+from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable
+from modeharvest.idic.finite_element.pixels import MeshPixels
+from modeharvest.imaging.grid import PixelGrid
 from modeharvest.imaging.mapping.elements import reference_element, shape_gradients
 from modeharvest.util.arrays import BoolArray, FloatArray, IntArray
 from modeharvest.util.compiled import compiled
@@ -41,51 +45,9 @@ _PENALTY = 100.0
 _QUADRATURE = np.array([[1 / 6, 1 / 6], [2 / 3, 1 / 6], [1 / 6, 2 / 3]])
 _LEAST_DET = 0.05
 """Points of an element that shrink to less have no part in it: an iteration gone astray."""
+SAMPLES = 16
+"""Of random vectors: standard deviations by them are known to 18 %."""
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-
-
-class Imbalance:
-    """The forces of a T6 mesh that nothing balances.
-
-    Parameters
-    ----------
-    mesh : [mm].
-    material : of the body, in plane strain.
-    loaded : (n,) True at nodes on which unknown forces act.
-    """
-
-    def __init__(self, mesh: Mesh, material: Material, loaded: BoolArray) -> None:
-        self.mesh, self.material = mesh, material
-        local, x = shape_gradients("T6", _QUADRATURE), mesh.nodes[mesh.cells]
-        F = np.einsum("eki,qkj->eqij", x, local)
-        self._slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
-        self._weights = np.linalg.det(F) / 6.0
-        free = np.repeat(~loaded, 2).astype(float)
-        self._free = csr_array(diags_array(free))
-        dofs = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(len(mesh.cells), 12)
-        self._rows, self._cols = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, 12).ravel()
-        self._dofs = dofs.ravel()
-
-    def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
-        """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
-        cells = self.mesh.cells
-        F = np.eye(2) + np.einsum("eai,eqaj->eqij", u.reshape(-1, 2)[cells], self._slopes)
-        there = np.linalg.det(F) > _LEAST_DET
-        F[~there] = np.eye(2)
-        P, A = stress_and_tangent(self.material, F.reshape(-1, 2, 2))
-        w = (self._weights * there)[..., None, None]
-        P, A = P.reshape(F.shape) * w, A.reshape(*F.shape, 2, 2) * w[..., None, None]
-        f = np.einsum("eqij,eqaj->eai", P, self._slopes, optimize=True)
-        half = np.einsum("eqijkl,eqbl->eqijkb", A, self._slopes, optimize=True)
-        K = np.einsum("eqijkb,eqaj->eaibk", half, self._slopes, optimize=True)
-        total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
-        return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
-
-    def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) K'DK and (2 n,) K'Df."""
-        f, K = self.forces(u)
-        DK = self._free @ K
-        return csr_array(K.T @ DK), np.asarray(DK.T @ f)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +87,19 @@ class NodalPattern:
 
     def matrix(self, parts: FloatArray) -> csr_array:
         """(2 n, 2 n) of nodal parts xx, xy, yy (3, q)."""
-        n = self.indptr.size - 1
-        degree = 2 * np.repeat(np.diff(self.indptr), 2)
-        indptr = np.concatenate([[0], np.cumsum(degree)])
-        data, indices = np.empty(indptr[-1]), np.empty(indptr[-1], dtype=np.int32)
-        _expand(self.indptr, self.indices, np.ascontiguousarray(parts), indptr, indices, data)
-        return csr_array((data, indices, indptr.astype(np.int32)), shape=(2 * n, 2 * n))
+        n, (indptr, indices) = self.indptr.size - 1, self._of_components
+        data = np.empty(indices.size)
+        _interleave(self.indptr, parts, data)
+        return csr_array((data, indices, indptr), shape=(2 * n, 2 * n))
+
+    @cached_property
+    def _of_components(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Compressed rows of both components of every node."""
+        indptr = np.concatenate([[0], np.cumsum(2 * np.repeat(np.diff(self.indptr), 2))])
+        own = np.repeat(np.arange(2 * (self.indptr.size - 1)), np.diff(indptr))
+        neighbour, component = np.divmod(np.arange(own.size) - indptr[own], 2)
+        indices = 2 * self.indices[self.indptr[own // 2] + neighbour] + component
+        return indptr.astype(np.int32), indices.astype(np.int32)
 
 
 @compiled()
@@ -145,14 +114,13 @@ def _scatter(indptr: Any, indices: Any, nodes: Any, blocks: Any, data: Any) -> N
 
 
 @compiled()
-def _expand(indptr: Any, indices: Any, parts: Any, begin: Any, columns: Any, data: Any) -> None:
+def _interleave(indptr: Any, parts: Any, data: Any) -> None:
+    to = 0
     for i in range(indptr.size - 1):
         for c in range(2):
-            to = begin[2 * i + c]
             for q in range(indptr[i], indptr[i + 1]):
-                for d in range(2):
-                    columns[to], data[to] = 2 * indices[q] + d, parts[c + d, q]
-                    to += 1
+                data[to], data[to + 1] = parts[c, q], parts[c + 1, q]
+                to += 2
 
 
 def interior_sides(cells: IntArray) -> IntArray:
@@ -208,110 +176,129 @@ def side_jumps(mesh: Mesh, sides: IntArray) -> tuple[IntArray, FloatArray, Float
     return nodes, np.concatenate(parts, axis=2), weights
 
 
-def smoothness_roots(mesh: Mesh) -> tuple[IntArray, FloatArray]:
-    """(s, 2 k) nodes around each interior side, and (s, 2 k, c) roots [1/mm^2] of their part of R.
+class SmoothnessRoots(NamedTuple):
+    """What R is made of, side by side: a part is its roots times their transpose."""
 
-    A part is its roots times their transpose.
-    """
-    curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
-    nodes, jumps, shares = side_jumps(mesh, sides)
-    first, side, second, _ = sides.T
-    x = mesh.nodes[mesh.cells[first]]
-    ends = x[np.arange(len(x)), side], x[np.arange(len(x)), (side + 1) % 3]
-    h = np.linalg.norm(ends[1] - ends[0], axis=1)
-    bent = np.concatenate([curved[first], -curved[second]], axis=1)
-    across = np.sqrt(_PENALTY * shares / h[:, None] ** 2)[:, :, None, None] * jumps
-    second_part, first_part = bent.reshape(*nodes.shape, 4), np.moveaxis(across, 2, 1)
-    return nodes, np.concatenate([second_part, first_part.reshape(*nodes.shape, 4)], axis=2)
+    size: int
+    """Nodes of the mesh."""
+    nodes: IntArray
+    roots: FloatArray
+    """(s, 2 k) around each interior side, and (s, 2 k, c) [1/mm^2]."""
 
+    @classmethod
+    def of(cls, mesh: Mesh) -> SmoothnessRoots:
+        """Of a T6 mesh."""
+        curved, sides = second_gradients(mesh), interior_sides(mesh.cells)
+        nodes, jumps, shares = side_jumps(mesh, sides)
+        first, side, second, _ = sides.T
+        x = mesh.nodes[mesh.cells[first]]
+        ends = x[np.arange(len(x)), side], x[np.arange(len(x)), (side + 1) % 3]
+        h = np.linalg.norm(ends[1] - ends[0], axis=1)
+        bent = np.concatenate([curved[first], -curved[second]], axis=1)
+        across = np.sqrt(_PENALTY * shares / h[:, None] ** 2)[:, :, None, None] * jumps
+        second_part, first_part = bent.reshape(*nodes.shape, 4), np.moveaxis(across, 2, 1)
+        roots = np.concatenate([second_part, first_part.reshape(*nodes.shape, 4)], axis=2)
+        return cls(len(mesh.nodes), nodes, roots)
 
-def smoothness_matrix(mesh: Mesh) -> csr_array:
-    """(n, n) R of one component [1/mm^4], for nodal values (n,) on a T6 mesh; sorted indices."""
-    nodes, roots = smoothness_roots(mesh)
-    blocks = roots @ roots.swapaxes(1, 2)
-    n, k = len(mesh.nodes), nodes.shape[1]
-    at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
-    total = csr_array((blocks.ravel(), at), shape=(n, n))
-    total.sum_duplicates()
-    total.sort_indices()
-    return total
+    def matrix(self) -> csr_array:
+        """(n, n) R of one component [1/mm^4]; sorted indices."""
+        nodes, k = self.nodes, self.nodes.shape[1]
+        blocks = self.roots @ self.roots.swapaxes(1, 2)
+        at = np.repeat(nodes, k, axis=1).ravel(), np.tile(nodes, (1, k)).ravel()
+        total = csr_array((blocks.ravel(), at), shape=(self.size, self.size))
+        total.sum_duplicates()
+        total.sort_indices()
+        return total
 
-
-def smoothness_samples(mesh: Mesh, count: int) -> FloatArray:
-    """(2 n, count) random vectors whose covariance is R of both components [1/mm^2]."""
-    nodes, roots = smoothness_roots(mesh)
-    z = np.random.default_rng(1).standard_normal((len(roots), roots.shape[2], 2 * count))
-    total = np.zeros((len(mesh.nodes), 2 * count))
-    add_at(total, nodes, roots @ z)
-    return total.reshape(2 * len(mesh.nodes), count)
+    def samples(self, count: int) -> FloatArray:
+        """(2 n, count) random vectors whose covariance is R of both components [1/mm^2]."""
+        shape = len(self.roots), self.roots.shape[2], 2 * count
+        total = np.zeros((self.size, 2 * count))
+        add_at(total, self.nodes, self.roots @ np.random.default_rng(1).standard_normal(shape))
+        return total.reshape(2 * self.size, count)
 
 
 def add_at(total: FloatArray, nodes: IntArray, values: FloatArray) -> None:
     """Add values (m, k, s) to the rows of (n, s) whose numbers are (m, k)."""
     flat = nodes.ravel()
     ones = csr_array((np.ones(flat.size), (flat, np.arange(flat.size))), (len(total), flat.size))
-    total += ones @ values.reshape(flat.size, -1)
+    total += ones @ values.reshape(flat.size, total.shape[1])
 
 
 class Body:
-    """A mesh of the material with what all stages share: patterns, smoothness, the factor."""
+    """A T6 mesh of the material, with what all measurements on it share: patterns, the factor."""
 
-    def __init__(self, mesh: Mesh, start: FloatArray) -> None:
-        self.mesh, self.start = mesh, start
+    def __init__(
+        self, mesh: Mesh, mask: BoolArray | None = None, changes: tuple[str, ...] = ()
+    ) -> None:
+        self.mesh, self.pixels = mesh, MeshPixels(mesh)
+        self.mask, self.changes = mask, changes
+        """(rows, cols) True on pixels that count, None for those of any mask; what was left out."""
         sides = interior_sides(mesh.cells)
         pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
-        self._smoothness = self.pattern.both(smoothness_matrix(mesh))
-        self.law: Imbalance | None = None
+        roots = SmoothnessRoots.of(mesh)
+        self.smoothness, self.smoothness_samples = (
+            self.pattern.both(roots.matrix()), roots.samples(SAMPLES),
+        )  # fmt: skip
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
-        self._wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
-        self._waves = _waves(mesh.nodes, self._wavelength)
+        self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
+        """Of the waves by which data and smoothness are compared [mm]."""
+        self._waves = _waves(mesh.nodes, self.wavelength)
         self._factor: Factor | None = None
+        self._factorised: tuple[csr_array, csr_array, float] | None = None
         self._stored = 0
+
+    @classmethod
+    def of_mask(
+        cls, mask: BoolArray, grid: PixelGrid, element_px: float, edge_element_px: float
+    ) -> Body:
+        """On what can be meshed of a mask (rows, cols), elements of so many px inside and at edges.
+
+        InputError as :func:`modeharvest.idic.finite_element.mesh.mesh_of_mask`.
+        """
+        kept, changes = meshable(mask, edge_element_px)
+        return cls(mesh_of_mask(kept, grid, element_px, edge_element_px), kept, changes)
 
     @property
     def library(self) -> str:
         """What factorises."""
         return "" if self._factor is None else self._factor.library
 
-    def assembled(self, equations: NodalEquations) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) M and (2 n,) J'r of the nodes."""
-        M = self.pattern.matrix(self.pattern.assembled(self.mesh.cells, equations.blocks))
-        gradient = np.zeros((len(self.mesh.nodes), 2))
-        add_at(gradient, self.mesh.cells, equations.gradient)
-        return M, gradient.ravel()
+    def matrix(self, blocks: FloatArray) -> csr_array:
+        """(2 n, 2 n) of the blocks (m, 3, 6, 6) of the elements."""
+        return self.pattern.matrix(self.pattern.assembled(self.mesh.cells, blocks))
 
-    def penalty(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
-        """(2 n, 2 n) R and (2 n,) half the gradient of what is penalised, at u (2 n,)."""
-        if self.law is not None:
-            return self.law.linearised(u)
-        return self._smoothness, self._smoothness @ (u - self.start.ravel())
+    def vector(self, parts: FloatArray) -> FloatArray:
+        """(2 n,) of the parts (m, 6, 2) of the elements."""
+        total = np.zeros((len(self.mesh.nodes), 2))
+        add_at(total, self.mesh.cells, parts)
+        return total.ravel()
 
-    def weight(self, M: csr_array, R: csr_array, cutoff: float) -> float:
-        """The weight lambda of R for a cut-off wavelength [mm]."""
-        data, smooth = (float(np.sum(self._waves * (A @ self._waves))) for A in (M, R))
-        power = 6 if self.law is None else 4
-        return (cutoff / self._wavelength) ** power * data / smooth
+    def energies(self, matrix: csr_array) -> float:
+        """Sum of v'Av over some waves v."""
+        return float(np.sum(self._waves * (matrix @ self._waves)))
 
     def factor(self, M: csr_array, R: csr_array, weight: float) -> Factor:
-        """Factorise M + lambda R."""
-        A = csr_array(M + weight * R)
-        A.sort_indices()
+        """Factorise M + lambda R, unless these were the last ones."""
+        last = self._factorised
+        if self._factor and last and last[0] is M and last[1] is R and last[2] == weight:
+            return self._factor
+        if np.array_equal(M.indptr, R.indptr) and np.array_equal(M.indices, R.indices):
+            A = csr_array((M.data + weight * R.data, M.indices, M.indptr), shape=M.shape)
+        else:
+            A = csr_array(M + weight * R)
+            A.sort_indices()
         if self._factor is None or self._stored != A.nnz:
             self._factor, self._stored = factorise(A), A.nnz
         else:
             self._factor.update(A)
+        self._factorised = M, R, weight
         return self._factor
 
-    def prior_samples(self, count: int) -> FloatArray:
-        """(2 n, count) random vectors of the covariance R; 0 with a law."""
-        if self.law is not None:
-            return np.zeros((self.start.size, count))
-        return smoothness_samples(self.mesh, count)
-
-    def samples(self, blocks: FloatArray, count: int) -> FloatArray:
-        """(2 n, count) random vectors of the covariance M, given by its blocks."""
-        n, m = len(self.mesh.nodes), len(blocks)
+    def samples(self, blocks: FloatArray) -> FloatArray:
+        """(2 n, SAMPLES) random vectors of the covariance M, given by its blocks."""
+        n, m, count = len(self.mesh.nodes), len(blocks), SAMPLES
         parts = np.empty((m, 6, 2, 6, 2))
         for c in (0, 1):
             for d in (0, 1):
@@ -332,3 +319,114 @@ def _waves(nodes: FloatArray, wavelength: float) -> FloatArray:
     for k in range(4):
         waves[:, k % 2, k] = np.cos(2.0 * np.pi / wavelength * nodes[:, k // 2])
     return waves.reshape(-1, 4)
+
+
+class Smoothness:
+    """How rough what is added to a start (n, 2) is, on a body's mesh."""
+
+    power, is_linear = 6, True
+    """Of a wave number, in what a wave costs; whether R is the same everywhere."""
+
+    def __init__(self, body: Body, start: FloatArray) -> None:
+        self.body, self.start = body, start.ravel()
+
+    def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
+        """(2 n, 2 n) R and (2 n,) R(u - u_0)."""
+        R = self.body.smoothness
+        return R, R @ (u - self.start)
+
+    @property
+    def samples(self) -> FloatArray:
+        """(2 n, SAMPLES) random vectors of the covariance R."""
+        return self.body.smoothness_samples
+
+
+class Imbalance:
+    """The forces of a T6 mesh that nothing balances; smallest in a body that obeys a law.
+
+    Parameters
+    ----------
+    mesh : [mm].
+    material : of the body, in plane strain.
+    loaded : (n,) True at nodes on which unknown forces act.
+    """
+
+    power, is_linear = 4, False
+
+    def __init__(self, mesh: Mesh, material: Material, loaded: BoolArray) -> None:
+        self.mesh, self.material = mesh, material
+        local, x = shape_gradients("T6", _QUADRATURE), mesh.nodes[mesh.cells]
+        F = np.einsum("eki,qkj->eqij", x, local)
+        self._slopes = np.einsum("qkj,eqji->eqki", local, np.linalg.inv(F))
+        self._weights = np.linalg.det(F) / 6.0
+        free = np.repeat(~loaded, 2).astype(float)
+        self._free = csr_array(diags_array(free))
+        dofs = (2 * mesh.cells[:, :, None] + np.arange(2)).reshape(len(mesh.cells), 12)
+        self._rows, self._cols = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, 12).ravel()
+        self._dofs = dofs.ravel()
+
+    def forces(self, u: FloatArray) -> tuple[FloatArray, csr_array]:
+        """(2 n,) internal forces at u (2 n,) and their derivatives (2 n, 2 n), up to a factor."""
+        cells = self.mesh.cells
+        F = np.eye(2) + np.einsum("eai,eqaj->eqij", u.reshape(-1, 2)[cells], self._slopes)
+        there = np.linalg.det(F) > _LEAST_DET
+        F[~there] = np.eye(2)
+        P, A = stress_and_tangent(self.material, F.reshape(-1, 2, 2))
+        w = (self._weights * there)[..., None, None]
+        P, A = P.reshape(F.shape) * w, A.reshape(*F.shape, 2, 2) * w[..., None, None]
+        f = np.einsum("eqij,eqaj->eai", P, self._slopes, optimize=True)
+        half = np.einsum("eqijkl,eqbl->eqijkb", A, self._slopes, optimize=True)
+        K = np.einsum("eqijkb,eqaj->eaibk", half, self._slopes, optimize=True)
+        total = np.asarray(np.bincount(self._dofs, f.ravel(), u.size), dtype=np.float64)
+        return total, csr_array((K.ravel(), (self._rows, self._cols)), shape=(u.size, u.size))
+
+    def linearised(self, u: FloatArray) -> tuple[csr_array, FloatArray]:
+        """(2 n, 2 n) K'DK and (2 n,) K'Df."""
+        f, K = self.forces(u)
+        DK = self._free @ K
+        return csr_array(K.T @ DK), np.asarray(DK.T @ f)
+
+    @property
+    def samples(self) -> None:
+        """None: what a law allows where there is no speckle is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Normal equations at some displacement of the nodes."""
+
+    body: Body
+    prior: Smoothness | Imbalance
+    """What regularises."""
+    u: FloatArray
+    """(2 n,) [mm]."""
+    M: csr_array
+    gradient: FloatArray
+    """(2 n, 2 n) and (2 n,): sums of h h' and of h r."""
+    square_sum: float
+    pixels: int
+    """Sum of r^2, and how many pixels it is over."""
+    blocks: FloatArray
+    """(m, 3, 6, 6) parts of M, element by element."""
+    share: FloatArray
+    """(m,) of each element's slopes that is signal, not noise [-]."""
+    excess: FloatArray
+    """(m,) mean of r^2 in an element over that in all, at least 1 [-]."""
+    R: csr_array
+    penalty: FloatArray
+    """(2 n, 2 n) matrix and (2 n,) gradient of the regularisation."""
+    ratio: float
+    """Of M to R, by the body's waves."""
+
+    def weight(self, cutoff: float) -> float:
+        """The weight lambda of R for a cut-off wavelength [mm]."""
+        return (cutoff / self.body.wavelength) ** self.prior.power * self.ratio
+
+    def factor(self, weight: float) -> Factor:
+        """M + lambda R, factorised."""
+        return self.body.factor(self.M, self.R, weight)
+
+    def step(self, cutoff: float, times: float = 1.0) -> FloatArray:
+        """(2 n,) Gauss-Newton step for a cut-off wavelength [mm], or so many times its weight."""
+        weight = times * self.weight(cutoff)
+        return self.factor(weight).solve(self.gradient - weight * self.penalty)

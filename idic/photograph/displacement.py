@@ -17,8 +17,13 @@ from scipy.spatial import cKDTree
 
 from modeharvest.fem.field import Mesh
 from modeharvest.idic.chebyshev import Box
-from modeharvest.idic.finite_element.measure import FiniteElementOptions, measure_displacement
+from modeharvest.idic.finite_element.measure import (
+    FiniteElementOptions,
+    coarse_displacement,
+    measure_displacement,
+)
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.local.field import LocalField
 from modeharvest.idic.local.motion import first_motion
 from modeharvest.idic.photograph.matching import (
@@ -49,7 +54,7 @@ _DENSER = 5
 """Times as many blocks where it leaves more."""
 _STRAY = 8.0
 """Times the spread of its neighbours' motion that a block may be off their median."""
-_FIRST = FiniteElementOptions(cutoff_px=40.0, edge_px=4)
+_FIRST = FiniteElementOptions(edge_px=4)
 """Of the measurement that only the deformed image's mask is taken from."""
 _LAST = FiniteElementOptions(edge_px=1)
 """A camera's pixel on an edge shows some background; one such row lets the edge drift off."""
@@ -61,7 +66,7 @@ _OFF_PX = 4.0, 1.0
 
 def photographed_displacement(
     pair: ImagePair,
-    mesh: Mesh,
+    body: Body,
     before: NodalResult | None = None,
     names: tuple[str, str] = ("the reference", "the deformed image"),
     progress: Progress = silent,
@@ -72,18 +77,18 @@ def photographed_displacement(
     :func:`~modeharvest.idic.finite_element.measure.measure_displacement`.
 
     pair : Reference and deformed image, the mask of the reference. Their brightness may differ.
-    mesh : Of the material, T6.
+    body : The material's mesh.
     before : What was found in the image before, on the same mesh.
     names : Of the two images, for messages.
     """
-    start = block_motion(pair, mesh, before, names)
-    return displacement_from(start, pair, mesh, progress=progress)
+    start = block_motion(pair, body.mesh, before, names)
+    return displacement_from(start, pair, body, progress=progress)
 
 
 def displacement_from(
     start: FloatArray,
     pair: ImagePair,
-    mesh: Mesh,
+    body: Body,
     options: FiniteElementOptions = _LAST,
     progress: Progress = silent,
 ) -> NodalResult:
@@ -91,14 +96,14 @@ def displacement_from(
 
     For the others see :func:`photographed_displacement`.
     """
+    mesh, begin = body.mesh, partial(_known, start)
     pair = _alike(pair, mesh, start)
-    begin = partial(_known, start)
     if pair.mask is not None and not pair.mask.all() and pair.deformed_mask is None:
         inner = replace(pair, deformed_mask=deformed_mask(pair.grid, mesh, start, _OFF_PX[0]))
-        first = measure_displacement(inner, begin, mesh, options=_FIRST, progress=progress)
-        mask = deformed_mask(pair.grid, mesh, first.displacement, _OFF_PX[1])
-        pair = replace(_alike(pair, mesh, first.displacement), deformed_mask=mask)
-    return measure_displacement(pair, begin, mesh, options=options, progress=progress)
+        first = coarse_displacement(inner, begin, body, options=_FIRST)
+        mask = deformed_mask(pair.grid, mesh, first, _OFF_PX[1])
+        pair = replace(_alike(pair, mesh, first), deformed_mask=mask)
+    return measure_displacement(pair, begin, body, options=options, progress=progress)
 
 
 def _known(values: FloatArray, points: FloatArray) -> FloatArray:

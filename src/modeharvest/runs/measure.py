@@ -34,6 +34,7 @@ from modeharvest.idic.finite_element.files import (
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import (
     brightness,
     photographed_displacement,
@@ -52,6 +53,7 @@ from modeharvest.imaging.photographs.photograph import (
     read_reference,
 )
 from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.runs.whole_field import BYTES_PER_PIXEL
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
 from modeharvest.util.files import (
@@ -70,8 +72,6 @@ from modeharvest.util.typed import picked
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 _CODE = ("fem", "imaging", "idic", "runs")
 """What the numbers depend on."""
-_BYTES_PER_PIXEL = 420.0
-"""Of memory while an image is measured: 1.6 GB were measured for one of 4 Mpx."""
 _MISFIT, _SLIGHT = 2.0, 0.03
 """Residual, over the images' noise and over their contrast, beyond which that is warned of."""
 _LEAST_PX = 1000
@@ -137,7 +137,7 @@ class MeasureRun(StagedRun[MeasureCase]):
         if given is not None:
             names = str(self.case.reference), str(self.case.mask)
             require_same_shape(reference.image, given, *names)
-        require_memory(_BYTES_PER_PIXEL * reference.image.size,
+        require_memory(BYTES_PER_PIXEL * reference.image.size,
                        f"an image of {reference.image.size / 1e6:.0f} Mpx", "crop it")  # fmt: skip
         return reference
 
@@ -173,14 +173,18 @@ class MeasureRun(StagedRun[MeasureCase]):
 
         return self.do("prepare", self._key, work, read)
 
+    @cached_property
+    def _body(self) -> Body:
+        return Body(self.material.mesh)
+
     def _material(self) -> MeshedMaterial:
         """What can be measured of the mask that is given, or is found by its speckle."""
         given, options, image = self.case.mask, FiniteElementOptions(), self.reference.image
         mask = find_material(image).mask if given is None else read_mask(given)
         mask, blank = speckled(image, mask)
-        mask, changes = meshable(mask, options.edge_element_px)
-        mesh = mesh_of_mask(mask, self.grid, options.element_px, options.edge_element_px)
-        return MeshedMaterial(mask, mesh, (*blank, *changes))
+        kept, changes = meshable(mask, options.edge_element_px)
+        mesh = mesh_of_mask(kept, self.grid, options.element_px, options.edge_element_px)
+        return MeshedMaterial(kept, mesh, (*blank, *changes))
 
     def _meshed(self, path: Path) -> MeshedMaterial:
         """A mesh that is given, and what it covers of the mask, which is all of it if there is one.
@@ -240,7 +244,7 @@ class MeasureRun(StagedRun[MeasureCase]):
 
         def work() -> tuple[Path, ...]:
             result = photographed_displacement(
-                self.pair(path), self.material.mesh, before, names, self.progress
+                self.pair(path), self._body, before, names, self.progress
             )
             tables = [stem.with_name(stem.name + kind) for kind in (".h5", ".vtu", ".csv")]
             write_result(tables[0], result, unit)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numba import get_num_threads
 
 from modeharvest.fem.experiment import Experiment
 from modeharvest.fem.specimen import Specimen
@@ -25,12 +30,14 @@ from modeharvest.idic.finite_element.measure import (
     measure_displacement,
 )
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.result import Result
 from modeharvest.imaging.imageset import ImageSet
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import make_folder, read_json, write_json
-from modeharvest.util.progress import Progress
+from modeharvest.util.machine import available_bytes, is_alone
+from modeharvest.util.progress import Progress, silent
 from modeharvest.validation.truth import Comparison
 from modeharvest.validation.whole_field import (
     WholeField,
@@ -39,7 +46,8 @@ from modeharvest.validation.whole_field import (
     refitted,
 )
 
-_SECONDS = "timings.json"
+BYTES_PER_PIXEL = 420.0
+"""Of memory while an image is measured: 1.6 GB were measured for one of 4 Mpx."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +96,31 @@ class VirtualWholeFieldOptions(WholeFieldOptions):
         """The engine's options for an experiment, whose two ends along x are loaded."""
         if not self.material_law:
             return self.on_mesh(None)
-        end = experiment.specimen.half_size[0]
+        ends = _Ends(experiment.specimen.half_size[0], pixel_size)
+        return self.on_mesh(Law(experiment.material, ends))
 
-        def is_loaded(points: FloatArray) -> BoolArray:
-            return np.asarray(np.abs(np.abs(points[:, 0]) - end) < pixel_size)
 
-        return self.on_mesh(Law(experiment.material, is_loaded))
+@dataclass(frozen=True)
+class _Ends:
+    """Tells which points lie on the two ends of a specimen along x, to within a length [mm]."""
+
+    half_length: float
+    within: float
+
+    def __call__(self, points: FloatArray) -> BoolArray:
+        return np.asarray(np.abs(np.abs(points[:, 0]) - self.half_length) < self.within)
+
+
+@contextmanager
+def _way_around(of: str) -> Iterator[None]:
+    """Say in an InputError whose whole displacement it is about, and how to do without."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(
+            f"whole displacement, {of}: {error}; or leave it out: [whole_field] measure = "
+            "false, --no-whole-field"
+        ) from error
 
 
 def name_of(strain: float) -> str:
@@ -129,18 +156,12 @@ class WholeFields:
         def report(done: float, total: float, what: str) -> None:
             progress(done, total, f"{what}, {of}")
 
-        try:
+        with _way_around(of):
             found = work(report)
-        except InputError as error:
-            raise InputError(
-                f"whole displacement, {of}: {error}; or leave it out: [whole_field] measure = "
-                "false, --no-whole-field"
-            ) from error
         make_folder(self.folder)
         write_result(path, found, given=given)
         write_vtu(path.with_suffix(".vtu"), found, given=given)
-        seconds = {**self._seconds(), name: time.perf_counter() - begin}
-        write_json(self.folder / _SECONDS, seconds)
+        write_json(self._timing(name), {"seconds": time.perf_counter() - begin})
         return path, path.with_suffix(".vtu")
 
     def of_images(
@@ -151,20 +172,29 @@ class WholeFields:
         experiment: Experiment,
         progress: Progress,
     ) -> list[Path]:
-        """Measure every deformed image of a virtual experiment, from its correlation's result."""
-        files: list[Path] = []
-        how = options.of(experiment, images.grid.pixel_size)
-        law = None if how.law is None else how.law.material
+        """Measure every deformed image of a virtual experiment, from its correlation's result.
 
-        def one(strain: float, progress: Progress) -> NodalResult:
-            pair = images.pair(strain, camera=options.camera)
-            return measure_displacement(pair, results[strain], options=how, progress=progress)
-
-        for strain in images.strains:
-            of, given = f"strain {100 * strain:.2f} %", Given(law, results[strain])
-            work = partial(one, strain)
-            files += self.measure(name_of(strain), of, work, progress, given)
-        return files
+        They are shared out among processes, as many as there are cores and memory for.
+        """
+        how, mask = options.of(experiment, images.grid.pixel_size), images.mask()
+        most = min(get_num_threads() if is_alone() else 1, len(images.strains))
+        count = max(1, min(most, int(available_bytes() / (BYTES_PER_PIXEL * mask.size))))
+        with _children(count - 1) as children:
+            with _way_around("mesh of the material"):
+                sizes = how.element_px, how.edge_element_px
+                body = Body.of_mask(mask, images.grid, *sizes)
+            shares = [
+                _Share(self.folder, images.folder, body, how, options.camera,
+                       {strain: results[strain] for strain in images.strains[k::count]})
+                for k in range(count)
+            ]  # fmt: skip
+            for child, share in zip(children, shares[1:], strict=True):
+                assert child.stdin
+                with child.stdin as to:
+                    pickle.dump(share, to)
+            shares[0].measure(progress)
+        stems = [self.path(name_of(strain)) for strain in images.strains]
+        return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
 
     def compared(
         self, comparisons: Sequence[Comparison], k: int, specimen: Specimen
@@ -185,8 +215,63 @@ class WholeFields:
 
     def seconds(self, name: str) -> float:
         """What its measurement took [s]."""
-        return float(self._seconds().get(name, float("nan")))
+        path = self._timing(name)
+        return float(read_json(path)["seconds"]) if path.exists() else float("nan")
 
-    def _seconds(self) -> Mapping[str, float]:
-        path = self.folder / _SECONDS
-        return dict(read_json(path)) if path.exists() else {}
+    def _timing(self, name: str) -> Path:
+        return self.folder / f"{name}_timings.json"
+
+
+@dataclass(frozen=True)
+class _Share:
+    """Some images of a virtual experiment, to be measured one after another."""
+
+    folder: Path
+    images: Path
+    """Where the files go, and where the images are."""
+    body: Body
+    how: FiniteElementOptions
+    camera: bool
+    results: Mapping[float, Result]
+    """Of correlations, by strain."""
+
+    def measure(self, progress: Progress) -> None:
+        """Leave the files of the images."""
+        images, how = ImageSet.read(self.images), self.how
+        law = None if how.law is None else how.law.material
+
+        def one(strain: float, progress: Progress) -> NodalResult:
+            pair, start = images.pair(strain, camera=self.camera), self.results[strain]
+            return measure_displacement(pair, start, self.body, options=how, progress=progress)
+
+        for strain, result in self.results.items():
+            of, given = f"strain {100 * strain:.2f} %", Given(law, result)
+            WholeFields(self.folder).measure(
+                name_of(strain), of, partial(one, strain), progress, given
+            )
+
+
+@contextmanager
+def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Processes that measure the share they are given; InputError as it comes from there."""
+    command = [sys.executable, "-P", "-m", "modeharvest.runs.whole_field"]
+    pipe = subprocess.PIPE
+    children = [subprocess.Popen(command, stdin=pipe, stderr=pipe) for _ in range(count)]
+    try:
+        yield children
+        for child in children:
+            assert child.stderr
+            text = child.stderr.read().decode(errors="replace").strip()
+            if child.wait() != 0:
+                raise InputError(text.splitlines()[-1] if text else "a process was killed")
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+if __name__ == "__main__":
+    try:
+        pickle.load(sys.stdin.buffer).measure(silent)
+    except InputError as error:
+        sys.exit(str(error))

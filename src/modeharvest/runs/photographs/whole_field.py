@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modeharvest.fem.field import Mesh
 from modeharvest.idic.finite_element.files import Given
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
-from modeharvest.idic.finite_element.mesh import mesh_of_mask, quadratic
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import block_motion, displacement_from
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise
 from modeharvest.idic.result import Result
@@ -108,10 +107,10 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
         return WholeFields(self.folder / "whole_field")
 
     @cached_property
-    def _mesh(self) -> Mesh:
+    def _body(self) -> Body:
         how, prepared = self.case.whole_field, self.prepared
         sizes = how.element_px, how.edge_element_px
-        return quadratic(mesh_of_mask(prepared.mask(), prepared.grid, *sizes))
+        return Body.of_mask(prepared.mask(), prepared.grid, *sizes)
 
     def _whole(
         self, name: str, before: str | None, found: Mapping[str, WholeField], key: str
@@ -123,15 +122,15 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
             is_usable = correlated.outcome not in _ASTRAY
 
             def measured(progress: Progress) -> NodalResult:
-                pair, mesh = self._pair(name, before, found), self._mesh
+                pair, body = self._pair(name, before, found), self._body
                 if is_usable:
-                    begin = correlated.ansatz.displacement_at(correlated.unknowns, mesh.nodes)
+                    begin = correlated.ansatz.displacement_at(correlated.unknowns, body.mesh.nodes)
                 else:
                     known = None if last is None else last.measured
-                    begin = block_motion(pair, mesh, known, ("the reference", name))
+                    begin = block_motion(pair, body.mesh, known, ("the reference", name))
                 cutoff = self.case.whole_field.cutoff_px
                 options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
-                return self._warned(displacement_from(begin, pair, mesh, options, progress), name)
+                return self._warned(displacement_from(begin, pair, body, options, progress), name)
 
             try:
                 files = self._files.measure(
