@@ -102,13 +102,12 @@ def continued(image: FloatImage, mask: BoolArray) -> FloatImage:
     Parameters
     ----------
     image : (rows, cols) grey levels.
-    mask : (rows, cols) True on material; farther than 4 px from it there is its mean.
+    mask : (rows, cols) True on material; farther than 4 px from it the nearest pixel's value is
+        kept.
     """
-    outside = ~mask
-    beyond = eroded(outside, _REACH_PX)
-    filled = np.ascontiguousarray(image, np.float32).copy()
-    filled[beyond] = image[mask].mean(dtype=np.float64)
-    rows, cols = np.nonzero(outside & ~beyond)
+    distance, nearest = ndimage.distance_transform_edt(~mask, return_indices=True)
+    filled = np.ascontiguousarray(image[tuple(nearest)])
+    rows, cols = np.nonzero((distance > 0) & (distance <= _REACH_PX))
     of_material = readable(image), readable(mask)
     in_parallel(_continue, *of_material, readable(rows), readable(cols), filled)
     return filled

@@ -170,16 +170,6 @@ class NodalResult:
         """(n, 2, 2) F = I + du/dX at the nodes, the mean of the elements around each [-]."""
         return np.eye(2) + nodal_gradient(self.mesh, self.displacement)
 
-    @property
-    def green_lagrange(self) -> FloatArray:
-        """(n, 2, 2) E = (F'F - I)/2 at the nodes [-]."""
-        return self.field("green_lagrange")
-
-    @property
-    def logarithmic_strain(self) -> FloatArray:
-        """(n, 2, 2) Hencky's strain ln U at the nodes, U^2 = F'F [-]."""
-        return self.field("logarithmic")
-
 
 def _continue(
     mesh: Mesh, grid: PixelGrid, located: Located, nodal: FloatArray, values: FloatArray

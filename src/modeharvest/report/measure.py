@@ -113,7 +113,7 @@ def _cards(
         field = frame.average(residual(name, result))
         return draw_field(frame, field, ColourScale.signed(field, "levels", 0.999), unit=unit)
 
-    u, strain = result.displacement, result.logarithmic_strain
+    u, strain = result.displacement, result.field("logarithmic")
     sd = np.linalg.norm(result.standard_deviation, axis=1)
     panels: dict[str, list[tuple[str, Callable[[], Figure]]]] = {
         "Displacement": [(axis, partial(nodal, u[:, c], unit)) for c, axis in enumerate("uv")],

@@ -85,7 +85,7 @@ class WholeMaps(Generic[S]):
     def _principal_strain(self, state: S) -> Figure:
         """The logarithmic strain of larger size, tension positive."""
         frame, measured = state.view.map_frame(), self._measured(state)
-        values = np.linalg.eigvalsh(measured.logarithmic_strain)
+        values = np.linalg.eigvalsh(measured.field("logarithmic"))
         is_first = np.abs(values[:, :1]) > np.abs(values[:, 1:])
         larger = np.where(is_first, values[:, :1], values[:, 1:])
         strain = measured.on_pixels(larger, _pixels(frame, state.view.grid))[..., 0]
