@@ -32,8 +32,8 @@ WHOLE_FIELD = (
 SUBSTRUCTURES = ("fem/path/factor.py",)
 """What lets every rank factorise its own part of a body."""
 ADDED = {"whole field": WHOLE_FIELD, "substructures": SUBSTRUCTURES}
-MOST = {"whole field": (17, 3_930), "substructures": (1, 232), "all else": (180, 39_948)}
-"""Modules and lines."""
+MOST = {"whole field": (17, 4_163), "substructures": (1, 232), "all else": (180, 39_944)}
+"""Modules and lines, as they are."""
 
 PRIVATE_WORDS = """
     told judged leftover softness softened pushes unmatched trapped landed levelled marched

@@ -139,8 +139,8 @@ def test_strains_of_a_rotation_and_a_stretch(noisy: tuple[ImagePair, NodalResult
     u = result.mesh.nodes @ (turn @ stretch - np.eye(2)).T
     known = replace(result, displacement=u)
     np.testing.assert_allclose(
-        known.field("green_lagrange"), np.broadcast_to(0.5 * (stretch**2 - np.eye(2)), (len(u), 2, 2)),
-        atol=1e-10,
+        known.field("green_lagrange"),
+        np.broadcast_to(0.5 * (stretch**2 - np.eye(2)), (len(u), 2, 2)), atol=1e-10,
     )  # fmt: skip
     np.testing.assert_allclose(
         known.field("logarithmic"), np.broadcast_to(np.diag(np.log([1.2, 0.9])), (len(u), 2, 2)),
