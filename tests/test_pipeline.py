@@ -20,7 +20,8 @@ from modeharvest.fem.field import Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.idic.finite_element.files import read_result
-from modeharvest.runs import run
+from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.runs import run, whole_field
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
 from modeharvest.runs.whole_field import VirtualWholeFieldOptions
@@ -105,7 +106,10 @@ def test_the_run_leaves_what_it_promises(finished: Path) -> None:
     assert not [name for name in names if ".part" in name]
 
 
-def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: Path) -> None:
+def test_the_whole_displacement_is_measured_up_to_the_edges(
+    case: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_field, "get_num_threads", lambda: 2)
     how = VirtualWholeFieldOptions(measure=True, element_px=16.0, edge_element_px=10.0)
     whole = Case.read(case).model_copy(update={"whole_field": how})
     run(whole, folder)
@@ -125,6 +129,22 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(case: Path, folder: 
     before = stamps(folder)
     run(whole, folder)
     assert not changed(before, stamps(folder))
+    monkeypatch.setattr(whole_field, "get_num_threads", lambda: 1)
+    measured = sorted((folder / "whole_field").glob("*.h5"))
+    content = [path.read_bytes() for path in measured]
+    shutil.rmtree(folder / "whole_field")
+    run(whole, folder)
+    assert [path.read_bytes() for path in measured] == content
+
+
+def test_an_input_error_of_another_process_is_one_here(tmp_path: Path) -> None:
+    options = FiniteElementOptions()
+    share = whole_field._Share(tmp_path, tmp_path / "none", None, options, True, {})  # type: ignore[arg-type]
+    with (
+        pytest.raises(InputError, match="expected a finished image set"),
+        whole_field._children(1) as [child],
+    ):
+        share.hand_to(child)
 
 
 def test_the_stages_commands_measure_it_too(

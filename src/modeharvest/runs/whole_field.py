@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -189,9 +189,7 @@ class WholeFields:
                 for k in range(count)
             ]  # fmt: skip
             for child, share in zip(children, shares[1:], strict=True):
-                assert child.stdin
-                with child.stdin as to:
-                    pickle.dump(share, to)
+                share.hand_to(child)
             shares[0].measure(progress)
         stems = [self.path(name_of(strain)) for strain in images.strains]
         return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
@@ -235,6 +233,12 @@ class _Share:
     results: Mapping[float, Result]
     """Of correlations, by strain."""
 
+    def hand_to(self, child: subprocess.Popen[bytes]) -> None:
+        """Let one of ``_children`` measure it."""
+        assert child.stdin
+        with suppress(BrokenPipeError), child.stdin as to:  # why it ended is seen in the end
+            pickle.dump(self, to)
+
     def measure(self, progress: Progress) -> None:
         """Leave the files of the images."""
         images, how = ImageSet.read(self.images), self.how
@@ -253,25 +257,41 @@ class _Share:
 
 @contextmanager
 def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that measure the share they are given; InputError as it comes from there."""
-    command = [sys.executable, "-P", "-m", "modeharvest.runs.whole_field"]
-    pipe = subprocess.PIPE
-    children = [subprocess.Popen(command, stdin=pipe, stderr=pipe) for _ in range(count)]
-    try:
-        yield children
-        for child in children:
-            assert child.stderr
-            text = child.stderr.read().decode(errors="replace").strip()
-            if child.wait() != 0:
-                raise InputError(text.splitlines()[-1] if text else "a process was killed")
-    finally:
-        for child in children:
-            child.kill()
-            child.wait()
+    """Processes that measure the share they are given; an InputError is theirs.
+
+    RuntimeError if one fails otherwise. None is left in the end.
+    """
+    command, pipe = [sys.executable, "-P", "-m", "modeharvest.runs.whole_field"], subprocess.PIPE
+    with ExitStack() as stack:
+        children = [
+            stack.enter_context(subprocess.Popen(command, stdin=pipe, stderr=pipe))
+            for _ in range(count)
+        ]
+        try:
+            yield children
+            for child in children:
+                assert child.stderr
+                text, code = child.stderr.read().decode(errors="replace").strip(), child.wait()
+                if code == _REFUSED:
+                    raise InputError(text.splitlines()[-1])
+                if code != 0:
+                    raise RuntimeError(text or f"a process that measures ended with {code}")
+        finally:
+            for child in children:
+                child.kill()
 
 
-if __name__ == "__main__":
+_REFUSED = 2
+"""Exit code for an InputError."""
+
+
+def _main() -> None:
     try:
         pickle.load(sys.stdin.buffer).measure(silent)
     except InputError as error:
-        sys.exit(str(error))
+        print(error, file=sys.stderr)
+        sys.exit(_REFUSED)
+
+
+if __name__ == "__main__":
+    _main()
