@@ -16,11 +16,13 @@ import pytest
 from test_cli import called, error_line
 
 from modeharvest.cli.root import main
-from modeharvest.fem.field import Solution
+from modeharvest.fem.field import Mesh, Solution
 from modeharvest.fem.materials import Ogden, TwoTermI1
 from modeharvest.fem.specimen import Imperfection, Specimen
 from modeharvest.idic.finite_element.files import read_result
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
+from modeharvest.idic.finite_element.mesh import quadratic
+from modeharvest.idic.finite_element.system import Body
 from modeharvest.runs import run, whole_field
 from modeharvest.runs.case import Case
 from modeharvest.runs.experiment import Run
@@ -137,11 +139,28 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     assert [path.read_bytes() for path in measured] == content
 
 
-def test_an_input_error_of_another_process_is_one_here(tmp_path: Path) -> None:
-    options = FiniteElementOptions()
-    share = whole_field._Share(tmp_path, tmp_path / "none", None, options, True, {})  # type: ignore[arg-type]
+@pytest.fixture
+def share(tmp_path: Path) -> whole_field._Share:
+    """Of images that aren't there."""
+    corners = Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [[0, 1, 2], [1, 3, 2]], "T3")
+    body, options = Body(quadratic(corners)), FiniteElementOptions()
+    return whole_field._Share(tmp_path, tmp_path / "none", body, options, True, {})
+
+
+def test_an_input_error_of_another_process_is_one_here(share: whole_field._Share) -> None:
     with (
         pytest.raises(InputError, match="expected a finished image set"),
+        whole_field._children(1) as [child],
+    ):
+        share.hand_to(child)
+
+
+def test_a_killed_process_is_no_fault_of_the_program(
+    share: whole_field._Share, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_field._Share, "hand_to", lambda _, child: child.kill())
+    with (
+        pytest.raises(InputError, match="killed by signal 9, as where memory runs out"),
         whole_field._children(1) as [child],
     ):
         share.hand_to(child)

@@ -154,7 +154,7 @@ def measure_displacement(
     options : how to measure.
     progress : listener.
     """
-    course = _Measurement.begun(pair, start, on, options or FiniteElementOptions())
+    course = _Measurement.of(pair, start, on, options or FiniteElementOptions())
     count = len(course.options.stages) + 1
     for k, stage in enumerate(course.options.stages):
         progress(k, count, "whole displacement")
@@ -169,7 +169,7 @@ def coarse_displacement(
     pair: ImagePair, start: Result | Start, on: Body, *, options: FiniteElementOptions
 ) -> FloatArray:
     """(n, 2) u [mm] after the stages before the last; for the rest see `measure_displacement`."""
-    course = _Measurement.begun(pair, start, on, options)
+    course = _Measurement.of(pair, start, on, options)
     for stage in options.stages:
         course.through(stage)
     return course.u.reshape(-1, 2)
@@ -203,7 +203,7 @@ class _Measurement:
         self.history: list[Step] = []
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
-        self.on: _LevelOnMesh | None = None
+        self.level: _LevelOnMesh | None = None
         self.kept: Linearised | None = None
         self.free: tuple[FloatArray, Deviations] | None = None
         self.contradicted: float | None = None
@@ -213,7 +213,7 @@ class _Measurement:
         self.order = options.order or spline_order(self.speckle_px)
 
     @classmethod
-    def begun(
+    def of(
         cls, pair: ImagePair, start: Result | Start, on: Mesh | Body | None,
         options: FiniteElementOptions,
     ) -> _Measurement:  # fmt: skip
@@ -242,15 +242,15 @@ class _Measurement:
         self._last = now
 
     def _prepare(self, level: Level) -> _LevelOnMesh:
-        if self.on is None or self.on.level != level:
+        if self.level is None or self.level.level != level:
             order = self.order if level == FULL else 5
             images = images_on(self.pair, level, self.options.edge_px, order)
             pixels = self.body.pixels.on(images.grid, images.mask, images.reference)
-            self.on, self.kept = _LevelOnMesh(level, images, pixels), None
+            self.level, self.kept = _LevelOnMesh(level, images, pixels), None
             if level == FULL:
-                self.on = self._weighed_by_reference(self.on)
+                self.level = self._weighed_by_reference(self.level)
             self._lap("images")
-        return self.on
+        return self.level
 
     def _weighed_by_reference(self, on: _LevelOnMesh) -> _LevelOnMesh:
         """Weigh the residual by the reference's gradient, blurred as noise asks for."""
@@ -272,7 +272,7 @@ class _Measurement:
 
     def linearised(self) -> Linearised:
         """Normal equations at u; after short steps with the matrices that there are."""
-        on, kept, body = self.on, self.kept, self.body
+        on, kept, body = self.level, self.kept, self.body
         assert on is not None
         nodal, is_new = self.u.reshape(-1, 2), kept is None
         found = normal_equations(

@@ -275,11 +275,8 @@ def normal_equations(
     with_blocks : whether the blocks are needed, which take most of the time.
     """
     m = len(mesh.cells)
-    blocks, gradient, sums = (
-        np.zeros((m * with_blocks, 3, 6, 6)),
-        np.zeros((m, 6, 2)),
-        np.zeros((m, 4)),
-    )
+    blocks = np.zeros((m if with_blocks else 0, 3, 6, 6))
+    gradient, sums = np.zeros((m, 6, 2)), np.zeros((m, 4))
     valid = np.ones((0, 0), dtype=np.bool_) if level.valid is None else level.valid
     g = level.deformed
     in_parallel(

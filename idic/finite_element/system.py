@@ -238,9 +238,8 @@ class Body:
         pairs = np.hstack([mesh.cells[sides[:, 0]], mesh.cells[sides[:, 2]]])
         self.pattern = NodalPattern.of(len(mesh.nodes), mesh.cells, pairs)
         roots = SmoothnessRoots.of(mesh)
-        self.smoothness, self.smoothness_samples = (
-            self.pattern.both(roots.matrix()), roots.samples(SAMPLES),
-        )  # fmt: skip
+        self.smoothness = self.pattern.both(roots.matrix())
+        self.smoothness_samples = roots.samples(SAMPLES)
         edge = mesh.nodes[mesh.cells[:, 1]] - mesh.nodes[mesh.cells[:, 0]]
         self.wavelength = 10.0 * float(np.median(np.linalg.norm(edge, axis=1)))
         """Of the waves by which data and smoothness are compared [mm]."""

@@ -112,7 +112,7 @@ class _Ends:
 
 
 @contextmanager
-def _way_around(of: str) -> Iterator[None]:
+def _with_remedy(of: str) -> Iterator[None]:
     """Say in an InputError whose whole displacement it is about, and how to do without."""
     try:
         yield
@@ -156,7 +156,7 @@ class WholeFields:
         def report(done: float, total: float, what: str) -> None:
             progress(done, total, f"{what}, {of}")
 
-        with _way_around(of):
+        with _with_remedy(of):
             found = work(report)
         make_folder(self.folder)
         write_result(path, found, given=given)
@@ -180,13 +180,12 @@ class WholeFields:
         most = min(get_num_threads() if is_alone() else 1, len(images.strains))
         count = max(1, min(most, int(available_bytes() / (BYTES_PER_PIXEL * mask.size))))
         with _children(count - 1) as children:
-            with _way_around("mesh of the material"):
-                sizes = how.element_px, how.edge_element_px
-                body = Body.of_mask(mask, images.grid, *sizes)
+            with _with_remedy("mesh of the material"):
+                body = Body.of_mask(mask, images.grid, how.element_px, how.edge_element_px)
             shares = [
                 _Share(self.folder, images.folder, body, how, options.camera,
-                       {strain: results[strain] for strain in images.strains[k::count]})
-                for k in range(count)
+                       {strain: results[strain] for strain in images.strains[-1 - k :: -count]})
+                for k in range(count)  # the last state takes longest, and its progress is seen
             ]  # fmt: skip
             for child, share in zip(children, shares[1:], strict=True):
                 share.hand_to(child)
@@ -257,9 +256,9 @@ class _Share:
 
 @contextmanager
 def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that measure the share they are given; an InputError is theirs.
+    """Processes that measure the share they are given; none is left in the end.
 
-    RuntimeError if one fails otherwise. None is left in the end.
+    InputError as it comes from one, or if one was killed; RuntimeError if one fails otherwise.
     """
     command, pipe = [sys.executable, "-P", "-m", "modeharvest.runs.whole_field"], subprocess.PIPE
     with ExitStack() as stack:
@@ -274,6 +273,11 @@ def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
                 text, code = child.stderr.read().decode(errors="replace").strip(), child.wait()
                 if code == _REFUSED:
                     raise InputError(text.splitlines()[-1])
+                if code < 0:
+                    raise InputError(
+                        f"a process that measures was killed by signal {-code}, as where memory "
+                        "runs out; free some, or measure with NUMBA_NUM_THREADS=1"
+                    )
                 if code != 0:
                     raise RuntimeError(text or f"a process that measures ended with {code}")
         finally:
