@@ -258,8 +258,9 @@ def displacement_spectrum(
     return spectrum, mode_pattern.read_pattern(spectrum)
 
 
-def compare_snapshot(measured: MeasuredExperiment, strain: float) -> Comparison:
-    """Set the result at a strain against the truth."""
+def compare_snapshot(k: int, measured: MeasuredExperiment) -> Comparison:
+    """Set the k-th result, by ascending strain, against the truth."""
+    strain = sorted(measured.results)[k]
     result, options = measured.results[strain], measured.options
     start = result.ansatz.initial_guess(strain, options.start_amplitude)
     return compare(measured.images, strain, result, start, options.camera)

@@ -60,6 +60,8 @@ _LAST = FiniteElementOptions(edge_px=1)
 """A camera's pixel on an edge shows some background; one such row lets the edge drift off."""
 _BLUR_PX, _SPECKLE = 1.5, 3.0
 """Of the reference, and the power of its slopes over that of noise, where there is speckle."""
+_MISFIT, _SLIGHT = 2.0, 0.03
+"""Residual, over the images' noise and over their contrast, beyond which they don't match."""
 _OFF_PX = 4.0, 1.0
 """By how much edges may be off where blocks of speckle, and a first measurement, say they are."""
 
@@ -242,6 +244,14 @@ def residual(pair: ImagePair, u: FloatArray) -> FloatArray:
     found = np.full(pair.grid.shape, np.nan)
     found[known] = f - gain * g - offset
     return found
+
+
+def is_misfit(result: NodalResult, noise: float, reference: FloatImage) -> bool:
+    """Whether images don't match somewhere: the residual is more than noise and than slight.
+
+    ``noise``: of the residual, rms; ``reference``: (p,) pixels of its material [grey levels].
+    """
+    return result.residual_rms > max(_MISFIT * noise, _SLIGHT * float(reference.std()))
 
 
 def _compared(

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -65,17 +65,14 @@ class Run(StagedRun[Case]):
         """
         path, vtu = self.folder / "solution.h5", self.folder / "solution.vtu"
 
-        def write(solution: Solution) -> None:
-            solution.write(path)
-            solution.write_vtu(vtu)
-
         def work() -> tuple[Path, ...]:
             solution = self._simulate()
-            on_first(lambda: write(solution))
+            on_first(lambda: solution.write(path))
+            on_first(lambda: solution.write_vtu(vtu))
             return path, vtu
 
-        key = stage_key(self.case.plain()["experiment"], "fem")
-        return self.do("fem", key, work, lambda: Solution.read(path), collective=True)
+        self.do("fem", stage_key(self.case.plain()["experiment"], "fem"), work, collective=True)
+        return Solution.read(path)
 
     def solved(self) -> Solution:
         """The solution that was given, or else a simulated one.
@@ -92,12 +89,12 @@ class Run(StagedRun[Case]):
         """
         solution, folder = self._solution(), self.folder / "images"
         strains, spec = self._strains(solution), self.case.imaging
-        return self.do(
-            "image",
-            image_key(solution, spec, strains),
-            lambda: make_images(solution, spec, folder, strains, self.progress).files,
-            lambda: ImageSet.read(folder),
-        )
+
+        def work() -> tuple[Path, ...]:
+            return make_images(solution, spec, folder, strains, self.progress).files
+
+        self.do("image", image_key(solution, spec, strains), work)
+        return ImageSet.read(folder)
 
     def correlate(self) -> dict[float, Result]:
         """Correlate every deformed image with the reference; leaves ``correlation/``.
@@ -113,8 +110,8 @@ class Run(StagedRun[Case]):
                 self._correlate_one(images, strain).write(path)
             return paths
 
-        key = self._correlate_key(images)
-        return self.do("correlate", key, work, lambda: self._results(images))
+        self.do("correlate", self._correlate_key(images), work)
+        return self._results(images)
 
     def measure(self) -> dict[float, NodalResult]:
         """Measure the whole displacement of every deformed image; leaves ``whole_field/``.
@@ -131,10 +128,8 @@ class Run(StagedRun[Case]):
             results, experiment = self._results(images), self.case.experiment
             return self._whole_fields.of_images(images, results, options, experiment, self.progress)
 
-        def read() -> dict[float, NodalResult]:
-            return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
-
-        return self.do("measure", self._measure_key(correlated), work, read)
+        self.do("measure", self._measure_key(correlated), work)
+        return {strain: self._whole_fields.read(name_of(strain)) for strain in images.strains}
 
     def validate(self) -> dict[str, Any]:
         """Compare the results with the truth; leaves ``report.html`` and ``summary.json``.
@@ -143,7 +138,7 @@ class Run(StagedRun[Case]):
         """
         images, correlated = self._correlated()
         measured = self._measure_key(correlated)
-        if self.case.whole_field.measure and not self.stages.is_finished("measure", measured):
+        if self.case.whole_field.measure and not self.is_finished("measure", measured):
             raise InputError(
                 f"expected whole displacements of this case in {self._whole_fields.folder}, found "
                 "none that are finished and whole; make them with 'modeharvest correlate'"
@@ -154,8 +149,8 @@ class Run(StagedRun[Case]):
             write_json(path, self._report(images, page))
             return path, page
 
-        key = stage_key([measured, self.case.title])
-        return self.do("validate", key, work, lambda: dict(read_json(path)))
+        self.do("validate", stage_key([measured, self.case.title]), work)
+        return dict(read_json(path))
 
     def all(self) -> dict[str, Any]:
         """Run every stage that is not finished; returns the content of ``summary.json``.
@@ -165,7 +160,7 @@ class Run(StagedRun[Case]):
         """
         with exclusive(self.folder):
             stages = ("image", "correlate", *("measure",) * self.case.whole_field.measure)
-            ahead = [stage for stage in stages if stage not in self.stages.timings]
+            ahead = [stage for stage in stages if stage not in self.timings]
             with precompiling(ahead) as kernels:
                 solution = self.solved()
                 kernels.wait("image", self.progress)
@@ -194,7 +189,7 @@ class Run(StagedRun[Case]):
         """The images, and the key of their results; InputError without finished ones."""
         images = self._images()
         correlated = self._correlate_key(images)
-        if not self.stages.is_finished("correlate", correlated):
+        if not self.is_finished("correlate", correlated):
             raise InputError(
                 f"expected results of this case in {self.folder / 'correlation'}, found none that "
                 "are finished and whole; make them with 'modeharvest correlate'"
@@ -208,22 +203,20 @@ class Run(StagedRun[Case]):
         from modeharvest.report.model import draw_figures, write_page
 
         case, solution, results = self.case, self._solution(), self._results(images)
+        is_whole = case.whole_field.measure
         measured = MeasuredExperiment(case.experiment, case.correlation, solution, images, results)
         strains = sorted(results)
-        every = range(len(strains))
         # The numbers are numpy's and numba's work, which let go of the GIL; drawing is Python's.
         with _brief_turns(), ThreadPoolExecutor(os.cpu_count()) as threads:
-            comparisons = _Awaited([threads.submit(compare_snapshot, measured, e) for e in strains])
-            spectra = _Awaited(
-                [threads.submit(displacement_spectrum, comparisons, k, measured) for k in every]
-            )
-            snapshots = _Awaited(
-                [threads.submit(snapshot_summary, comparisons, spectra, k, measured) for k in every]
-            )
-            wholes = _Awaited(
-                [threads.submit(self._whole_fields.compared, comparisons, k, measured.specimen)
-                 for k in every if case.whole_field.measure]
-            )  # fmt: skip
+
+            def of_each(work: Callable[..., T], *earlier: Sequence[Any]) -> Sequence[T]:
+                states = range(len(strains))
+                return _Awaited([threads.submit(work, *earlier, k, measured) for k in states])
+
+            comparisons = of_each(compare_snapshot)
+            spectra = of_each(displacement_spectrum, comparisons)
+            snapshots = of_each(snapshot_summary, comparisons, spectra)
+            wholes = of_each(self._whole_fields.compared, comparisons) if is_whole else ()
             found, pitch = [results[strain] for strain in strains], measured.specimen.pitch
             data = ExperimentData(
                 solution, images, strains, found, comparisons, spectra, pitch, wholes
@@ -238,7 +231,7 @@ class Run(StagedRun[Case]):
 
     def _images(self) -> ImageSet:
         advice = "make it again with 'modeharvest image'"
-        self.stages.require_whole(self.folder / "images" / SIDECAR, advice)
+        self.require_whole(self.folder / "images" / SIDECAR, advice)
         images = ImageSet.read(self.folder / "images")
         where = f"in {images.folder}; make them again with 'modeharvest image'"
         if images.spec != self.case.imaging:
@@ -277,7 +270,7 @@ class Run(StagedRun[Case]):
         """The solution that was given, or the folder's own; InputError if it isn't this case's."""
         if self.solution is None:
             advice = "make it again with 'modeharvest fem', or give it by --solution"
-            self.stages.require_whole(self._solution_path, advice)
+            self.require_whole(self._solution_path, advice)
         solution = Solution.read(self._solution_path)
         require_same_experiment(solution.info, self.case.experiment, self._solution_path)
         self._strains(solution)

@@ -37,6 +37,7 @@ from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
 from modeharvest.idic.photograph.displacement import (
     brightness,
+    is_misfit,
     photographed_displacement,
     residual,
     speckled,
@@ -72,8 +73,6 @@ from modeharvest.util.typed import picked
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 _CODE = ("fem", "imaging", "idic", "runs")
 """What the numbers depend on."""
-_MISFIT, _SLIGHT = 2.0, 0.03
-"""Residual, over the images' noise and over their contrast, beyond which that is warned of."""
 _LEAST_PX = 1000
 """Pixels that a mesh covers, at least: some four elements."""
 _OVERLAP = 0.01
@@ -100,14 +99,14 @@ class MeasureCase:
     def __post_init__(self) -> None:
         if self.pixel_size is not None:
             require_within("expected a pixel size [mm]", self.pixel_size, 0.0, above=True)
-        for path in (self.reference, *self.files, self.mask, self.mesh):
+        for path in (self.reference, *self.files.values(), self.mask, self.mesh):
             if path is not None:
                 require_file(path, "a file", "check its name")
 
     @property
-    def files(self) -> tuple[Path, ...]:
-        """The deformed images."""
-        return named_files(Path(), self.deformed)
+    def files(self) -> dict[str, Path]:
+        """The deformed images by their names, in the order of the test."""
+        return {path.stem: path for path in named_files(Path(), self.deformed)}
 
     @property
     def unit(self) -> str:
@@ -132,14 +131,17 @@ class MeasureRun(StagedRun[MeasureCase]):
     @cached_property
     def reference(self) -> Photograph:
         """The reference; InputError if it shows no speckle."""
-        given = None if self.case.mask is None else read_mask(self.case.mask)
-        reference = read_reference(self.case.reference)
+        given, reference = self._given_mask, read_reference(self.case.reference)
         if given is not None:
             names = str(self.case.reference), str(self.case.mask)
             require_same_shape(reference.image, given, *names)
         require_memory(BYTES_PER_PIXEL * reference.image.size,
                        f"an image of {reference.image.size / 1e6:.0f} Mpx", "crop it")  # fmt: skip
         return reference
+
+    @cached_property
+    def _given_mask(self) -> BoolArray | None:
+        return None if self.case.mask is None else read_mask(self.case.mask)
 
     @cached_property
     def grid(self) -> PixelGrid:
@@ -166,12 +168,10 @@ class MeasureRun(StagedRun[MeasureCase]):
                 write_mesh(file, found.mesh)
             return mask_path, mesh_path
 
-        def read() -> MeshedMaterial:
-            with open_hdf5(mesh_path, "a mesh", "measure again", _MESH_FORMAT) as file:
-                warnings = tuple(json.loads(file.attrs["warnings"]))
-                return MeshedMaterial(read_mask(mask_path), read_mesh(file), warnings)
-
-        return self.do("prepare", self._key, work, read)
+        self.do("prepare", self._key, work)
+        with open_hdf5(mesh_path, "a mesh", "measure again", _MESH_FORMAT) as file:
+            warnings = tuple(json.loads(file.attrs["warnings"]))
+            return MeshedMaterial(read_mask(mask_path), read_mesh(file), warnings)
 
     @cached_property
     def _body(self) -> Body:
@@ -179,9 +179,8 @@ class MeasureRun(StagedRun[MeasureCase]):
 
     def _material(self) -> MeshedMaterial:
         """What can be measured of the mask that is given, or is found by its speckle."""
-        given, options, image = self.case.mask, FiniteElementOptions(), self.reference.image
-        mask = find_material(image).mask if given is None else read_mask(given)
-        mask, blank = speckled(image, mask)
+        given, options, image = self._given_mask, FiniteElementOptions(), self.reference.image
+        mask, blank = speckled(image, find_material(image).mask if given is None else given)
         kept, changes = meshable(mask, options.edge_element_px)
         mesh = mesh_of_mask(kept, self.grid, options.element_px, options.edge_element_px)
         return MeshedMaterial(kept, mesh, (*blank, *changes))
@@ -206,7 +205,7 @@ class MeasureRun(StagedRun[MeasureCase]):
                 f"expected elements that don't overlap in {path}, got {located.doubly_covered} px "
                 "in more than one; repair the mesh"
             )
-        mask = covered if self.case.mask is None else read_mask(self.case.mask)
+        mask = covered if self._given_mask is None else self._given_mask
         size = np.array(self.grid.shape) - 1
         off = np.abs(np.column_stack(self.grid.to_px(*mesh.nodes.T)) - size / 2) > size / 2
         shown, used = (np.bincount(located.element[where], minlength=len(mesh.cells)) > 0
@@ -222,44 +221,42 @@ class MeasureRun(StagedRun[MeasureCase]):
             )
         return MeshedMaterial(mask, mesh, warnings)
 
-    def pair(self, path: Path) -> ImagePair:
+    def pair(self, name: str) -> ImagePair:
         """The reference, a deformed image, and the mask."""
-        frame = read_frame(path, self.reference)
+        frame = read_frame(self.case.files[name], self.reference)
         return ImagePair(self.reference.image, frame.image, self.grid, self.material.mask)
 
     def results(self) -> dict[str, NodalResult]:
         """Measure every image, each after the one before; leaves ``results/``."""
         files, key = self.case.files, self._key
-        for path in files:  # what is wrong with one is known before the first is measured
+        for path in files.values():  # what is wrong with one is known before the first is measured
             read_frame(path, self.reference)
         found: dict[str, NodalResult] = {}
-        for path in counted(files, self.progress, "measure images"):
-            key = digest([key, path.stem, sha256_of(path)])
-            found[path.stem] = self._result(path, key, next(reversed(found.values()), None))
+        for name in counted(tuple(files), self.progress, "measure images"):
+            key = digest([key, name, sha256_of(files[name])])
+            found[name] = self._result(name, key, next(reversed(found.values()), None))
         return found
 
-    def _result(self, path: Path, key: str, before: NodalResult | None) -> NodalResult:
-        stem = self.folder / "results" / path.stem
-        names, unit = (str(self.case.reference), str(path)), self.case.unit
+    def _result(self, name: str, key: str, before: NodalResult | None) -> NodalResult:
+        folder, unit = self.folder / "results", self.case.unit
+        tables = [folder / f"{name}.{kind}" for kind in ("h5", "vtu", "csv")]
 
         def work() -> tuple[Path, ...]:
+            names = str(self.case.reference), str(self.case.files[name])
             result = photographed_displacement(
-                self.pair(path), self._body, before, names, self.progress
+                self.pair(name), self._body, before, names, self.progress
             )
-            tables = [stem.with_name(stem.name + kind) for kind in (".h5", ".vtu", ".csv")]
             write_result(tables[0], result, unit)
             write_vtu(tables[1], result, unit)
             write_csv(tables[2], result, unit=unit)
-            return *tables, *write_maps(stem, result, unit)
+            return *tables, *write_maps(folder / name, result, unit)
 
-        return self.do(
-            f"image {path.stem}", key, work, lambda: read_result(stem.with_name(stem.name + ".h5"))
-        )
+        self.do(f"image {name}", key, work)
+        return read_result(tables[0])
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
-        path = next(path for path in self.case.files if path.stem == name)
-        return residual(self.pair(path), result.displacement_on())
+        return residual(self.pair(name), result.displacement_on())
 
     def all(self) -> dict[str, Any]:
         """Do everything that is not finished; returns the content of ``summary.json``."""
@@ -301,13 +298,12 @@ class MeasureRun(StagedRun[MeasureCase]):
         px, mask = self.grid.pixel_size, self.material.mask
         u = result.displacement_on()
         inside = u[mask & np.isfinite(u).all(axis=-1)] / px
-        path = next(path for path in self.case.files if path.stem == name)
-        pair = self.pair(path)
+        pair = self.pair(name)
         gain, offset = brightness(pair, u)
         f, material = pair.reference, pair.masks[0]
         noise = estimated_noise(f, material).sd * float(np.hypot(1.0, gain))
         warnings = list(result.warnings)
-        if result.residual_rms > max(_MISFIT * noise, _SLIGHT * float(f[material].std())):
+        if is_misfit(result, noise, f[material]):
             warnings.append(
                 f"The residual is {result.residual_rms:.3g} grey levels, of which noise is about "
                 f"{noise:.2g}: somewhere the images don't match, see its map; give images in "
@@ -324,7 +320,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             **picked(result, "residual_rms residual_noise library"),
             "gain": gain,
             "offset": offset,
-            "seconds": self.stages.timings.get(f"image {name}"),
+            "seconds": self.timings.get(f"image {name}"),
             "image_noise": noise,
             "warnings": warnings,
         }

@@ -139,16 +139,16 @@ class StudyAnalysis(StagedRun[StudyCase]):
             require_writable(folder)
             _claim(folder, self.case.kind)
             self.workers.require_ready(study.function, folder)
-            with self.stages.timed("solution and images"):
+            with self.timed("solution and images"):
                 cases = study.prepare(self.pair_spec(), folder, self.progress)
             campaign = Campaign(study.function, cases, folder)
-            with self.stages.timed("cases"):
+            with self.timed("cases"):
                 listener = named(self.progress, f"study: {len(cases)} cases")
                 table = campaign.run(self.workers, listener)
             if (table["error"] != "").all():
                 first = table["error"].iloc[0]
                 raise InputError(f"all {len(table)} cases failed; the first: {first}")
-            with self.stages.timed("findings"):
+            with self.timed("findings"):
                 findings = FINDINGS[type(study)](study.analyse(table, folder), study.seeds)
             return self._write_report(campaign, table, findings)
 

@@ -16,7 +16,6 @@ import numpy as np
 from numba import get_num_threads
 
 from modeharvest.fem.experiment import Experiment
-from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.finite_element.files import (
     NO_MORE,
     Given,
@@ -38,6 +37,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import make_folder, read_json, write_json
 from modeharvest.util.machine import available_bytes, is_alone
 from modeharvest.util.progress import Progress, silent
+from modeharvest.validation.summary import MeasuredExperiment
 from modeharvest.validation.truth import Comparison
 from modeharvest.validation.whole_field import (
     WholeField,
@@ -194,21 +194,17 @@ class WholeFields:
         return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
 
     def compared(
-        self, comparisons: Sequence[Comparison], k: int, specimen: Specimen
+        self, comparisons: Sequence[Comparison], k: int, measured: MeasuredExperiment
     ) -> tuple[WholeField, WholeFieldSummary]:
-        """One of a virtual experiment, refitted and set against the truth."""
-        known = comparisons[k]
-        whole = self.refitted(name_of(known.strain), known.result, known.mask)
-        return whole, compare_whole(whole, known.displacement, known.best, known.mask, specimen)
+        """The k-th of a virtual experiment, refitted and set against the truth."""
+        known, name = comparisons[k], name_of(comparisons[k].strain)
+        found, true = self.read(name), known.displacement
+        whole = WholeField(found, refitted(found, known.result, known.mask), self.seconds(name))
+        return whole, compare_whole(whole, true, known.best, known.mask, measured.specimen)
 
     def read(self, name: str) -> NodalResult:
         """The whole displacement of an image; InputError if its file is missing or damaged."""
         return read_result(self.path(name))
-
-    def refitted(self, name: str, correlated: Result, mask: BoolArray) -> WholeField:
-        """It with the ansatz of a correlation, refitted to it on the pixels of a mask."""
-        measured = self.read(name)
-        return WholeField(measured, refitted(measured, correlated, mask), self.seconds(name))
 
     def seconds(self, name: str) -> float:
         """What its measurement took [s]."""

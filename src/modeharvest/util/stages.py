@@ -22,11 +22,11 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from importlib.metadata import version
 from importlib.resources.abc import Traversable
@@ -88,11 +88,11 @@ except ImportError:  # Windows
 RECORD, TIMINGS, LOCK = "stages.json", "timings.json", ".lock"
 
 
-@dataclass(frozen=True)
 class Stages:
     """The stages of one folder, which is made if it does not exist."""
 
-    folder: Path
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def is_finished(self, name: str, key: str) -> bool:
         """Whether a stage was finished with this key, and its files are what it wrote."""
@@ -171,7 +171,7 @@ class Stages:
 
 
 @dataclass(frozen=True)
-class StagedRun(Generic[C]):
+class StagedRun(Stages, Generic[C]):
     """What every kind of run has: a case, a folder, stages that are not done twice."""
 
     case: C
@@ -179,22 +179,42 @@ class StagedRun(Generic[C]):
     """Made if it does not exist."""
     progress: Progress = silent
 
-    @property
-    def stages(self) -> Stages:
-        """What is finished in the folder."""
-        return Stages(self.folder)
-
-    def do(
+    def do_in_turn(
         self,
-        name: str,
-        key: str,
-        work: Callable[[], Iterable[Path]],
-        read: Callable[[], R],
-        collective: bool = False,
-    ) -> R:
-        """Do a stage unless it is finished (see :class:`Stages`); returns what its files say."""
-        self.stages.do(name, key, work, collective=collective)
-        return read()
+        what: str,
+        keys: Mapping[str, str],
+        records: Path,
+        work: Callable[[str, dict[str, R]], tuple[Sequence[Path], dict[str, Any]]],
+        read: Callable[[str, dict[str, Any]], R],
+        nothing: Mapping[str, Any],
+    ) -> tuple[dict[str, R], dict[str, str]]:
+        """A stage for each of several images, from what was found in those before.
+
+        ``keys``: by their names; ``work`` gets a name and what was found, leaves files, and returns
+        them with the content of ``NAME_start.json`` in the folder ``records``; ``read`` reads them
+        again. Returns what was found and why others failed: an InputError of the work is taken down
+        as ``failed``, beside ``nothing`` for the rest, and the next image goes on.
+        """
+        found: dict[str, R] = {}
+        failed: dict[str, str] = {}
+
+        def one(name: str, path: Path) -> Sequence[Path]:
+            try:
+                files, about = work(name, found)
+            except InputError as error:
+                files, about = (), {"failed": str(error), **nothing}
+            write_json(path, {"failed": "", **about})
+            return *files, path
+
+        for name, key in keys.items():
+            path = records / f"{name}_start.json"
+            self.do(f"{what} {name}", key, partial(one, name, path))
+            about = read_json(path)
+            if about["failed"]:
+                failed[name] = about["failed"]
+            else:
+                found[name] = read(name, about)
+        return found, failed
 
 
 def stage_key(content: object, *folders: str) -> str:

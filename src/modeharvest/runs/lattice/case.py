@@ -12,8 +12,7 @@
     [study]        # optional: how the pattern depends on d/l, l, material and loading
 
 In Python: ``LatticeCase(lattice=SquareLattice(1.9, 1.5), loading=Loading("equibiaxial"))``. No
-lattice needs gmsh before its cell is meshed. Here is also what each stage of the analysis depends
-on: with the same key it is not done again.
+lattice needs gmsh before its cell is meshed.
 """
 
 from __future__ import annotations
@@ -33,9 +32,7 @@ from modeharvest.fem.lattice.options import Wave
 from modeharvest.fem.materials import MATERIALS, Material, Ogden
 from modeharvest.runs.case import CaseModel, of_kind, with_kind
 from modeharvest.util.errors import InputError, require_within
-from modeharvest.util.files import sha256_of
 from modeharvest.util.progress import Progress, silent
-from modeharvest.util.stages import digest, stage_key
 from modeharvest.validation.studies.lattice import (
     LatticeModeStudy,
     StudiedLattice,
@@ -374,19 +371,3 @@ class LatticeCase(CaseModel):
         ratio, loading = lattice.diameter / lattice.pitch, self.loading.macro()
         base = StudiedLattice(ratio, loading, self.material, lattice.pitch)
         return run_lattice_study(base, plan, table, progress)
-
-
-def stage_keys(case: LatticeCase) -> dict[str, str]:
-    """By stage, the digest of all that its outcome depends on; a cell's own file included."""
-    content = case.plain()
-    if isinstance(case.lattice, FileLattice):
-        content["lattice"]["content"] = sha256_of(case.lattice.path)
-    tables = {name: content[name] for name in ("lattice", "material", "loading", "search")}
-    critical = stage_key(tables)
-    return {
-        "critical": critical,
-        "dispersion": digest([critical, content["dispersion"]]),
-        "modes": digest([critical, content["modes"]]),
-        "families": digest([critical, content["modes"], "families"]),
-        "study": stage_key([tables, content["study"]]),
-    }

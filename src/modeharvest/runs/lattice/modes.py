@@ -1,9 +1,4 @@
-"""What a lattice buckles into: its critical point, its modes and branches, their mode families.
-
-``critical.json`` holds ``point``, the fields of
-:class:`modeharvest.runs.lattice.results.CriticalPoint`, and ``history``: for each load looked at
-the least stable wave (see ``fem.bloch.critical.LeastStable``).
-"""
+"""What a lattice buckles into: its critical point, its modes and branches, their mode families."""
 
 from __future__ import annotations
 
@@ -23,9 +18,7 @@ from modeharvest.runs.lattice.case import LatticeCase
 from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, PeriodicField
 from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError, requiring_dolfinx
-from modeharvest.util.files import read_json, reading, write_json
 from modeharvest.util.progress import Progress, named, silent
-from modeharvest.util.typed import made, to_plain
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
@@ -34,18 +27,6 @@ if TYPE_CHECKING:
 
 BEYOND = (1.02, 1.1, 1.25, 1.5)
 """Loads at which states of branches are kept, relative to the critical one."""
-
-
-def write_critical(path: Path, loading: str, found: LatticeCritical) -> None:
-    """Write ``critical.json``."""
-    point = CriticalPoint.of(loading, found)
-    write_json(path, {"point": to_plain(point), "history": to_plain(found.history)})
-
-
-def read_critical(path: Path) -> CriticalPoint:
-    """Read the point in ``critical.json``; InputError if it is damaged."""
-    with reading(path, "a critical point", "remove it"):
-        return made(CriticalPoint, read_json(path)["point"])
 
 
 @dataclass(frozen=True)

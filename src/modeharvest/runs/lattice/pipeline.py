@@ -17,20 +17,15 @@ from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap, dispersion, zo
 from modeharvest.fem.bloch.modes import Branch, ModeSet
 from modeharvest.idic.spectra.mode_family import write_family
 from modeharvest.runs.lattice import results
-from modeharvest.runs.lattice.case import LatticeCase, stage_keys
-from modeharvest.runs.lattice.modes import (
-    LatticeModel,
-    found_pattern,
-    read_critical,
-    to_be_shown,
-    write_critical,
-)
+from modeharvest.runs.lattice.case import FileLattice, LatticeCase
+from modeharvest.runs.lattice.modes import LatticeModel, found_pattern, to_be_shown
 from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
 from modeharvest.util import __version__
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, write_json
+from modeharvest.util.files import read_json, reading, sha256_of, write_json
 from modeharvest.util.progress import counted
-from modeharvest.util.stages import StagedRun, exclusive, stage_key
+from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key
+from modeharvest.util.typed import made, to_plain
 
 
 @dataclass(frozen=True)
@@ -43,16 +38,21 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
     def critical(self) -> CriticalPoint:
         """Find the first critical load over all wave vectors; leaves ``critical.json``.
 
-        Raises InputError if the cell is not periodic or the lattice is a mechanism,
-        MissingDependencyError if dolfinx is not there.
+        There ``history`` has the least stable wave at each load looked at. Raises InputError if
+        the cell is not periodic or the lattice is a mechanism, MissingDependencyError if dolfinx
+        is not there.
         """
         path = self.folder / "critical.json"
 
         def work() -> tuple[Path, ...]:
-            write_critical(path, self.case.loading.name, self._model.critical())
+            found = self._model.critical()
+            point = CriticalPoint.of(self.case.loading.name, found)
+            write_json(path, to_plain({"point": point, "history": found.history}))
             return (path,)
 
-        return self.do("critical", self._keys["critical"], work, lambda: read_critical(path))
+        self.do("critical", self._keys["critical"], work)
+        with reading(path, "a critical point", "remove it"):
+            return made(CriticalPoint, read_json(path)["point"])
 
     def dispersion(self) -> Dispersion:
         """Compute the lowest eigenvalues; leaves ``dispersion.h5`` and, as a table, ``.csv``."""
@@ -70,7 +70,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             results.write_dispersion_table(found, table)
             return path, table
 
-        return self.do("dispersion", self._keys["dispersion"], work, lambda: Dispersion.read(path))
+        self.do("dispersion", self._keys["dispersion"], work)
+        return Dispersion.read(path)
 
     def modes(self) -> tuple[ModeSet | None, tuple[Branch, ...]]:
         """Find modes and branches; leaves ``modes.h5``, ``.vtu`` and ``.xdmf``, if there are any.
@@ -91,7 +92,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             mode_files.write_xdmf(xdmf, *found)
             return path, vtu, xdmf
 
-        return self.do("modes", self._keys["modes"], work, lambda: mode_files.read_modes(path))
+        self.do("modes", self._keys["modes"], work)
+        return mode_files.read_modes(path)
 
     def families(self) -> None:
         """Find the mode families of modes, branches and primary path; leaves ``family_*.json``."""
@@ -105,7 +107,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             write_json(index, {pattern.file: pattern.name for pattern in self._patterns})
             return [index, *(self.folder / pattern.file for pattern in self._patterns)]
 
-        self.stages.do("families", self._keys["families"], work)
+        self.do("families", self._keys["families"], work)
 
     def study(self) -> None:
         """Do the study, if the case has one; leaves ``study.csv``."""
@@ -121,7 +123,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
                 other.unlink()
             return (path,)
 
-        self.stages.do("study", key, work)
+        self.do("study", key, work)
 
     def report(self) -> dict[str, Any]:
         """Write all that is finished into ``report.html`` and ``summary.json``; returns the latter.
@@ -129,7 +131,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         Whatever was computed in this folder for this very case is in it.
         """
         path, page = self.folder / "summary.json", self.folder / "report.html"
-        done = {n: key for n, key in self._keys.items() if self.stages.is_finished(n, key)}
+        done = {n: key for n, key in self._keys.items() if self.is_finished(n, key)}
 
         def work() -> tuple[Path, ...]:
             from modeharvest.report.lattice import lattice_report
@@ -143,7 +145,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             return path, page
 
         key = stage_key([done, self.case.title, self.source])
-        return self.do("report", key, work, lambda: dict(read_json(path)))
+        self.do("report", key, work)
+        return dict(read_json(path))
 
     def bloch(self) -> dict[str, Any]:
         """Stability against all waves, and dispersion; returns the content of ``summary.json``.
@@ -217,4 +220,16 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
     @cached_property
     def _keys(self) -> dict[str, str]:
-        return stage_keys(self.case)
+        """By stage, the digest of all that it depends on; a cell's own file included."""
+        case, content = self.case, self.case.plain()
+        if isinstance(case.lattice, FileLattice):
+            content["lattice"]["content"] = sha256_of(case.lattice.path)
+        tables = {name: content[name] for name in ("lattice", "material", "loading", "search")}
+        critical = stage_key(tables)
+        return {
+            "critical": critical,
+            "dispersion": digest([critical, content["dispersion"]]),
+            "modes": digest([critical, content["modes"]]),
+            "families": digest([critical, content["modes"], "families"]),
+            "study": stage_key([tables, content["study"]]),
+        }

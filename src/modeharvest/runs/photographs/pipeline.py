@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -38,25 +39,16 @@ from modeharvest.runs.photographs.summary import harvest_summary
 from modeharvest.runs.photographs.whole_field import PhotographWholeFields
 from modeharvest.runs.whole_field import change_of
 from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, require_writable, sha256_of, write_json
+from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
-from modeharvest.util.typed import made, to_plain
+from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
 """What the numbers depend on."""
 _CODE = ("fem", "imaging", "idic", "runs")
 """Folders of the package that they depend on; how they are shown is in others."""
-
-
-@dataclass(frozen=True)
-class _StartRecord:
-    """``NAME_start.json``: why a photograph could not be measured, or how its measurement began."""
-
-    failed: str
-    fixed: bool = False
-    text: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,8 @@ class HarvestRun(StagedRun[PhotographCase]):
             return self.folder / "distortion.json", self.folder / "calibration.json"
 
         key = stage_key([to_plain(table), [sha256_of(path) for path in files]], *_CODE)
-        return self.do("optics", key, work, lambda: prepare.calibrated_lens(self.folder))
+        self.do("optics", key, work)
+        return prepare.calibrated_lens(self.folder)
 
     def prepared(self) -> PreparedPhotographs:
         """Make the photographs ready; leaves ``prepared/``."""
@@ -91,9 +84,8 @@ class HarvestRun(StagedRun[PhotographCase]):
             distortion = self.optics.distortion
             return prepare.prepare(self.case, folder, distortion, self.progress).files
 
-        return self.do(
-            "prepare", self._prepared_key(), work, lambda: PreparedPhotographs.read(folder)
-        )
+        self.do("prepare", self._prepared_key(), work)
+        return PreparedPhotographs.read(folder)
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -107,15 +99,9 @@ class HarvestRun(StagedRun[PhotographCase]):
         One that can't be measured is left out (see :meth:`failures`), and the next goes on from
         the last that could. Raises InputError if none can be measured.
         """
-        prepared = self.prepared()
-        _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
-        found: dict[str, MeasuredPhotograph] = {}
-        for name, key in self._keys.items():
-            measured = self._measured(prepared, name, found, key)
-            if measured is not None:
-                found[name] = measured
+        found, failed = self._correlated
         if not found:
-            name, reason = self.failures()[0]
+            name, reason = next(iter(failed.items()))
             raise InputError(f"{name}: {reason}")
         return found
 
@@ -142,8 +128,7 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def failures(self) -> tuple[tuple[str, str], ...]:
         """Names of the photographs that were read but could not be measured, and why."""
-        reasons = {name: self._record(name).failed for name in self.prepared().names}
-        return tuple((name, reason) for name, reason in reasons.items() if reason)
+        return tuple(self._correlated[1].items())
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
@@ -180,7 +165,6 @@ class HarvestRun(StagedRun[PhotographCase]):
         """
         with exclusive(self.folder):
             require_writable(self.folder)
-            self.results()
             from modeharvest.report.model import write_page
             from modeharvest.report.photographs import photographs_report
 
@@ -193,45 +177,37 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     # -- parts --------------------------------------------------------------------------
 
-    def _measured(
-        self,
-        prepared: PreparedPhotographs,
-        name: str,
-        found: dict[str, MeasuredPhotograph],
-        key: str,
-    ) -> MeasuredPhotograph | None:
-        """A photograph, measured from the last of those before it that were; None if it can't."""
-        result, field, start = self._paths(name)
-        before = next(reversed(found), None)
+    @cached_property
+    def _correlated(self) -> tuple[dict[str, MeasuredPhotograph], dict[str, str]]:
+        """Photographs that were measured, and why others could not be."""
+        prepared, case = self.prepared(), self.case
+        _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
 
-        def work() -> tuple[Path, ...]:
-            case, lens = self.case, self.optics.distortion
-            try:
-                measured = measure(
-                    self._pair(prepared, name, before, found),
-                    self.geometry,
-                    case.specimen.cell_size,
-                    case.correlation,
-                    prepare.local_field(case, prepared, name, lens),
-                    None if before is None else found[before],
-                    self.progress,
-                )
-            except InputError as error:
-                write_json(start, to_plain(_StartRecord(str(error))))
-                return (start,)
+        def work(
+            name: str, found: dict[str, MeasuredPhotograph]
+        ) -> tuple[Sequence[Path], dict[str, Any]]:
+            before = next(reversed(found), None)
+            measured = measure(
+                self._pair(prepared, name, before, found),
+                self.geometry,
+                case.specimen.cell_size,
+                case.correlation,
+                prepare.local_field(case, prepared, name, self.optics.distortion),
+                None if before is None else found[before],
+                self.progress,
+            )
+            result, field = self._paths(name)
             write_field(field, measured.local)
             measured.result.write(result)
-            write_json(start, to_plain(_StartRecord("", measured.fixed, measured.text)))
-            return result, field, start
+            return (result, field), picked(measured, "fixed text")
 
-        def read() -> MeasuredPhotograph | None:
-            record = self._record(name)
-            if record.failed:
-                return None
+        def read(name: str, start: dict[str, Any]) -> MeasuredPhotograph:
+            result, field = self._paths(name)
             outcome = Result.read(result), read_field(field)
-            return MeasuredPhotograph(*outcome, record.fixed, record.text)
+            return MeasuredPhotograph(*outcome, start["fixed"], tuple(start["text"]))
 
-        return self.do(f"correlate {name}", key, work, read)
+        folder, nothing = self.folder / "results", {"fixed": False, "text": ()}
+        return self.do_in_turn("correlate", self._keys, folder, work, read, nothing)
 
     def _pair(
         self,
@@ -248,12 +224,8 @@ class HarvestRun(StagedRun[PhotographCase]):
         reference, inside = warped_back(prepared.image(before), result, result.order)
         return replace(pair, reference=reference, mask=prepared.mask() & inside)
 
-    def _record(self, name: str) -> _StartRecord:
-        return made(_StartRecord, read_json(self._paths(name)[2]))
-
-    def _paths(self, name: str) -> tuple[Path, Path, Path]:
-        folder = self.folder / "results"
-        return folder / f"{name}.json", folder / f"{name}.npz", folder / f"{name}_start.json"
+    def _paths(self, name: str) -> tuple[Path, Path]:
+        return self.folder / "results" / f"{name}.json", self.folder / "results" / f"{name}.npz"
 
     def _prepared_key(self) -> str:
         tables, files = self.case.plain(), prepare.all_files(self.case)

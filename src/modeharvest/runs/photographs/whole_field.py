@@ -12,7 +12,7 @@ starts from the images, and from the photograph before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +26,7 @@ from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.pixels import continued
 from modeharvest.idic.finite_element.result import NodalResult
 from modeharvest.idic.finite_element.system import Body
-from modeharvest.idic.photograph.displacement import block_motion, displacement_from
+from modeharvest.idic.photograph.displacement import block_motion, displacement_from, is_misfit
 from modeharvest.idic.photograph.measure import MeasuredPhotograph, image_noise
 from modeharvest.idic.result import Result
 from modeharvest.idic.solver.gauss_newton import Outcome
@@ -38,11 +38,9 @@ from modeharvest.runs.photographs.prepare import PreparedPhotographs
 from modeharvest.runs.photographs.results import Harvest, HarvestedFrame, TruthCheck
 from modeharvest.runs.whole_field import WholeFields
 from modeharvest.util.arrays import BoolArray
-from modeharvest.util.errors import InputError
-from modeharvest.util.files import read_json, write_json
 from modeharvest.util.progress import Progress
 from modeharvest.util.stages import StagedRun, digest
-from modeharvest.util.typed import made, to_plain
+from modeharvest.util.typed import to_plain
 from modeharvest.validation.whole_field import (
     WholeField,
     WholeFieldSummary,
@@ -56,19 +54,8 @@ _ASTRAY = (Outcome.LOCAL_MINIMUM, Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
 """Outcomes of a correlation that is no start."""
 _EDGE_PX = 2
 """A camera's pixels on an edge show some background, and taking out distortion mixes it further."""
-_MISFIT, _SLIGHT = 2.0, 0.03
-"""Residual, over the images' noise and over their contrast, beyond which that is warned of."""
-
 _REFIT_WAVES, _REFIT_AMPLITUDE = 0.05, 0.5
 """What must come out by the whole displacement [%], both against the best fit."""
-
-
-@dataclass(frozen=True)
-class _WholeRecord:
-    """``NAME_start.json``."""
-
-    failed: str
-    start: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,25 +68,19 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
     keys: Mapping[str, str]
     """Of the stages that left them."""
 
-    @cached_property
+    @property
     def found(self) -> dict[str, WholeField]:
         """Measure every photograph that was correlated; leaves ``whole_field/``.
 
         One that can't be measured is left out, and its frame has a warning.
         """
-        found: dict[str, WholeField] = {}
-        key = digest(to_plain(self.case.whole_field))
-        for name in self.results:
-            key = digest([key, self.keys[name]])
-            whole = self._whole(name, next(reversed(found), None), found, key)
-            if whole is not None:
-                found[name] = whole
-        return found
+        return self._measured[0]
 
     def added(self, frame: HarvestedFrame) -> HarvestedFrame:
         """A frame with its whole displacement, and warnings of it."""
-        whole, failed = self.found.get(frame.name), self._record(frame.name).failed
-        warnings = (failed,) if whole is None else whole.measured.warnings
+        found, failed = self._measured
+        whole = found.get(frame.name)
+        warnings = (failed[frame.name],) if whole is None else whole.measured.warnings
         return replace(frame, whole=whole, warnings=(*frame.warnings, *warnings))
 
     @cached_property
@@ -112,55 +93,52 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
         sizes = how.element_px, how.edge_element_px
         return Body.of_mask(prepared.mask(), prepared.grid, *sizes)
 
-    def _whole(
-        self, name: str, before: str | None, found: Mapping[str, WholeField], key: str
-    ) -> WholeField | None:
-        correlated, last = self.results[name].result, None if before is None else found[before]
-        start, refit = self._path(f"{name}_start"), self._path(f"{name}_refit")
+    @cached_property
+    def _measured(self) -> tuple[dict[str, WholeField], dict[str, str]]:
+        """Whole displacements, and why some photographs have none."""
+        keys, key = {}, digest(to_plain(self.case.whole_field))
+        for name in self.results:
+            keys[name] = key = digest([key, self.keys[name]])
 
-        def work() -> tuple[Path, ...]:
+        def work(name: str, found: dict[str, WholeField]) -> tuple[Sequence[Path], dict[str, Any]]:
+            correlated, before = self.results[name].result, next(reversed(found), None)
+            last = None if before is None else found[before].measured
             is_usable = correlated.outcome not in _ASTRAY
 
             def measured(progress: Progress) -> NodalResult:
-                pair, body = self._pair(name, before, found), self._body
+                pair, body = self._pair(name, before, last), self._body
                 if is_usable:
                     begin = correlated.ansatz.displacement_at(correlated.unknowns, body.mesh.nodes)
                 else:
-                    known = None if last is None else last.measured
-                    begin = block_motion(pair, body.mesh, known, ("the reference", name))
+                    begin = block_motion(pair, body.mesh, last, ("the reference", name))
                 cutoff = self.case.whole_field.cutoff_px
                 options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
                 return self._warned(displacement_from(begin, pair, body, options, progress), name)
 
-            try:
-                files = self._files.measure(
-                    name, name, measured, self.progress, Given(None, correlated)
-                )
-                refitted(self._files.read(name), correlated, self.prepared.mask()).write(refit)
-            except InputError as error:
-                write_json(start, to_plain(_WholeRecord(str(error))))
-                return (start,)
+            given, refit = Given(None, correlated), self._refit(name)
+            files = self._files.measure(name, name, measured, self.progress, given)
+            refitted(self._files.read(name), correlated, self.prepared.mask()).write(refit)
             text = "the result of its correlation" if is_usable else "blocks of the speckle"
             text += "" if is_usable or last is None else " and the photograph before"
-            write_json(start, to_plain(_WholeRecord("", text)))
-            return *files, refit, start
+            return (*files, refit), {"start": text}
 
-        def read() -> WholeField | None:
-            record = self._record(name)
-            if record.failed:
-                return None
-            seconds = self._files.seconds(name)
-            return WholeField(self._files.read(name), Result.read(refit), seconds, record.start)
+        def read(name: str, about: dict[str, Any]) -> WholeField:
+            measured, refit = self._files.read(name), Result.read(self._refit(name))
+            return WholeField(measured, refit, self._files.seconds(name), about["start"])
 
-        return self.do(f"whole field {name}", key, work, read)
+        folder = self._files.folder
+        return self.do_in_turn("whole field", keys, folder, work, read, {"start": ""})
 
-    def _pair(self, name: str, before: str | None, found: Mapping[str, WholeField]) -> ImagePair:
+    def _refit(self, name: str) -> Path:
+        return self._files.folder / f"{name}_refit.json"
+
+    def _pair(self, name: str, before: str | None, last: NodalResult | None) -> ImagePair:
         """A photograph and its reference, whose brightness is made the photograph's."""
         pair, correlated = self.prepared.pair(name), self.results[name].result
         reference, mask = pair.reference, pair.mask
-        if before is not None and self.case.correlation.formulation == "updated":
-            shown, inside = self._pulled_back(before, found[before].measured)
-            reference, mask = shown, self.prepared.mask() & inside
+        if before and last and self.case.correlation.formulation == "updated":
+            reference, inside = self._pulled_back(before, last)
+            mask = self.prepared.mask() & inside
         grid = pair.grid
         gain, offset = correlated.ansatz.gain_and_offset(correlated.unknowns, grid.x, grid.y)
         reference = ((reference - offset) / gain).astype(np.float32)
@@ -187,20 +165,13 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
         pair = self.prepared.pair(name)
         noise = image_noise(pair, self.prepared.noise)
         expected = float(np.hypot(noise.reference, noise.deformed))
-        contrast = float(pair.reference[pair.masks[0]].std())
-        if measured.residual_rms <= max(_MISFIT * expected, _SLIGHT * contrast):
+        if not is_misfit(measured, expected, pair.reference[pair.masks[0]]):
             return measured
         text = (
             f"The residual of the whole displacement is {measured.residual_rms:.3g} grey levels, "
             f"of which noise is about {expected:.2g}: somewhere the images don't match."
         )
         return replace(measured, warnings=(*measured.warnings, text))
-
-    def _record(self, name: str) -> _WholeRecord:
-        return made(_WholeRecord, read_json(self._path(f"{name}_start")))
-
-    def _path(self, stem: str) -> Path:
-        return self._files.folder / f"{stem}.json"
 
 
 def whole_summary(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
