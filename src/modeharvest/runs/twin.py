@@ -23,11 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modeharvest.fem.field import Solution
 from modeharvest.fem.specimen import Specimen
-from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import identifiability
@@ -43,14 +41,14 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.pipeline import HarvestRun
 from modeharvest.runs.photographs.results import FrameTruth, HarvestTruth, TruthCheck
 from modeharvest.runs.photographs.whole_field import whole_checks
-from modeharvest.util.arrays import FloatArray
+from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import atomic, copy_whole, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, Stages, exclusive, stage_key
 from modeharvest.util.typed import to_plain
 from modeharvest.validation.truth import rms
-from modeharvest.validation.whole_field import compare_whole
+from modeharvest.validation.whole_field import compare_whole, v_percent
 
 _SIDECAR = "twin.json"
 _EXPERIMENT = resources.files(__package__).joinpath("twin_experiment.txt").read_text("utf-8")
@@ -159,7 +157,7 @@ def _experiment_text(case: Case, images: ImageSet) -> str:
     )  # fmt: skip
 
 
-_WAVES, _AMPLITUDE, _LENS_PX = 0.01, 0.03, 0.05
+_WAVES, _AMPLITUDE, _LENS_PX = 1.0, 3.0, 0.05
 """What must come out: wave vectors within 1 %, v1 within 3 % of the best fit's maximum, S within
 0.05 px rms without its affine part."""
 
@@ -196,7 +194,7 @@ def compare_with_truth(
     twin: Twin, harvesting: HarvestRun, specimen: Specimen, progress: Progress = silent
 ) -> HarvestTruth:
     """Set a harvest, which knows nothing of the truth, against that of its twin."""
-    images, geometry, results = twin.images, harvesting.geometry, harvesting.results()
+    images, results = twin.images, harvesting.results()
     wholes = harvesting.whole_fields.found if harvesting.whole_fields else {}
     frames, rows = {}, []
     for name in counted(tuple(results), progress, "compare with the truth"):
@@ -205,7 +203,7 @@ def compare_with_truth(
         inside = np.asarray(np.isfinite(true).all(axis=-1))
         result = results[name].result
         best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
-        rows += _frame_rows(name, result, best, true, inside, geometry.region.cellular)
+        rows += _frame_rows(name, result, best, true, inside)
         errors = None
         if name in wholes:
             errors = compare_whole(wholes[name], true, best, inside, specimen)
@@ -223,12 +221,7 @@ def _strain_of(name: str, strains: tuple[float, ...]) -> float:
 
 
 def _frame_rows(
-    name: str,
-    result: Result,
-    best: Result,
-    true: FloatArray,
-    inside: NDArray[np.bool_],
-    cellular: Box,
+    name: str, result: Result, best: Result, true: FloatArray, inside: BoolArray
 ) -> list[TruthCheck]:
     """What of one photograph was found, against the truth and the best fit of the ansatz."""
     px, found = result.grid.pixel_size, result.displacement()
@@ -242,23 +235,12 @@ def _frame_rows(
     if identifiability(result, inside).unobservable:
         words = f"{name}: wave vectors and v1"
         return [*rows, TruthCheck(words, "not observable", "asked of one that is", True)]
-    x = np.linspace(cellular.x_min, cellular.x_max, 200, dtype=np.float64)
-    y = np.linspace(cellular.y_min, cellular.y_max, 200, dtype=np.float64)
-    v, at_best = (r.ansatz.v(0, r.unknowns, x, y) for r in (result, best))
-    apart = float(np.abs(v - at_best).max() / np.abs(at_best).max())
     waves = result.ansatz.modes[0].family.waves(result.mode_parameters())[:, 2:4]
-    off = float(np.abs(np.abs(waves) - 1.0).max())
-    return [
-        *rows,
-        TruthCheck(
-            f"{name}: wave vectors, largest deviation from (±½, ±½)",
-            100 * off, f"≤ {100 * _WAVES:g}", off <= _WAVES, "%",
-        ),
-        TruthCheck(
-            f"{name}: v1 − v1 of the best fit, largest over the cellular part, of its maximum",
-            100 * apart, f"≤ {100 * _AMPLITUDE:g}", apart <= _AMPLITUDE, "%",
-        ),
-    ]  # fmt: skip
+    off = 100 * float(np.abs(np.abs(waves) - 1.0).max())
+    words = f"{name}: wave vectors, largest deviation from (±½, ±½)"
+    rows.append(TruthCheck.at_most(words, off, _WAVES, "%"))
+    words = f"{name}: v1 − v1 of the best fit, largest over the cellular part, of its maximum"
+    return [*rows, TruthCheck.at_most(words, v_percent(result, best), _AMPLITUDE, "%")]
 
 
 def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthCheck:
@@ -266,4 +248,4 @@ def _lens_row(found: Distortion, true: Distortion, grid: PixelGrid) -> TruthChec
     row, col = np.linspace(0, grid.rows - 1, 60), np.linspace(0, grid.cols - 1, 75)
     found_rms = rms(apart_without_affine(found, true, row[:, None], col[None, :]))
     words = "distortion of the lens: found − true without the affine part, rms per component"
-    return TruthCheck(words, found_rms, f"≤ {_LENS_PX:g}", found_rms <= _LENS_PX, "px")
+    return TruthCheck.at_most(words, found_rms, _LENS_PX, "px")

@@ -100,6 +100,11 @@ class TruthCheck:
     """Whether the first is as good as the second asks for."""
     unit: str = ""
 
+    @classmethod
+    def at_most(cls, quantity: str, obtained: float, limit: float, unit: str) -> TruthCheck:
+        """A number that must not be above a limit."""
+        return cls(quantity, obtained, f"≤ {limit:g}", obtained <= limit, unit)
+
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:

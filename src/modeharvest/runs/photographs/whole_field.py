@@ -197,7 +197,8 @@ def whole_checks(
         return rows
     v, waves = v_percent(refit, best), waves_percent(refit, best)
     words = f"{of}: v1 of the refitted ansatz − of the best fit, largest, of its maximum"
-    limit = f"≤ {_REFIT_AMPLITUDE:g}"
-    rows.append(TruthCheck(words, v, limit, v <= _REFIT_AMPLITUDE, "%"))
-    words, limit = f"{of}: wave vectors likewise", f"≤ {_REFIT_WAVES:g}"
-    return [*rows, TruthCheck(words, waves, limit, waves <= _REFIT_WAVES, "%")]
+    return [
+        *rows,
+        TruthCheck.at_most(words, v, _REFIT_AMPLITUDE, "%"),
+        TruthCheck.at_most(f"{of}: wave vectors likewise", waves, _REFIT_WAVES, "%"),
+    ]
