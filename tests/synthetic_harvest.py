@@ -112,8 +112,6 @@ def frame(name: str, strain: float, amplitude: float, fixed: bool = False) -> Ha
         error_y=y,
         by_noise=field_errors(result, x, y, result.covariance(NOISE)),
         by_model_error=field_errors(result, x, y, leftover),
-        noise_covariance=result.covariance(NOISE),
-        model_error_covariance=leftover,
         spectrum=spectrum,
         pattern=read_pattern(spectrum),
         local=replace(local, u=noisy, sd=np.full(noisy.shape, 1e-4)),

@@ -76,8 +76,8 @@ def states(harvest: Harvest) -> list[PhotographState]:
 
 def bare(harvest: Harvest) -> Harvest:
     """One photograph of which only the correlation is known."""
-    frame = replace(harvest.frames[1], mask=None, by_model_error=None, model_error_covariance=None,
-                    spectrum=None, pattern=None, local=None, start_text=())  # fmt: skip
+    frame = replace(harvest.frames[1], mask=None, by_model_error=None, spectrum=None, pattern=None,
+                    local=None, start_text=())  # fmt: skip
     return replace(harvest, geometry=replace(harvest.geometry, lattice=None), frames=(frame,),
                    skipped=(), timeline=(), buckling=None, optics=Optics(), full_scale=None,
                    text=(), truth=None, versions={})  # fmt: skip
@@ -156,7 +156,7 @@ def test_a_plain_global_dic_has_a_report_too(harvest: Harvest, tmp_path: File) -
                      inverse=1e-12 * np.eye(plain.size))  # fmt: skip
     by_noise = result.covariance(made_up.NOISE)
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
-    frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
+    frame = replace(frame, result=result, by_noise=errors,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
     ids = Page(report(replace(bare(harvest), frames=(frame,)), tmp_path)).ids
     assert "v0x-1" in ids
@@ -174,7 +174,7 @@ def test_every_mode_has_its_panels(harvest: Harvest) -> None:
                      inverse=1e-12 * np.eye(both.size))  # fmt: skip
     by_noise = result.covariance(made_up.NOISE)
     errors = field_errors(result, frame.error_x, frame.error_y, by_noise)
-    frame = replace(frame, result=result, by_noise=errors, noise_covariance=by_noise,
+    frame = replace(frame, result=result, by_noise=errors,
                     identifiability=identifiability(result, made_up.MASK))  # fmt: skip
     both_modes = replace(bare(harvest), frames=(frame,))
     (state,) = states(both_modes)
@@ -227,7 +227,8 @@ def test_the_summary_is_plain_json(harvest: Harvest, summary: dict[str, Any]) ->
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     unknown = bare(harvest)
     lost = replace(unknown.frames[0].result, inverse=np.diag([np.inf] * 77))
-    frame = replace(unknown.frames[0], result=lost, noise_covariance=lost.inverse)
+    by_noise = replace(unknown.frames[0].by_noise, covariance=lost.inverse)
+    frame = replace(unknown.frames[0], result=lost, by_noise=by_noise)
     told = harvest_summary(replace(unknown, frames=(frame,)))
     assert json.dumps(told, allow_nan=False)
     assert told["frames"][0]["modes"][0]["parameters"][0]["sd_noise"] is None

@@ -237,6 +237,8 @@ def _sandwich(inverse: FloatArray, gradients: FloatArray) -> FloatArray:
 class FieldErrors:
     """Standard deviations at positions that broadcast to a shape (...)."""
 
+    covariance: FloatArray
+    """(n, n) of the unknowns, which they are made of."""
     v0: FloatArray
     """(..., 2) of the slow field's components [mm]."""
     v: FloatArray
@@ -272,6 +274,7 @@ def field_errors(result: Result, x: ArrayLike, y: ArrayLike, covariance: ArrayLi
         pattern.append(propagated_sd(S[..., own], matrix[np.ix_(own, own)]))
     shape = S.shape[:-2]
     return FieldErrors(
+        covariance=matrix,
         v0=propagated_sd(S[..., slow], matrix[slow, slow]),
         v=np.array(amplitude).reshape(len(modes), *shape),
         fluctuation=np.array(pattern).reshape(len(modes), *shape, 2),

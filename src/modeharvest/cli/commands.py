@@ -57,17 +57,14 @@ def run(
     from modeharvest.report.photographs import photographs_report
 
     with _stages(case, out, solution, whole_field=whole_field) as stages:
-        is_twin = stages.case.calibration is not None
-        if is_twin:
+        if stages.case.calibration is None:
+            report = experiment_report(stages.all())
+        else:
             from modeharvest.runs.twin import TwinRun
 
-            summary = TwinRun(stages.case, out, stages.progress, solution).all()
-        else:
-            summary = stages.all()
-    if is_twin:
-        print_report(photographs_report(summary), out / "harvest")
-    else:
-        print_report(experiment_report(summary), out)
+            twin = TwinRun(stages.case, out, stages.progress, solution)
+            report, out = photographs_report(twin.all()), out / "harvest"
+    print_report(report, out)
 
 
 def fem(case: CaseName, out: OutFolder) -> None:

@@ -63,12 +63,8 @@ class HarvestedFrame:
     """(p,) and (q,) axes [mm] of the error bars."""
     by_noise: FieldErrors
     """Error bars on these axes by the images' noise, arrays (q, p, ...)."""
-    noise_covariance: FloatArray
-    """(n, n) of the unknowns, which these error bars are made of."""
     by_model_error: FieldErrors | None = None
     """Error bars by model error, likewise; None if they can't be had."""
-    model_error_covariance: FloatArray | None = None
-    """(n, n) of the unknowns, which those error bars are made of."""
     spectrum: Spectrum | None = None
     """Of the displacement without its affine part."""
     pattern: WavePattern | None = None
@@ -209,8 +205,6 @@ def harvested_frame(
         by_model_error=None
         if by_model_error is None
         else field_errors(result, x, y, by_model_error),
-        noise_covariance=found.by_noise,
-        model_error_covariance=by_model_error,
         spectrum=spectrum,
         pattern=pattern,
         parts=_parts(measured, geometry, cell),

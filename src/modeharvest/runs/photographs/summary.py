@@ -26,20 +26,13 @@ _CELLS = 360
 
 def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, Any]:
     """Describe mode i (from 0) of a frame; keys as in ``summary.json``."""
-    result, identified = frame.result, frame.identifiability
-    family, part = result.ansatz.modes[i].family, result.ansatz.phi_slice(i)
-    noise, left = frame.noise_covariance[part, part], frame.model_error_covariance
-    left = None if left is None else left[part, part]
-    nothing = [None] * family.size
-    each = zip(
-        family.names,
-        family.units,
-        result.mode_parameters(i),
-        propagated_sd(np.eye(family.size), noise),
-        nothing if left is None else propagated_sd(np.eye(family.size), left),
-        strict=True,
-    )
-    keys = ("name", "unit", "value", "sd_noise", "sd_model_error")
+    family, identified = frame.result.ansatz.modes[i].family, frame.identifiability
+    parameters: dict[str, Any] = {
+        "name": family.names,
+        "unit": family.units,
+        "value": frame.result.mode_parameters(i),
+        **_deviations(frame, i, np.eye(family.size)),
+    }
     return {
         "family": family.name,
         "fixed": family.size == 0,
@@ -47,27 +40,32 @@ def mode_numbers(harvest: Harvest, frame: HarvestedFrame, i: int) -> dict[str, A
         "amplitude_px": identified.amplitude_px[i],
         **_largest_values(harvest, frame, i),
         "overlap": identified.overlap[i],
-        "parameters": [dict(zip(keys, parameter, strict=True)) for parameter in each],
-        "waves": _wave_vectors(harvest, frame, i, noise, left),
+        "parameters": [
+            {key: None if column is None else column[k] for key, column in parameters.items()}
+            for k in range(family.size)
+        ],
+        "waves": _wave_vectors(harvest, frame, i),
     }
 
 
-def _wave_vectors(
-    harvest: Harvest, frame: HarvestedFrame, i: int, noise: FloatArray, left: FloatArray | None
-) -> list[dict[str, Any]]:
+def _deviations(frame: HarvestedFrame, i: int, rows: FloatArray) -> dict[str, FloatArray | None]:
+    """Standard deviations of ``rows`` @ parameters of mode i; None where they can't be had."""
+    part = frame.result.ansatz.phi_slice(i)
+    return {
+        name: None if errors is None else propagated_sd(rows, errors.covariance[part, part])
+        for name, errors in (("sd_noise", frame.by_noise), ("sd_model_error", frame.by_model_error))
+    }
+
+
+def _wave_vectors(harvest: Harvest, frame: HarvestedFrame, i: int) -> list[dict[str, Any]]:
     """Wave vectors [1/l]: k is in units of half a wavelength's inverse, like the mode's length."""
-    mode = frame.result.ansatz.modes[i]
+    mode, found = frame.result.ansatz.modes[i], []
     to_xi = harvest.pitch / (2.0 * mode.half_wavelength)
-    waves = mode.family.waves(frame.result.mode_parameters(i))
-    found = []
-    for w, wave in enumerate(waves):
+    for w, wave in enumerate(mode.family.waves(frame.result.mode_parameters(i))):
         rows = to_xi * mode.family.matrix[PER_WAVE * w + 2 : PER_WAVE * w + 4]
-        fixed = not rows.any()
-        found.append({
-            "xi": to_xi * wave[2:4],
-            "sd_noise": None if fixed else propagated_sd(rows, noise),
-            "sd_model_error": None if fixed or left is None else propagated_sd(rows, left),
-        })  # fmt: skip
+        is_fixed = not rows.any()
+        sd = {"sd_noise": None, "sd_model_error": None} if is_fixed else _deviations(frame, i, rows)
+        found.append({"xi": to_xi * wave[2:4], **sd})
     return found
 
 
