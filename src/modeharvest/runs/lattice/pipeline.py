@@ -10,7 +10,7 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from modeharvest.fem.bloch import modes as mode_files
 from modeharvest.fem.bloch.dispersion import Dispersion, ZoneMap, dispersion, zone_map
@@ -18,19 +18,29 @@ from modeharvest.fem.bloch.modes import Branch, ModeSet
 from modeharvest.idic.spectra.mode_family import write_family
 from modeharvest.runs.lattice import results
 from modeharvest.runs.lattice.case import FileLattice, LatticeCase
-from modeharvest.runs.lattice.modes import LatticeModel, found_pattern, to_be_shown
-from modeharvest.runs.lattice.results import CriticalPoint, LatticeRun, PeriodicField
+from modeharvest.runs.lattice.results import CriticalPoint, FoundPattern, LatticeRun, PeriodicField
 from modeharvest.util import __version__
-from modeharvest.util.errors import InputError
+from modeharvest.util.errors import InputError, requiring_dolfinx
 from modeharvest.util.files import read_json, reading, sha256_of, write_json
-from modeharvest.util.progress import counted
+from modeharvest.util.progress import counted, named
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key
 from modeharvest.util.typed import made, to_plain
+
+if TYPE_CHECKING:
+    from modeharvest.fem.lattice.cell import CellPath, CellState, PeriodicCell
+    from modeharvest.fem.lattice.cells import UnitCell
+
+BEYOND = (1.02, 1.1, 1.25, 1.5)
+"""Loads at which states of branches are kept, relative to the critical one."""
 
 
 @dataclass(frozen=True)
 class LatticeAnalysis(StagedRun[LatticeCase]):
-    """The stages of a lattice's analysis."""
+    """The stages of a lattice's analysis.
+
+    All raise InputError if there is no such lattice or its cell isn't periodic, and
+    MissingDependencyError if dolfinx or gmsh is not there.
+    """
 
     source: str = "CASE"
     """Name or file of the case, for the report."""
@@ -39,13 +49,17 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         """Find the first critical load over all wave vectors; leaves ``critical.json``.
 
         There ``history`` has the least stable wave at each load looked at. Raises InputError if
-        the cell is not periodic or the lattice is a mechanism, MissingDependencyError if dolfinx
-        is not there.
+        the lattice is a mechanism.
         """
         path = self.folder / "critical.json"
 
         def work() -> tuple[Path, ...]:
-            found = self._model.critical()
+            primary = self._path()
+            from modeharvest.fem.bloch.critical import first_critical
+            from modeharvest.fem.lattice.options import CriticalSearch
+
+            search = CriticalSearch(**asdict(self.case.search))
+            found = first_critical(primary, search, named(self.progress, "first critical load"))
             point = CriticalPoint.of(self.case.loading.name, found)
             write_json(path, to_plain({"point": point, "history": found.history}))
             return (path,)
@@ -61,7 +75,7 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
         def work() -> tuple[Path, ...]:
             loads = plan.loads or (0.0, 0.5 * critical.load, critical.load)
-            cell_path, zone = self._model.path(max(loads)), list[ZoneMap]()
+            cell_path, zone = self._path(max(loads)), list[ZoneMap]()
             tour = plan.tour(self.case.lattice, self.case.loading)
             found = dispersion(cell_path, tour, loads, plan.points, plan.bands, self.progress)
             if plan.map_divisions:
@@ -80,13 +94,13 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         be reached.
         """
         critical = self.critical()
-        if self._model.why_no_modes(critical):
+        if self._why_no_modes(critical):
             return None, ()
         path = self.folder / "modes.h5"
         vtu, xdmf = path.with_suffix(".vtu"), path.with_suffix(".xdmf")
 
         def work() -> tuple[Path, ...]:
-            found = self._model.modes(critical, self._info(critical))
+            found = self._modes(critical)
             mode_files.write_modes(path, *found)
             mode_files.write_vtu(vtu, *found)
             mode_files.write_xdmf(xdmf, *found)
@@ -139,7 +153,8 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
 
             run = self._run(done)
             fields = self._patterns if "families" in done else []
-            summary = results.summary_of(run, [found_pattern(it, self.folder) for it in fields])
+            found = [FoundPattern.read(field, self.folder) for field in fields]
+            summary = results.summary_of(run, found)
             write_page(lattice_report(summary, run), page, self.progress)
             write_json(path, summary)
             return path, page
@@ -182,20 +197,105 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
         return {**tables, "critical": asdict(critical)}
 
     @cached_property
-    def _model(self) -> LatticeModel:
-        return LatticeModel(self.case, self.progress)
+    def _unit(self) -> UnitCell:
+        """The primitive cell's mesh and lattice vectors."""
+        with requiring_dolfinx("infinite lattices need"):
+            return self.case.lattice.cell()
+
+    @cached_property
+    def _cell(self) -> PeriodicCell:
+        """The primitive cell with its material."""
+        unit = self._unit
+        with requiring_dolfinx("infinite lattices need"):
+            from modeharvest.fem.lattice.cell import PeriodicCell
+        return PeriodicCell(unit, self.case.material)
+
+    def _path(self, load: float = 0.0, cell: PeriodicCell | None = None) -> CellPath:
+        """A new primary path, followed up to a load [-] in steps that jump over no state.
+
+        From the beginning, so that no stage depends on another's steps.
+        """
+        cell = cell or self._cell  # first: without dolfinx it says what is missing
+        from modeharvest.fem.lattice.cell import CellPath
+
+        path, step = CellPath(cell, self.case.loading.macro()), self.case.search.largest_step
+        for k in range(int(load / step) + 1):
+            if path.at(k * step) is None:
+                break
+        return path
+
+    def _why_no_modes(self, critical: CriticalPoint) -> str:
+        """Why there is no wave whose modes could be computed; empty if there is one."""
+        if self.case.modes.waves or critical.waves:
+            return ""
+        what = "long waves are modes of no finite cell" if critical.found else "nothing is critical"
+        return f"no modes: {what}; name waves in [modes], such as waves = [[1, 1]]"
+
+    def _modes(self, critical: CriticalPoint) -> tuple[ModeSet, tuple[Branch, ...]]:
+        """The modes of the plan as real fields, and the branches that start with critical ones.
+
+        Raises InputError if a wave doesn't repeat within a dozen cells, the load can't be reached,
+        or combinations don't have one coefficient for each mode.
+        """
+        plan = self.case.modes
+        path = self._path(max(plan.load, critical.load))
+        from modeharvest.fem.bloch.real_modes import real_modes
+
+        state = _state(path, plan.load or critical.load)
+        self.progress(0, 1, "modes")
+        modes = real_modes(path.cell, state, plan.phases or critical.waves, self._info(critical))
+        self.progress(1, 1, "modes")
+        if not critical.found or state.load != critical.load:
+            return modes, ()
+        return modes, tuple(self._branches(modes))
+
+    def _branches(self, modes: ModeSet) -> list[Branch]:
+        """A branch for each combination of modes, on their commensurate cell."""
+        from modeharvest.fem.bloch.postbuckling import follow
+        from modeharvest.fem.lattice.cell import PeriodicCell
+
+        plan = self.case.modes
+        combinations = plan.combinations or default_combinations(len(modes.waves))
+        loads = plan.branch_loads or tuple(factor * modes.load for factor in BEYOND)
+        cell = PeriodicCell(self._unit.enlarged(*modes.info["copies"]), self.case.material)
+        found = []
+        for k, combination in enumerate(combinations, start=1):
+            listener = named(self.progress, f"branch {k} of {len(combinations)}")
+            path = self._path(0.98 * modes.load, cell)
+            found.append(follow(path, modes, combination, loads, progress=listener))
+        return found
 
     @cached_property
     def _patterns(self) -> list[PeriodicField]:
-        """All fields in which families are looked for."""
-        critical = self.critical()
-        return self._model.fields(critical, *self.modes(), self._info(critical))
+        """All fields in which families are looked for: modes, ends of branches, primary path."""
+        critical, (modes, branches) = self.critical(), self.modes()
+        info, found = self._info(critical), []
+        if modes is not None:
+            found += [PeriodicField.of_mode(modes, k, info) for k in range(len(modes.waves))]
+            found += [
+                PeriodicField.of_branch(modes, k, branch, info)
+                for k, branch in enumerate(branches, start=1) if branch.states
+            ]  # fmt: skip
+        load = self.case.modes.load or critical.load
+        path = self._path(load)
+        state = _state(path, load)
+        return [*found, PeriodicField.of_primary(path.cell, state, load, modes, info)]
+
+    def _shown(self, modes: ModeSet) -> list[FoundPattern]:
+        """Branches from the lowest energy up, or else modes; and the primary path."""
+        every, pitch = self._patterns, self.case.lattice.pitch
+        branches = sorted((p for p in every[:-1] if p.stable is not None), key=lambda p: p.energy)
+        found = [FoundPattern.read(pattern, self.folder) for pattern in branches]
+        if not found:
+            largest = results.DRAWN_AMPLITUDE * pitch
+            found = [mode.scaled(largest).analysed(pitch) for mode in every[: len(modes.waves)]]
+        return [*found, FoundPattern.read(every[-1], self.folder)]
 
     def _run(self, done: Collection[str]) -> LatticeRun:
         """All there is, for the report."""
         from modeharvest.fem import dolfinx_api
 
-        unit, critical = self._model.unit, self.critical()
+        unit, critical = self._unit, self.critical()
         modes, branches = self.modes() if "modes" in done else (None, ())
         command = "modes" if "families" in done else "bloch"
         return LatticeRun(
@@ -209,11 +309,10 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             dispersion=self.dispersion() if "dispersion" in done else None,
             modes=modes,
             branches=branches,
-            patterns=to_be_shown(self._patterns, modes, self.case.lattice.pitch, self.folder)
-            if modes and "families" in done else (),
+            patterns=self._shown(modes) if modes and "families" in done else (),
             study=self.case.run_study(self.folder / "study.csv", self.progress)
             if "study" in done else None,  # of which the rows are all there
-            notes=[note for note in (self._model.why_no_modes(critical),) if note],
+            notes=[note for note in (self._why_no_modes(critical),) if note],
             exports=results.exports_in(self.folder),
             versions={"modeharvest": __version__, "dolfinx": dolfinx_api.VERSION},
         )  # fmt: skip
@@ -233,3 +332,17 @@ class LatticeAnalysis(StagedRun[LatticeCase]):
             "families": digest([critical, content["modes"], "families"]),
             "study": stage_key([tables, content["study"]]),
         }
+
+
+def default_combinations(count: int) -> tuple[tuple[float, ...], ...]:
+    """Each of some modes alone, and the sum of all where there are more."""
+    alone = [tuple(float(i == k) for i in range(count)) for k in range(count)]
+    return (*alone, (1.0,) * count) if count > 1 else tuple(alone)
+
+
+def _state(path: CellPath, load: float) -> CellState:
+    """The state at a load; a millionth below where that is critical with the cell's own period."""
+    state = path.at(load) or path.at((1.0 - 1e-6) * load)
+    if state is None:
+        raise InputError(f"modes: expected a load that the lattice's path reaches, got {load:.6g}")
+    return state

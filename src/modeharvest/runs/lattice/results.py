@@ -11,20 +11,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from modeharvest.fem.bloch.dispersion import Dispersion
 from modeharvest.fem.bloch.modes import Branch, ModeSet
 from modeharvest.fem.field import Mesh
 from modeharvest.fem.lattice.options import Wave
 from modeharvest.idic.spectra.lattice_spectrum import LatticeSpectrum, lattice_spectrum
-from modeharvest.idic.spectra.mode_family import FoundFamily, mode_family
+from modeharvest.idic.spectra.mode_family import (
+    FoundFamily,
+    mode_family,
+    read_family,
+    read_spectrum,
+)
 from modeharvest.util.arrays import FloatArray
+from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json, write_csv
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.studies.lattice import LatticeModeStudy
 
 if TYPE_CHECKING:
     from modeharvest.fem.bloch.critical import LatticeCritical
+    from modeharvest.fem.lattice.cell import CellState, PeriodicCell
 
 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
@@ -129,6 +137,32 @@ class PeriodicField:
             energy=last.energy - last.primary_energy,
         )
 
+    @classmethod
+    def of_primary(
+        cls,
+        cell: PeriodicCell,
+        state: CellState,
+        load: float,
+        modes: ModeSet | None,
+        info: Mapping[str, Any],
+    ) -> PeriodicField:
+        """The unbuckled lattice at a load, on the modes' cell where there is one."""
+        unit, gradient = cell.cell, state.gradient - np.eye(2)
+        mesh, lattice = (unit.mesh, unit.lattice) if modes is None else (modes.mesh, modes.lattice)
+        w = cell.displacement(state) - unit.mesh.nodes @ gradient.T
+        known, wanted = (_in_cell(nodes, unit.lattice) for nodes in (unit.mesh.nodes, mesh.nodes))
+        same = cKDTree(known, boxsize=1.0).query(wanted)[1]
+        return cls(
+            file="family_primary.json",
+            name=f"primary path at {100 * load:.4g} %",
+            mesh=mesh,
+            lattice=lattice,
+            displacement=w[same] + mesh.nodes @ gradient.T,
+            gradient=state.gradient,
+            info={**info, "load": load},
+            stable=True,
+        )
+
     @property
     def fluctuation(self) -> FloatArray:
         """(n, 2) displacement without the affine part."""
@@ -154,6 +188,21 @@ class FoundPattern(PeriodicField):
 
     spectrum: LatticeSpectrum
     family: FoundFamily
+
+    @classmethod
+    def read(cls, pattern: PeriodicField, folder: Path) -> FoundPattern:
+        """A pattern with what its file in a folder has; InputError if that lacks something."""
+        path = folder / pattern.file
+        family, spectrum = read_family(path), read_spectrum(path)
+        if spectrum is None:
+            raise InputError(f"expected Fourier coefficients in {path}, found none; make it again")
+        return cls(**vars(pattern), spectrum=spectrum, family=family)
+
+
+def _in_cell(nodes: FloatArray, lattice: FloatArray) -> FloatArray:
+    """(n, 2) fractional coordinates in [0, 1)."""
+    fractional = np.mod(nodes @ np.linalg.inv(lattice), 1.0)
+    return np.asarray(np.mod(fractional, 1.0))  # -1e-17 has become 1
 
 
 @dataclass(frozen=True, eq=False)
