@@ -97,7 +97,7 @@ def children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Child]:
     monkeypatch.setattr(subprocess, "Popen", start)
     monkeypatch.setattr(precompile.os, "cpu_count", lambda: 2)
     monkeypatch.setattr(precompile, "cached_in", lambda kernel: tmp_path / kernel.__name__)
-    there = precompile._PARTS["correlate"].stamp
+    there = precompile._stamp("correlate")
     assert there is not None
     there.parent.mkdir()
     there.touch()

@@ -72,25 +72,18 @@ def _measurement() -> None:
     found.standard_deviation_on()
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A child's work, and a kernel beside which it notes that it is done."""
-
-    work: Callable[[], None]
-    beside: Callable[..., object]
-
-    @property
-    def stamp(self) -> Path | None:
-        """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
-        folder = cached_in(self.beside)
-        return None if folder is None else folder / f"precompiled-{sources()}.nbi"
-
-
-_PARTS = {
-    "image": _Part(_images, rasterise),
-    "correlate": _Part(_correlation, accumulate),
-    "measure": _Part(_measurement, accumulate_elements),
+_PARTS: dict[str, tuple[Callable[[], None], Callable[..., object]]] = {
+    "image": (_images, rasterise),
+    "correlate": (_correlation, accumulate),
+    "measure": (_measurement, accumulate_elements),
 }
+"""By stage, a child's work, and a kernel beside which it notes that it is done."""
+
+
+def _stamp(stage: str) -> Path | None:
+    """The note; deleted with the kernels by who deletes ``*.nbi``. None without a cache."""
+    folder = cached_in(_PARTS[stage][1])
+    return None if folder is None else folder / f"precompiled-{sources()}.nbi"
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,7 @@ def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
     children = {}
     if is_alone() and (os.cpu_count() or 1) > 1:
         for stage in stages:
-            stamp = _PARTS[stage].stamp
+            stamp = _stamp(stage)
             if stamp is not None and not stamp.exists():
                 command = [sys.executable, "-m", "modeharvest.runs.precompile", stage]
                 nowhere = subprocess.DEVNULL
@@ -132,12 +125,12 @@ def precompiling(stages: Iterable[str]) -> Iterator[Precompilation]:
 def _main(stage: str) -> None:
     if hasattr(os, "nice"):
         os.nice(10)  # the finite elements go first
-    part = _PARTS[stage]
-    part.work()
-    if part.stamp is not None:
-        for old in part.stamp.parent.glob("precompiled-*.nbi"):
+    _PARTS[stage][0]()
+    stamp = _stamp(stage)
+    if stamp is not None:
+        for old in stamp.parent.glob("precompiled-*.nbi"):
             old.unlink(missing_ok=True)
-        part.stamp.touch()
+        stamp.touch()
 
 
 if __name__ == "__main__":

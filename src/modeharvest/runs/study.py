@@ -8,6 +8,7 @@ In Python: ``StudyCase(study=RobustnessStudy(initial_guesses=20, radius=0.2))``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -196,8 +197,11 @@ class StudyAnalysis(StagedRun[StudyCase]):
 def _claim(folder: Path, kind: str) -> None:
     """Take a folder for a kind of study; InputError if it holds anything else."""
     path, wanted = folder / "study.json", f"a {kind} study"
-    holds = f"a {_kind_in(path, kind)} study" if path.is_file() else wanted
-    if not path.is_file() and (folder / "summary.json").exists():
+    holds = wanted
+    if path.is_file():
+        with suppress(InputError, KeyError, TypeError):  # a damaged one says nothing
+            holds = f"a {read_json(path)['kind']} study"
+    elif (folder / "summary.json").exists():
         holds = "something that is no study (it has a summary.json, but no study.json)"
     if holds != wanted:
         raise InputError(
@@ -205,11 +209,3 @@ def _claim(folder: Path, kind: str) -> None:
             "take another with --out"
         )
     write_json(path, {"kind": kind})
-
-
-def _kind_in(path: Path, kind: str) -> str:
-    """The kind that a folder's ``study.json`` says; the one asked for if that is damaged."""
-    try:
-        return str(read_json(path)["kind"])
-    except (InputError, KeyError, TypeError):
-        return kind

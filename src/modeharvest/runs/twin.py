@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 from modeharvest.fem.field import Solution
-from modeharvest.fem.specimen import Specimen
 from modeharvest.idic.correlate import fit_displacement
 from modeharvest.idic.result import Result
 from modeharvest.idic.uncertainty.identifiability import identifiability
@@ -186,38 +185,30 @@ class TwinRun(StagedRun[Case]):
             case, folder = PhotographCase.read(twin.experiment), self.folder / "harvest"
             case = case.model_copy(update={"whole_field": how.of_photographs})
             harvesting = HarvestRun(case, folder, self.progress, str(twin.experiment))
-            specimen = self.case.experiment.specimen
-            return harvesting.all(compare_with_truth(twin, harvesting, specimen, self.progress))
+            return harvesting.all(self._compare(twin, harvesting))
 
-
-def compare_with_truth(
-    twin: Twin, harvesting: HarvestRun, specimen: Specimen, progress: Progress = silent
-) -> HarvestTruth:
-    """Set a harvest, which knows nothing of the truth, against that of its twin."""
-    images, results = twin.images, harvesting.results()
-    wholes = harvesting.whole_fields.found if harvesting.whole_fields else {}
-    frames, rows = {}, []
-    for name in counted(tuple(results), progress, "compare with the truth"):
-        true = images.truth(_strain_of(name, images.strains)).displacement
-        # Not the images' own masks: those are as the lens shows them.
-        inside = np.asarray(np.isfinite(true).all(axis=-1))
-        result = results[name].result
-        best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
-        rows += _frame_rows(name, result, best, true, inside)
-        errors = None
-        if name in wholes:
-            errors = compare_whole(wholes[name], true, best, inside, specimen)
-            rows += whole_checks(name, wholes[name].refit, best, errors, inside)
-        frames[name] = FrameTruth(true, best, errors)
-    if harvesting.optics.distortion is not None:
-        rows.append(_lens_row(harvesting.optics.distortion, twin.distortion, images.grid))
-    return HarvestTruth(frames, twin.distortion, tuple(rows))
-
-
-def _strain_of(name: str, strains: tuple[float, ...]) -> float:
-    """The strain in a photograph's name, in hundredths of a per cent."""
-    number = int(name.rsplit("_", 1)[-1]) / 1e4
-    return min(strains, key=lambda strain: abs(strain - number))
+    def _compare(self, twin: Twin, harvesting: HarvestRun) -> HarvestTruth:
+        """Set a harvest, which knows nothing of the truth, against that of its twin."""
+        images, results, specimen = twin.images, harvesting.results(), self.case.experiment.specimen
+        wholes = harvesting.whole_fields.found if harvesting.whole_fields else {}
+        names = [name for name, _ in _exposures(images) if name != "reference"]
+        strains = dict(zip(names, images.strains, strict=True))
+        frames, rows = {}, []
+        for name in counted(tuple(results), self.progress, "compare with the truth"):
+            true = images.truth(strains[name]).displacement
+            # Not the images' own masks: those are as the lens shows them.
+            inside = np.asarray(np.isfinite(true).all(axis=-1))
+            result = results[name].result
+            best = fit_displacement(true, result.grid, result.ansatz, result.unknowns, inside)
+            rows += _frame_rows(name, result, best, true, inside)
+            errors = None
+            if name in wholes:
+                errors = compare_whole(wholes[name], true, best, inside, specimen)
+                rows += whole_checks(name, wholes[name].refit, best, errors, inside)
+            frames[name] = FrameTruth(true, best, errors)
+        if harvesting.optics.distortion is not None:
+            rows.append(_lens_row(harvesting.optics.distortion, twin.distortion, images.grid))
+        return HarvestTruth(frames, twin.distortion, tuple(rows))
 
 
 def _frame_rows(
