@@ -40,6 +40,7 @@ from modeharvest.util.errors import InputError
 from modeharvest.util.files import make_folder, read_json, remove_orphans, sha256_of, write_json
 from modeharvest.util.machine import on_first
 from modeharvest.util.progress import Progress, silent
+from modeharvest.util.typed import to_plain
 
 _SOURCES = (".py", ".html", ".css", ".toml")
 C = TypeVar("C")
@@ -203,7 +204,7 @@ class StagedRun(Stages, Generic[C]):
                 files, about = work(name, found)
             except InputError as error:
                 files, about = (), {"failed": str(error), **nothing}
-            write_json(path, {"failed": "", **about})
+            write_json(path, to_plain({"failed": "", **about}))
             return *files, path
 
         for name, key in keys.items():
