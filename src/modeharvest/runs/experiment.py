@@ -105,9 +105,18 @@ class Run(StagedRun[Case]):
         images = self._images()
 
         def work() -> list[Path]:
-            paths = [self._result_path(strain) for strain in images.strains]
-            for strain, path in zip(images.strains, paths, strict=True):
-                self._correlate_one(images, strain).write(path)
+            how, paths = self.case.correlation, []
+            ansatz = how.ansatz(self.case.experiment.specimen)
+            for strain in images.strains:
+                result = correlate(
+                    images.pair(strain, camera=how.camera),
+                    ansatz,
+                    guess=ansatz.initial_guess(strain, how.start_amplitude),
+                    options=how.options(),
+                    progress=self.progress,
+                )
+                paths.append(self._result_path(strain))
+                result.write(paths[-1])
             return paths
 
         self.do("correlate", self._correlate_key(images), work)
@@ -312,17 +321,6 @@ class Run(StagedRun[Case]):
 
     def _results(self, images: ImageSet) -> dict[float, Result]:
         return {strain: Result.read(self._result_path(strain)) for strain in images.strains}
-
-    def _correlate_one(self, images: ImageSet, strain: float) -> Result:
-        how, specimen = self.case.correlation, self.case.experiment.specimen
-        ansatz = how.ansatz(specimen)
-        return correlate(
-            images.pair(strain, camera=how.camera),
-            ansatz,
-            guess=ansatz.initial_guess(strain, how.start_amplitude),
-            options=how.options(),
-            progress=self.progress,
-        )
 
 
 @contextmanager

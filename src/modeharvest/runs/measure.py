@@ -24,13 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from modeharvest.fem.field import Mesh, read_mesh, read_plane_mesh, write_mesh
-from modeharvest.idic.finite_element.files import (
-    read_result,
-    write_csv,
-    write_maps,
-    write_result,
-    write_vtu,
-)
+from modeharvest.idic.finite_element import files as nodal_files
 from modeharvest.idic.finite_element.measure import FiniteElementOptions
 from modeharvest.idic.finite_element.mesh import mesh_of_mask, meshable, quadratic
 from modeharvest.idic.finite_element.result import NodalResult
@@ -53,7 +47,7 @@ from modeharvest.imaging.photographs.photograph import (
     read_frame,
     read_reference,
 )
-from modeharvest.runs.photographs.prepare import named_files
+from modeharvest.runs.photographs.prepare import CODE, LIBRARIES, named_files
 from modeharvest.runs.whole_field import BYTES_PER_PIXEL
 from modeharvest.util.arrays import BoolArray, FloatArray
 from modeharvest.util.errors import InputError, require_within
@@ -70,9 +64,6 @@ from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked
 
-_LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
-_CODE = ("fem", "imaging", "idic", "runs")
-"""What the numbers depend on."""
 _LEAST_PX = 1000
 """Pixels that a mesh covers, at least: some four elements."""
 _OVERLAP = 0.01
@@ -152,7 +143,7 @@ class MeasureRun(StagedRun[MeasureCase]):
     def _key(self) -> str:
         inputs = [self.case.reference, self.case.mask, self.case.mesh]
         files = [None if path is None else sha256_of(path) for path in inputs]
-        return stage_key([files, self.case.pixel_size], *_CODE)
+        return stage_key([files, self.case.pixel_size], *CODE)
 
     @cached_property
     def material(self) -> MeshedMaterial:
@@ -246,13 +237,13 @@ class MeasureRun(StagedRun[MeasureCase]):
             result = photographed_displacement(
                 self.pair(name), self._body, before, names, self.progress
             )
-            write_result(tables[0], result, unit)
-            write_vtu(tables[1], result, unit)
-            write_csv(tables[2], result, unit=unit)
-            return *tables, *write_maps(folder / name, result, unit)
+            nodal_files.write_result(tables[0], result, unit)
+            nodal_files.write_vtu(tables[1], result, unit)
+            nodal_files.write_csv(tables[2], result, unit=unit)
+            return *tables, *nodal_files.write_maps(folder / name, result, unit)
 
         self.do(f"image {name}", key, work)
-        return read_result(tables[0])
+        return nodal_files.read_result(tables[0])
 
     def residual(self, name: str, result: NodalResult) -> FloatArray:
         """(rows, cols) residual of one image [grey levels], NaN off the material."""
@@ -291,7 +282,7 @@ class MeasureRun(StagedRun[MeasureCase]):
             "notes": list(self.reference.notes),
             "warnings": list(self.material.warnings),
             "images": [self._image(name, result) for name, result in results.items()],
-            "versions": versions(*_LIBRARIES),
+            "versions": versions(*LIBRARIES),
         }  # fmt: skip
 
     def _image(self, name: str, result: NodalResult) -> dict[str, Any]:

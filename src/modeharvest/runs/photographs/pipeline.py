@@ -45,11 +45,6 @@ from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, ver
 from modeharvest.util.typed import picked, to_plain
 from modeharvest.validation.onset import find_buckling
 
-_LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
-"""What the numbers depend on."""
-_CODE = ("fem", "imaging", "idic", "runs")
-"""Folders of the package that they depend on; how they are shown is in others."""
-
 
 @dataclass(frozen=True)
 class HarvestRun(StagedRun[PhotographCase]):
@@ -72,7 +67,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             prepare.calibrate_lens(table, base, self.folder, self.progress)
             return self.folder / "distortion.json", self.folder / "calibration.json"
 
-        key = stage_key([to_plain(table), [sha256_of(path) for path in files]], *_CODE)
+        key = stage_key([to_plain(table), [sha256_of(path) for path in files]], *prepare.CODE)
         self.do("optics", key, work)
         return prepare.calibrated_lens(self.folder)
 
@@ -154,7 +149,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             truth=truth,
             command=f"modeharvest harvest {self.source} --out {self.folder}",
             toml=source.read_text("utf-8") if source.is_file() else "",
-            versions=versions(*_LIBRARIES),
+            versions=versions(*prepare.LIBRARIES),
         )
 
     def all(self, truth: HarvestTruth | None = None) -> dict[str, Any]:
@@ -230,7 +225,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     def _prepared_key(self) -> str:
         tables, files = self.case.plain(), prepare.all_files(self.case)
         wanted = {k: tables[k] for k in ("images", "scale", "specimen", "distortion", "noise")}
-        return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *_CODE)
+        return stage_key([wanted, [[path.name, sha256_of(path)] for path in files]], *prepare.CODE)
 
 
 def harvest(

@@ -50,6 +50,9 @@ from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.typed import made, picked, to_plain
 
 PREPARED_FILE = "prepared.json"
+LIBRARIES = ("numpy", "scipy", "numba", "scikit-image")
+CODE = ("fem", "imaging", "idic", "runs")
+"""What numbers from photographs depend on: libraries, and folders of the package."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -190,6 +190,8 @@ def harvested_frame(
     along, across = mean_strain(result, box)
     spectrum = measured_spectrum(measured.local, cell, box)
     pattern = read_pattern(spectrum)
+    parts = geometry.parts if len(geometry.parts) > 1 else ()
+    own = {part.name: measured_spectrum(measured.local, cell, part.box) for part in parts}
     return HarvestedFrame(
         name=name,
         strain_x=along,
@@ -207,21 +209,11 @@ def harvested_frame(
         else field_errors(result, x, y, by_model_error),
         spectrum=spectrum,
         pattern=pattern,
-        parts=_parts(measured, geometry, cell),
+        parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()),
         local=measured.local if case.local.code != "none" else None,
         start_text=tuple(s for s in measured.text if s not in pattern.text),
         warnings=found.warnings,
     )
-
-
-def _parts(
-    measured: MeasuredPhotograph, geometry: Geometry, cell: float
-) -> tuple[PartSpectrum, ...]:
-    """Spectra of the parts, where there are several."""
-    if len(geometry.parts) == 1:
-        return ()
-    spectra = {p.name: measured_spectrum(measured.local, cell, p.box) for p in geometry.parts}
-    return tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in spectra.items())
 
 
 def amplitude_of(frame: HarvestedFrame, cellular: Box) -> ImageAmplitude:
