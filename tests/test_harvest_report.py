@@ -43,8 +43,7 @@ from modeharvest.report.photographs import (
     photographs_report,
 )
 from modeharvest.runs.photographs.prepare import Optics
-from modeharvest.runs.photographs.results import Harvest
-from modeharvest.runs.photographs.summary import harvest_summary
+from modeharvest.runs.photographs.results import Harvest, harvest_summary
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")
 

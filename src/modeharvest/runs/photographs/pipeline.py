@@ -19,10 +19,23 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from modeharvest.idic.chebyshev import Box
 from modeharvest.idic.local.field import read_field, write_field
 from modeharvest.idic.photograph.geometry import Geometry, find_geometry
-from modeharvest.idic.photograph.measure import MeasuredPhotograph, measure, warped_back
+from modeharvest.idic.photograph.measure import (
+    MeasuredPhotograph,
+    image_noise,
+    measure,
+    residual_test,
+    warped_back,
+)
 from modeharvest.idic.result import Result
+from modeharvest.idic.spectra.pattern import read_pattern
+from modeharvest.idic.spectra.spectrum import measured_spectrum
+from modeharvest.idic.uncertainty.covariance import covariance, field_errors
+from modeharvest.idic.uncertainty.identifiability import identifiability
 from modeharvest.imaging.distortion.files import read_distortion
 from modeharvest.imaging.pair import ImagePair
 from modeharvest.runs.case import CaseModel
@@ -31,19 +44,24 @@ from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import Optics, PreparedPhotographs
 from modeharvest.runs.photographs.results import (
     Harvest,
+    HarvestedFrame,
     HarvestTruth,
+    PartSpectrum,
     amplitude_of,
-    harvested_frame,
+    harvest_summary,
 )
-from modeharvest.runs.photographs.summary import harvest_summary
 from modeharvest.runs.photographs.whole_field import PhotographWholeFields
 from modeharvest.runs.whole_field import change_of
+from modeharvest.util.arrays import FloatArray
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import require_writable, sha256_of, write_json
 from modeharvest.util.progress import Progress, counted, silent
 from modeharvest.util.stages import StagedRun, digest, exclusive, stage_key, versions
 from modeharvest.util.typed import picked, to_plain
-from modeharvest.validation.onset import find_buckling
+from modeharvest.validation.onset import find_buckling, mean_strain
+
+_ALONG = 120
+"""Points of the error bars along the longer side: they are as smooth as the ansatz."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +149,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         results, source = self.results(), Path(self.source)
         frames, wholes = [], self.whole_fields
         for name in counted(tuple(results), self.progress, "error bars"):
-            frame = harvested_frame(case, prepared, self.geometry, name, results[name])
+            frame = self._frame(prepared, name, results[name])
             frames.append(frame if wholes is None else wholes.added(frame))
         moments = [amplitude_of(frame, region.cellular) for frame in frames]
         return Harvest(
@@ -204,6 +222,45 @@ class HarvestRun(StagedRun[PhotographCase]):
         folder, nothing = self.folder / "results", {"fixed": False, "text": ()}
         return self.do_in_turn("correlate", self._keys, folder, work, read, nothing)
 
+    def _frame(
+        self, prepared: PreparedPhotographs, name: str, measured: MeasuredPhotograph
+    ) -> HarvestedFrame:
+        """One photograph's measurement, with its error bars and spectra."""
+        case, geometry, result = self.case, self.geometry, measured.result
+        pair, cell = prepared.pair(name), case.specimen.cell_size
+        box = geometry.region.cellular
+        x, y = _axes(geometry.region.domain)
+        noise, edge_px = image_noise(pair, prepared.noise), case.correlation.edge_px
+        found = covariance(result, pair, noise, cell, edge_px)
+        by_model_error = found.by_model_error
+        along, across = mean_strain(result, box)
+        spectrum = measured_spectrum(measured.local, cell, box)
+        pattern = read_pattern(spectrum)
+        parts = geometry.parts if len(geometry.parts) > 1 else ()
+        own = {part.name: measured_spectrum(measured.local, cell, part.box) for part in parts}
+        return HarvestedFrame(
+            name=name,
+            strain_x=along,
+            strain_y=across,
+            image=pair.deformed,
+            mask=pair.deformed_mask,
+            result=result,
+            identifiability=identifiability(result, pair.mask),
+            residual_test=residual_test(result, pair, noise, edge_px),
+            error_x=x,
+            error_y=y,
+            by_noise=field_errors(result, x, y, found.by_noise),
+            by_model_error=None
+            if by_model_error is None
+            else field_errors(result, x, y, by_model_error),
+            spectrum=spectrum,
+            pattern=pattern,
+            parts=tuple(PartSpectrum(name, s, read_pattern(s)) for name, s in own.items()),
+            local=measured.local if case.local.code != "none" else None,
+            start_text=tuple(s for s in measured.text if s not in pattern.text),
+            warnings=found.warnings,
+        )
+
     def _pair(
         self,
         prepared: PreparedPhotographs,
@@ -246,3 +303,12 @@ def harvest(
     prepare.require_inputs(found)
     source = "CASE" if isinstance(case, CaseModel) else str(case)
     return HarvestRun(found, Path(folder), progress, source).all()
+
+
+def _axes(domain: Box) -> tuple[FloatArray, FloatArray]:
+    """Positions over the specimen, about as dense both ways [mm]."""
+    across, up = (max(2, round(_ALONG * half / max(domain.half)) + 1) for half in domain.half)
+    return (
+        np.linspace(domain.x_min, domain.x_max, across, dtype=np.float64),
+        np.linspace(domain.y_min, domain.y_max, up, dtype=np.float64),
+    )

@@ -13,7 +13,7 @@ starts from the images, and from the photograph before.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from modeharvest.imaging.pair import ImagePair
 from modeharvest.imaging.spline import SplineImage
 from modeharvest.runs.photographs.case import PhotographCase
 from modeharvest.runs.photographs.prepare import PreparedPhotographs
-from modeharvest.runs.photographs.results import Harvest, HarvestedFrame, TruthCheck
+from modeharvest.runs.photographs.results import HarvestedFrame, TruthCheck
 from modeharvest.runs.whole_field import WholeFields
 from modeharvest.util.arrays import BoolArray
 from modeharvest.util.progress import Progress
@@ -47,7 +47,6 @@ from modeharvest.validation.whole_field import (
     refitted,
     v_percent,
     waves_percent,
-    whole_numbers,
 )
 
 _ASTRAY = (Outcome.LOCAL_MINIMUM, Outcome.OUTSIDE_IMAGE, Outcome.SINGULAR)
@@ -172,15 +171,6 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
             f"of which noise is about {expected:.2g}: somewhere the images don't match."
         )
         return replace(measured, warnings=(*measured.warnings, text))
-
-
-def whole_summary(harvest: Harvest, frame: HarvestedFrame) -> dict[str, Any] | None:
-    """What ``summary.json`` says of a frame's whole displacement; None without."""
-    if frame.whole is None:
-        return None
-    known = harvest.truth.frames.get(frame.name) if harvest.truth else None
-    errors = asdict(known.whole) if known and known.whole else {}
-    return {**errors, **asdict(whole_numbers(frame.whole, frame.result, harvest.mask))}
 
 
 def whole_checks(
