@@ -8,7 +8,9 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from modeharvest.runs.experiment import Run
 from modeharvest.runs.whole_field import VirtualWholeFieldOptions
 from modeharvest.util.errors import InputError
 from modeharvest.util.files import read_json
+from modeharvest.util.progress import Progress
 
 CASE = """
 title = "A reduced demo"
@@ -139,31 +142,32 @@ def test_the_whole_displacement_is_measured_up_to_the_edges(
     assert [path.read_bytes() for path in measured] == content
 
 
+Share = Callable[[Progress], None]
+
+
 @pytest.fixture
-def share(tmp_path: Path) -> whole_field._Share:
+def share(tmp_path: Path) -> Share:
     """Of images that aren't there."""
     corners = Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [[0, 1, 2], [1, 3, 2]], "T3")
     body, options = Body(quadratic(corners)), FiniteElementOptions()
-    return whole_field._Share(tmp_path, tmp_path / "none", body, options, True, {})
+    files = whole_field.WholeFields(tmp_path)
+    return partial(whole_field._measure, files, tmp_path / "none", body, options, True, {})
 
 
-def test_an_input_error_of_another_process_is_one_here(share: whole_field._Share) -> None:
+def test_an_input_error_of_another_process_is_one_here(share: Share) -> None:
     with (
         pytest.raises(InputError, match="expected a finished image set"),
         whole_field._children(1) as [child],
     ):
-        share.hand_to(child)
+        whole_field._hand_to(child, share)
 
 
-def test_a_killed_process_is_no_fault_of_the_program(
-    share: whole_field._Share, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(whole_field._Share, "hand_to", lambda _, child: child.kill())
+def test_a_killed_process_is_no_fault_of_the_program() -> None:
     with (
         pytest.raises(InputError, match="killed by signal 9, as where memory runs out"),
         whole_field._children(1) as [child],
     ):
-        share.hand_to(child)
+        child.kill()
 
 
 def test_the_stages_commands_measure_it_too(

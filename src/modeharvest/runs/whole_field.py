@@ -182,14 +182,17 @@ class WholeFields:
         with _children(count - 1) as children:
             with _with_remedy("mesh of the material"):
                 body = Body.of_mask(mask, images.grid, how.element_px, how.edge_element_px)
-            shares = [
-                _Share(self.folder, images.folder, body, how, options.camera,
-                       {strain: results[strain] for strain in images.strains[-1 - k :: -count]})
-                for k in range(count)  # the last state takes longest, and its progress is seen
-            ]  # fmt: skip
-            for child, share in zip(children, shares[1:], strict=True):
-                share.hand_to(child)
-            shares[0].measure(progress)
+            # The last state takes longest, and its progress is seen.
+            first, *others = (
+                partial(
+                    _measure, self, images.folder, body, how, options.camera,
+                    {strain: results[strain] for strain in images.strains[-1 - k :: -count]},
+                )
+                for k in range(count)
+            )  # fmt: skip
+            for child, share in zip(children, others, strict=True):
+                _hand_to(child, share)
+            first(progress)
         stems = [self.path(name_of(strain)) for strain in images.strains]
         return [path.with_suffix(kind) for path in stems for kind in (".h5", ".vtu")]
 
@@ -215,44 +218,37 @@ class WholeFields:
         return self.folder / f"{name}_timings.json"
 
 
-@dataclass(frozen=True)
-class _Share:
-    """Some images of a virtual experiment, to be measured one after another."""
+def _measure(
+    files: WholeFields,
+    folder: Path,
+    body: Body,
+    how: FiniteElementOptions,
+    camera: bool,
+    results: Mapping[float, Result],
+    progress: Progress,
+) -> None:
+    """Measure images in a folder one after another, from their correlations, by strain."""
+    images, law = ImageSet.read(folder), None if how.law is None else how.law.material
 
-    folder: Path
-    images: Path
-    """Where the files go, and where the images are."""
-    body: Body
-    how: FiniteElementOptions
-    camera: bool
-    results: Mapping[float, Result]
-    """Of correlations, by strain."""
+    def one(strain: float, progress: Progress) -> NodalResult:
+        pair = images.pair(strain, camera=camera)
+        return measure_displacement(pair, results[strain], body, options=how, progress=progress)
 
-    def hand_to(self, child: subprocess.Popen[bytes]) -> None:
-        """Let one of ``_children`` measure it."""
-        assert child.stdin
-        with suppress(BrokenPipeError), child.stdin as to:  # why it ended is seen in the end
-            pickle.dump(self, to)
+    for strain, result in results.items():
+        of, given = f"strain {100 * strain:.2f} %", Given(law, result)
+        files.measure(name_of(strain), of, partial(one, strain), progress, given)
 
-    def measure(self, progress: Progress) -> None:
-        """Leave the files of the images."""
-        images, how = ImageSet.read(self.images), self.how
-        law = None if how.law is None else how.law.material
 
-        def one(strain: float, progress: Progress) -> NodalResult:
-            pair, start = images.pair(strain, camera=self.camera), self.results[strain]
-            return measure_displacement(pair, start, self.body, options=how, progress=progress)
-
-        for strain, result in self.results.items():
-            of, given = f"strain {100 * strain:.2f} %", Given(law, result)
-            WholeFields(self.folder).measure(
-                name_of(strain), of, partial(one, strain), progress, given
-            )
+def _hand_to(child: subprocess.Popen[bytes], share: Callable[[Progress], None]) -> None:
+    """Let one of ``_children`` do a share of the work."""
+    assert child.stdin
+    with suppress(BrokenPipeError), child.stdin as to:  # why it ended is seen in the end
+        pickle.dump(share, to)
 
 
 @contextmanager
 def _children(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that measure the share they are given; none is left in the end.
+    """Processes that do the share they are given; none is left in the end.
 
     InputError as it comes from one, or if one was killed; RuntimeError if one fails otherwise.
     """
@@ -287,7 +283,7 @@ _REFUSED = 2
 
 def _main() -> None:
     try:
-        pickle.load(sys.stdin.buffer).measure(silent)
+        pickle.load(sys.stdin.buffer)(silent)
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(_REFUSED)
