@@ -96,19 +96,13 @@ class VirtualWholeFieldOptions(WholeFieldOptions):
         """The engine's options for an experiment, whose two ends along x are loaded."""
         if not self.material_law:
             return self.on_mesh(None)
-        ends = _Ends(experiment.specimen.half_size[0], pixel_size)
-        return self.on_mesh(Law(experiment.material, ends))
+        on_ends = partial(_on_ends, experiment.specimen.half_size[0], pixel_size)
+        return self.on_mesh(Law(experiment.material, on_ends))
 
 
-@dataclass(frozen=True)
-class _Ends:
-    """Tells which points lie on the two ends of a specimen along x, to within a length [mm]."""
-
-    half_length: float
-    within: float
-
-    def __call__(self, points: FloatArray) -> BoolArray:
-        return np.asarray(np.abs(np.abs(points[:, 0]) - self.half_length) < self.within)
+def _on_ends(half_length: float, within: float, points: FloatArray) -> BoolArray:
+    """(n,) True for points on the two ends of a specimen along x, to within a length [mm]."""
+    return np.asarray(np.abs(np.abs(points[:, 0]) - half_length) < within)
 
 
 @contextmanager
