@@ -127,7 +127,7 @@ def _setup(folder: Path, name: str) -> _CoverageSetup:
     twin = Twin(folder / "twin")
     case = PhotographCase.read(twin.experiment)
     harvesting = HarvestRun(case, folder / "harvest")
-    prepared, measured = harvesting.prepared(), harvesting.results()[name]
+    prepared, measured = harvesting.prepared, harvesting.results()[name]
     pair = prepared.pair(name)
     box = harvesting.geometry.region.cellular
     x = np.linspace(box.x_min, box.x_max, _POINTS, dtype=np.float64)

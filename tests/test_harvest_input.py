@@ -170,7 +170,7 @@ def test_spoilt_frames_are_skipped_each_with_its_reason(folder: Path) -> None:
         tifffile.imwrite(folder / f"mask_{path.name}", whole)
     text(f"= {PITCH}", f'= {PITCH}\ndeformed_material = ["mask_*.tif"]')(folder)
     run = HarvestRun(PhotographCase.read(folder / "experiment.toml"), folder / "out")
-    prepared = run.prepared()
+    prepared = run.prepared
     assert prepared.names == ("frame_1", "frame_2", "frame_3")
     reasons = dict(prepared.skipped)
     assert "the constant grey level 90" in reasons["frame_1a.tif"]

@@ -142,7 +142,7 @@ def test_damaged_and_foreign_frames_are_skipped_and_told(
         tifffile.imwrite(tmp_path / name, np.rint(255 * shown).astype(np.uint8))
     harvesting = HarvestRun(PhotographCase.read(path), tmp_path / "out")
     assert list(harvesting.results()) == ["frame_1", "frame_2"]
-    ((damaged, why),) = harvesting.prepared().skipped
+    ((damaged, why),) = harvesting.prepared.skipped
     assert damaged == "frame_1a.tif"
     assert "frame_1a.tif" in why
     failures = dict(harvesting.failures())

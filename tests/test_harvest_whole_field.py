@@ -192,7 +192,7 @@ def test_without_a_correlation_the_images_are_the_start(
     lost = replace(astray, outcome=Outcome.LOCAL_MINIMUM, unknowns=0.0 * astray.unknowns)
     results["frame_2"] = replace(results["frame_2"], result=lost)
     stages = PhotographWholeFields(
-        case, tmp_path, prepared=HarvestRun(case, harvested).prepared(),
+        case, tmp_path, prepared=HarvestRun(case, harvested).prepared,
         results=results, keys=dict.fromkeys(results, ""),
     )  # fmt: skip
     found = stages.found["frame_2"]

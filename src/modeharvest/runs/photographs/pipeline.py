@@ -89,6 +89,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         self.do("optics", key, work)
         return prepare.calibrated_lens(self.folder)
 
+    @cached_property
     def prepared(self) -> PreparedPhotographs:
         """Make the photographs ready; leaves ``prepared/``."""
         folder = self.folder / "prepared"
@@ -103,7 +104,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     @cached_property
     def geometry(self) -> Geometry:
         """Holes, lattice and cellular part, from the reference."""
-        prepared, table = self.prepared(), self.case.specimen
+        prepared, table = self.prepared, self.case.specimen
         return find_geometry(prepared.mask(), prepared.grid, table, self.case.base)
 
     def results(self) -> dict[str, MeasuredPhotograph]:
@@ -124,7 +125,7 @@ class HarvestRun(StagedRun[PhotographCase]):
         how, local, keys = self.case.plain(), self.case.local.files, {}
         key = digest([self._prepared_key(), [how["correlation"], how["local"]]])
         fields = prepare.of_each_photograph(self.case, local, "local.files")
-        for name in self.prepared().names:
+        for name in self.prepared.names:
             key = digest([key, name, sha256_of(fields[name]) if name in fields else ""])
             keys[name] = key
         return keys
@@ -136,7 +137,7 @@ class HarvestRun(StagedRun[PhotographCase]):
             return None
         return PhotographWholeFields(
             self.case, self.folder, self.progress,
-            prepared=self.prepared(), results=self.results(), keys=self._keys,
+            prepared=self.prepared, results=self.results(), keys=self._keys,
         )  # fmt: skip
 
     def failures(self) -> tuple[tuple[str, str], ...]:
@@ -145,11 +146,11 @@ class HarvestRun(StagedRun[PhotographCase]):
 
     def harvest(self, truth: HarvestTruth | None = None) -> Harvest:
         """All that is known of the test, for the report."""
-        case, prepared, region = self.case, self.prepared(), self.geometry.region
+        case, prepared, region = self.case, self.prepared, self.geometry.region
         results, source = self.results(), Path(self.source)
         frames, wholes = [], self.whole_fields
         for name in counted(tuple(results), self.progress, "error bars"):
-            frame = self._frame(prepared, name, results[name])
+            frame = self._frame(name, results[name])
             frames.append(frame if wholes is None else wholes.added(frame))
         moments = [amplitude_of(frame, region.cellular) for frame in frames]
         return Harvest(
@@ -193,7 +194,7 @@ class HarvestRun(StagedRun[PhotographCase]):
     @cached_property
     def _correlated(self) -> tuple[dict[str, MeasuredPhotograph], dict[str, str]]:
         """Photographs that were measured, and why others could not be."""
-        prepared, case = self.prepared(), self.case
+        case = self.case
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
 
         def work(
@@ -201,11 +202,11 @@ class HarvestRun(StagedRun[PhotographCase]):
         ) -> tuple[Sequence[Path], dict[str, Any]]:
             before = next(reversed(found), None)
             measured = measure(
-                self._pair(prepared, name, before, found),
+                self._pair(name, before, found),
                 self.geometry,
                 case.specimen.cell_size,
                 case.correlation,
-                prepare.local_field(case, prepared, name, self.optics.distortion),
+                prepare.local_field(case, self.prepared, name, self.optics.distortion),
                 None if before is None else found[before],
                 self.progress,
             )
@@ -222,15 +223,13 @@ class HarvestRun(StagedRun[PhotographCase]):
         folder, nothing = self.folder / "results", {"fixed": False, "text": ()}
         return self.do_in_turn("correlate", self._keys, folder, work, read, nothing)
 
-    def _frame(
-        self, prepared: PreparedPhotographs, name: str, measured: MeasuredPhotograph
-    ) -> HarvestedFrame:
+    def _frame(self, name: str, measured: MeasuredPhotograph) -> HarvestedFrame:
         """One photograph's measurement, with its error bars and spectra."""
         case, geometry, result = self.case, self.geometry, measured.result
-        pair, cell = prepared.pair(name), case.specimen.cell_size
+        pair, cell = self.prepared.pair(name), case.specimen.cell_size
         box = geometry.region.cellular
         x, y = _axes(geometry.region.domain)
-        noise, edge_px = image_noise(pair, prepared.noise), case.correlation.edge_px
+        noise, edge_px = image_noise(pair, self.prepared.noise), case.correlation.edge_px
         found = covariance(result, pair, noise, cell, edge_px)
         by_model_error = found.by_model_error
         along, across = mean_strain(result, box)
@@ -262,19 +261,15 @@ class HarvestRun(StagedRun[PhotographCase]):
         )
 
     def _pair(
-        self,
-        prepared: PreparedPhotographs,
-        name: str,
-        before: str | None,
-        found: dict[str, MeasuredPhotograph],
+        self, name: str, before: str | None, found: dict[str, MeasuredPhotograph]
     ) -> ImagePair:
         """The photograph and what it is correlated with."""
-        pair = prepared.pair(name)
+        pair = self.prepared.pair(name)
         if self.case.correlation.formulation != "updated" or before is None:
             return pair
         result = found[before].result
-        reference, inside = warped_back(prepared.image(before), result, result.order)
-        return replace(pair, reference=reference, mask=prepared.mask() & inside)
+        reference, inside = warped_back(self.prepared.image(before), result, result.order)
+        return replace(pair, reference=reference, mask=self.prepared.mask() & inside)
 
     def _paths(self, name: str) -> tuple[Path, Path]:
         return self.folder / "results" / f"{name}.json", self.folder / "results" / f"{name}.npz"
