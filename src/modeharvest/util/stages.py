@@ -185,23 +185,23 @@ class StagedRun(Stages, Generic[C]):
         what: str,
         keys: Mapping[str, str],
         records: Path,
-        work: Callable[[str, dict[str, R]], tuple[Sequence[Path], dict[str, Any]]],
+        work: Callable[[str, tuple[str, R] | None], tuple[Sequence[Path], dict[str, Any]]],
         read: Callable[[str, dict[str, Any]], R],
         nothing: Mapping[str, Any],
     ) -> tuple[dict[str, R], dict[str, str]]:
-        """A stage for each of several images, from what was found in those before.
+        """A stage for each of several images, from the last one in which something was found.
 
-        ``keys``: by their names; ``work`` gets a name and what was found, leaves files, and returns
-        them with the content of ``NAME_start.json`` in the folder ``records``; ``read`` reads them
-        again. Returns what was found and why others failed: an InputError of the work is taken down
-        as ``failed``, beside ``nothing`` for the rest, and the next image goes on.
+        ``keys``: by their names; ``work`` gets a name, and that of the last one with what was found
+        there, leaves files, and returns them with the content of ``NAME_start.json`` in the folder
+        ``records``; ``read`` reads them again. Returns what was found and why others failed: an
+        InputError of the work is taken down as ``failed``, beside ``nothing`` for the rest.
         """
         found: dict[str, R] = {}
         failed: dict[str, str] = {}
 
         def one(name: str, path: Path) -> Sequence[Path]:
             try:
-                files, about = work(name, found)
+                files, about = work(name, next(reversed(found.items()), None))
             except InputError as error:
                 files, about = (), {"failed": str(error), **nothing}
             write_json(path, to_plain({"failed": "", **about}))

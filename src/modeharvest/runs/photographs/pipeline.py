@@ -198,16 +198,15 @@ class HarvestRun(StagedRun[PhotographCase]):
         _ = self.geometry  # what is wrong with the reference is not a deformed image's fault
 
         def work(
-            name: str, found: dict[str, MeasuredPhotograph]
+            name: str, last: tuple[str, MeasuredPhotograph] | None
         ) -> tuple[Sequence[Path], dict[str, Any]]:
-            before = next(reversed(found), None)
             measured = measure(
-                self._pair(name, before, found),
+                self._pair(name, last),
                 self.geometry,
                 case.specimen.cell_size,
                 case.correlation,
                 prepare.local_field(case, self.prepared, name, self.optics.distortion),
-                None if before is None else found[before],
+                last and last[1],
                 self.progress,
             )
             result, field = self._paths(name)
@@ -260,14 +259,12 @@ class HarvestRun(StagedRun[PhotographCase]):
             warnings=found.warnings,
         )
 
-    def _pair(
-        self, name: str, before: str | None, found: dict[str, MeasuredPhotograph]
-    ) -> ImagePair:
+    def _pair(self, name: str, last: tuple[str, MeasuredPhotograph] | None) -> ImagePair:
         """The photograph and what it is correlated with."""
         pair = self.prepared.pair(name)
-        if self.case.correlation.formulation != "updated" or before is None:
+        if self.case.correlation.formulation != "updated" or last is None:
             return pair
-        result = found[before].result
+        before, result = last[0], last[1].result
         reference, inside = warped_back(self.prepared.image(before), result, result.order)
         return replace(pair, reference=reference, mask=self.prepared.mask() & inside)
 

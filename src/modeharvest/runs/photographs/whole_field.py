@@ -99,17 +99,19 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
         for name in self.results:
             keys[name] = key = digest([key, self.keys[name]])
 
-        def work(name: str, found: dict[str, WholeField]) -> tuple[Sequence[Path], dict[str, Any]]:
-            correlated, before = self.results[name].result, next(reversed(found), None)
-            last = None if before is None else found[before].measured
+        def work(
+            name: str, last: tuple[str, WholeField] | None
+        ) -> tuple[Sequence[Path], dict[str, Any]]:
+            correlated = self.results[name].result
             is_usable = correlated.outcome not in _ASTRAY
 
             def measured(progress: Progress) -> NodalResult:
-                pair, body = self._pair(name, before, last), self._body
+                pair, body = self._pair(name, last), self._body
                 if is_usable:
                     begin = correlated.ansatz.displacement_at(correlated.unknowns, body.mesh.nodes)
                 else:
-                    begin = block_motion(pair, body.mesh, last, ("the reference", name))
+                    known = last and last[1].measured
+                    begin = block_motion(pair, body.mesh, known, ("the reference", name))
                 cutoff = self.case.whole_field.cutoff_px
                 options = FiniteElementOptions(edge_px=_EDGE_PX, cutoff_px=cutoff)
                 return self._warned(displacement_from(begin, pair, body, options, progress), name)
@@ -131,12 +133,12 @@ class PhotographWholeFields(StagedRun[PhotographCase]):
     def _refit(self, name: str) -> Path:
         return self._files.folder / f"{name}_refit.json"
 
-    def _pair(self, name: str, before: str | None, last: NodalResult | None) -> ImagePair:
+    def _pair(self, name: str, last: tuple[str, WholeField] | None) -> ImagePair:
         """A photograph and its reference, whose brightness is made the photograph's."""
         pair, correlated = self.prepared.pair(name), self.results[name].result
         reference, mask = pair.reference, pair.mask
-        if before and last and self.case.correlation.formulation == "updated":
-            reference, inside = self._pulled_back(before, last)
+        if last and self.case.correlation.formulation == "updated":
+            reference, inside = self._pulled_back(last[0], last[1].measured)
             mask = self.prepared.mask() & inside
         grid = pair.grid
         gain, offset = correlated.ansatz.gain_and_offset(correlated.unknowns, grid.x, grid.y)
